@@ -1,0 +1,1 @@
+"""From motion and intensities to pictures: mapping, blur, report, pipeline, the command line."""

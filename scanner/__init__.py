@@ -1,0 +1,1 @@
+"""What the instrument is: the device, its physics stage by stage, the recording. Knows no other package."""

@@ -1,0 +1,37 @@
+"""Errors a person can act on: what is wrong, where, and what to do, in one line."""
+
+from __future__ import annotations
+
+
+class BadInput(ValueError):
+    """Input that cannot be used. The command line prints it as one line and exits with 2.
+
+    Args:
+        what: what is wrong, in words.
+        file: the file it is wrong in.
+        channel: the channel (or device key) it is wrong in.
+        hint: what the user can do about it.
+    """
+
+    def __init__(self, what: str, *, file: object = None, channel: str | None = None, hint: str | None = None):
+        self.what, self.file, self.channel, self.hint = what, file, channel, hint
+        super().__init__(what)
+
+    def __str__(self) -> str:
+        where = ": ".join(str(part) for part in (self.file, self.channel) if part)
+        line = f"{where}: {self.what}" if where else self.what
+        if self.hint:
+            line += f"; {self.hint}"
+        return " ".join(line.split())
+
+
+class ChannelMissing(BadInput, KeyError):
+    """A channel that the asked-for operation needs is not in the recording."""
+
+
+class DeviceInvalid(BadInput):
+    """The device lacks a value that is needed, or holds one that is not physical."""
+
+
+class UnitUnknown(BadInput):
+    """A unit that is not the channel's own and that nobody said how to convert."""
