@@ -1,0 +1,157 @@
+"""Between TOML tables and dataclasses: reads key by key, so that every complaint names its key and nothing is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import MISSING, dataclass, field, fields
+from math import isfinite
+from typing import Any, TypeVar
+
+from scanner.errors import DeviceInvalid
+
+# What a field's number must be: kept as the field's metadata, checked when the dataclass is made.
+FINITE = {"must": "be a finite number"}
+POSITIVE = {"must": "be a number greater than 0"}
+NOT_NEGATIVE = {"must": "be a number, 0 or greater"}
+NONZERO = {"must": "be a number other than 0"}
+WHOLE = {"must": "be a whole number greater than 0"}
+CAN_BE_OFF = {"optional": True}
+
+_HOLDS: dict[str, Callable[[Any], bool]] = {
+    FINITE["must"]: lambda number: True,
+    POSITIVE["must"]: lambda number: number > 0,
+    NOT_NEGATIVE["must"]: lambda number: number >= 0,
+    NONZERO["must"]: lambda number: number != 0,
+    WHOLE["must"]: lambda number: isinstance(number, int) and number > 0,
+}
+
+T = TypeVar("T")
+
+
+def checked_number(value: object, must: str, key: str) -> float | int:
+    """``value`` as a number that fulfils ``must``; true and false are no numbers.
+
+    Raises:
+        DeviceInvalid: naming ``key``.
+    """
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        with suppress(OverflowError):  # TOML's integers have no limit, a float has one
+            if isfinite(value) and _HOLDS[must](value):
+                return value if must == WHOLE["must"] else float(value)
+    raise DeviceInvalid(f"is {value!r} and must {must}", channel=key)
+
+
+def check_values(record: object) -> None:
+    """Check every number of a dataclass against its field's metadata and store it as float (or int)."""
+    for item in fields(record):  # type: ignore[arg-type]
+        must, value = item.metadata.get("must"), getattr(record, item.name)
+        if must is None or (value is None and item.metadata.get("optional")):
+            continue
+        if item.type == "tuple[float, ...]":
+            if not isinstance(value, (list, tuple)):
+                raise DeviceInvalid(f"is {value!r} and must be a list of numbers", channel=item.name)
+            checked: object = tuple(checked_number(number, must, item.name) for number in value)
+        else:
+            checked = checked_number(value, must, item.name)
+        object.__setattr__(record, item.name, checked)
+
+
+def check_kind(kind: object, known: Iterable[str]) -> str:
+    """``kind`` if it is one of the known ones; else DeviceInvalid with their list."""
+    if kind not in (known := tuple(known)):
+        raise DeviceInvalid(f"{kind!r} is unknown", channel="kind", hint=f"known kinds: {', '.join(known)}")
+    return str(kind)
+
+
+def to_table(record: Any) -> dict[str, Any]:
+    """A dataclass as a TOML table, without what is None; a class that has a ``kind`` writes it first."""
+    kind = {"kind": record.kind} if hasattr(record, "kind") else {}
+    return kind | {item.name: v for item in fields(record) if (v := getattr(record, item.name)) is not None}
+
+
+def merged(table: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
+    """``table`` with the keys of ``extra`` added, table into table."""
+    out = dict(table)
+    for key, value in extra.items():
+        out[key] = merged(out[key], value) if isinstance(value, Mapping) and key in out else value
+    return out
+
+
+@dataclass
+class Table:
+    """A table being read: what is taken is gone, what is left is extra.
+
+    Attributes:
+        rest: what nobody took yet.
+        where: dotted key of the table, empty for the file itself.
+        source: the file, for messages.
+    """
+
+    rest: dict[str, Any]
+    where: str
+    source: str | None
+    tables: dict[str, Table] = field(default_factory=dict)
+
+    def key(self, name: str | None) -> str:
+        return ".".join(part for part in (self.where, name) if part)
+
+    def wrong(self, error: DeviceInvalid) -> DeviceInvalid:
+        """The same complaint with the file and the whole key."""
+        return DeviceInvalid(error.what, file=self.source, channel=self.key(error.channel), hint=error.hint)
+
+    def take_text(self, name: str, default: str) -> str:
+        value = self.rest.pop(name, default)
+        if not isinstance(value, str):
+            raise self.wrong(DeviceInvalid(f"is {value!r} and must be text", channel=name, hint="put it in quotes"))
+        return value
+
+    def take_table(self, name: str) -> Table | None:
+        value = self.rest.pop(name, None)
+        if value is None:
+            return None
+        if not isinstance(value, dict):
+            raise self.wrong(
+                DeviceInvalid(f"is {value!r} and must be a table", channel=name, hint=f"write [{self.key(name)}]")
+            )
+        self.tables[name] = Table(dict(value), self.key(name), self.source)
+        return self.tables[name]
+
+    def take_kind(self, known: Iterable[str]) -> str:
+        if "kind" not in self.rest:
+            hint = f"known kinds: {', '.join(known)}"
+            raise self.wrong(DeviceInvalid("is missing", channel="kind", hint=hint))
+        try:
+            return check_kind(self.rest.pop("kind"), known)
+        except DeviceInvalid as error:
+            raise self.wrong(error) from None
+
+    def take_numbers(self, must: Mapping[str, Any] = FINITE) -> dict[str, float]:
+        """All numbers of the table; text, lists and tables stay behind."""
+        names = [name for name, value in self.rest.items() if not isinstance(value, (str, list, dict))]
+        try:
+            return {name: checked_number(self.rest.pop(name), must["must"], name) for name in names}
+        except DeviceInvalid as error:
+            raise self.wrong(error) from None
+
+    def take_as(self, cls: type[T], name: str) -> T | None:
+        table = self.take_table(name)
+        return None if table is None else table.made(cls)
+
+    def made(self, cls: type[T]) -> T:
+        """An object of the dataclass ``cls`` from this table's keys."""
+        known = fields(cls)  # type: ignore[arg-type]
+        for item in known:
+            if item.default is MISSING and item.name not in self.rest:
+                needs = ", ".join(other.name for other in known if other.default is MISSING)
+                raise self.wrong(DeviceInvalid("is missing", channel=item.name, hint=f"[{self.where}] needs {needs}"))
+        try:
+            return cls(**{item.name: self.rest.pop(item.name) for item in known if item.name in self.rest})
+        except DeviceInvalid as error:
+            raise self.wrong(error) from None
+
+    def take_rest(self) -> dict[str, Any]:
+        """What nobody took, here and in the tables taken from here, nested as in the file."""
+        inner = {name: rest for name, table in self.tables.items() if (rest := table.take_rest())}
+        rest, self.rest, self.tables = self.rest | inner, {}, {}
+        return rest
