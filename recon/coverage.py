@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.mapping import Grid, _pixel
+from recon.mapping import Grid, pixel_of
 from scanner.errors import BadInput
 
 
@@ -18,8 +18,8 @@ def _first_visits(theta_x, theta_y, half_x, half_y, width, height):  # type: ign
     first = np.empty(width * height, np.int64)
     n = 0
     for i in range(theta_x.size):
-        column = _pixel(theta_x[i], half_x, width)
-        row = _pixel(theta_y[i], half_y, height)
+        column = pixel_of(theta_x[i], half_x, width)
+        row = pixel_of(theta_y[i], half_y, height)
         if column >= 0 and row >= 0 and not visited[row, column]:
             visited[row, column] = True
             first[n] = i
@@ -50,9 +50,7 @@ def fill_against_time(
     return (first + 1) / rate, np.arange(1, first.size + 1) / (grid.width * grid.height)
 
 
-def time_for_fill(
-    theta_x: NDArray[Any], theta_y: NDArray[Any], rate: float, grid: Grid, fill: float
-) -> float | None:
+def time_for_fill(theta_x: NDArray[Any], theta_y: NDArray[Any], rate: float, grid: Grid, fill: float) -> float | None:
     """Frame time after which the scan has visited the fraction ``fill`` of the pixels [s]; None if it never does.
 
     Args are those of `fill_against_time`, and ``fill`` in (0, 1].

@@ -1,0 +1,201 @@
+"""From angles and intensities to a picture: mean and count of the samples in each pixel.
+
+The pixel law is eq (2) of Chen et al. (2020) with its edges decided: pixel k holds k < N/2 (θ/half_angle + 1) <= k + 1,
+the field's lower edge belongs to pixel 0, and what lies outside the field is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import BadInput
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Pixels over the field of view; column 0 is θ_x = -half_angle_x, row 0 is θ_y = -half_angle_y.
+
+    Attributes:
+        width, height: pixels.
+        half_angle_x, half_angle_y: the field's edge, mechanical angle [rad].
+
+    Raises:
+        BadInput: a size or an angle that is not positive and finite.
+    """
+
+    width: int
+    height: int
+    half_angle_x: float
+    half_angle_y: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint="give at least 1x1")
+        if not all(math.isfinite(half) and half > 0 for half in (self.half_angle_x, self.half_angle_y)):
+            raise BadInput(
+                f"half angles of {self.half_angle_x} and {self.half_angle_y} rad", hint="give positive, finite angles"
+            )
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture and how often each of its pixels was visited.
+
+    Attributes:
+        image: mean intensity, shape (height, width) or (height, width, detectors), float32; NaN where never visited.
+        coverage: samples a pixel, shape (height, width), uint32.
+        grid: the pixels' place in the field.
+    """
+
+    image: NDArray[np.float32]
+    coverage: NDArray[np.uint32]
+    grid: Grid
+
+
+@numba.njit(cache=True, inline="always")
+def pixel_of(angle: float, half_angle: float, n: int) -> int:
+    position = angle / half_angle
+    if not abs(position) <= 1.0:  # outside the field, and NaN, which no comparison holds for
+        return -1
+    return max(math.ceil(0.5 * n * (position + 1.0)) - 1, 0)
+
+
+@numba.vectorize(cache=True)
+def _pixels(angle: float, half_angle: float, n: int) -> int:
+    return pixel_of(angle, half_angle, n)
+
+
+def pixel_index(angle: NDArray[Any] | float, half_angle: float, n: int) -> NDArray[np.int64]:
+    """Column (or row) that an angle falls in: ceil(n/2 (θ/half_angle + 1)) - 1, of [-half_angle, half_angle].
+
+    Args:
+        angle: any shape [rad].
+        half_angle: the field's edge [rad].
+        n: pixels across.
+
+    Returns:
+        Index, shape of ``angle``; -1 outside the field and for NaN.
+    """
+    return _pixels(angle, half_angle, n)
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate(theta_x, theta_y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
+    height, width = counts.shape
+    for i in range(theta_x.size):
+        column = pixel_of(theta_x[i], half_x, width)
+        row = pixel_of(theta_y[i], half_y, height)
+        if column < 0 or row < 0:
+            continue
+        if intensity.ndim == 1:  # decided when compiled: one detector runs at twice the speed of a loop over one
+            if not np.isnan(intensity[i]):
+                counts[row, column] += 1
+                sums[row, column] += intensity[i]
+        else:
+            whole = True
+            for d in range(intensity.shape[1]):
+                whole = whole and not np.isnan(intensity[i, d])
+            if whole:
+                counts[row, column] += 1
+                for d in range(intensity.shape[1]):
+                    sums[row, column, d] += intensity[i, d]
+
+
+def accumulate(
+    theta_x: NDArray[Any],
+    theta_y: NDArray[Any],
+    intensity: NDArray[Any],
+    grid: Grid,
+    sums: NDArray[np.float64] | None = None,
+    counts: NDArray[np.uint32] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+    """Add samples to the sums and counts of their pixels, in one pass and without temporaries.
+
+    A long recording goes through in chunks: give each call the sums and counts that the last one returned. A sample
+    outside the field, or with NaN in an angle or in any detector, is left out.
+
+    Args:
+        theta_x, theta_y: mechanical angles, shape (n,) [rad].
+        intensity: shape (n,) or (n, detectors).
+        grid: the pixels.
+        sums: shape (height, width) or (height, width, detectors); changed in place. New when None.
+        counts: shape (height, width); changed in place. New when None.
+
+    Returns:
+        ``sums``, float64, and ``counts``, uint32.
+
+    Raises:
+        BadInput: shapes that do not belong together.
+    """
+    theta_x, theta_y, intensity = np.asarray(theta_x), np.asarray(theta_y), np.asarray(intensity)
+    one_clock = theta_x.ndim == 1 and theta_x.shape == theta_y.shape == intensity.shape[:1]
+    if not one_clock or intensity.ndim > 2:
+        raise BadInput(
+            f"angles of shape {theta_x.shape} and {theta_y.shape} with an intensity of shape {intensity.shape}",
+            hint="give one angle of each axis for each intensity",
+        )
+    shape = (grid.height, grid.width, *intensity.shape[1:])
+    sums = np.zeros(shape) if sums is None else sums
+    counts = np.zeros(shape[:2], np.uint32) if counts is None else counts
+    if sums.shape != shape or counts.shape != shape[:2]:
+        raise BadInput(f"sums of shape {sums.shape} and counts of {counts.shape} where {shape} is needed")
+    _accumulate(theta_x, theta_y, intensity, grid.half_angle_x, grid.half_angle_y, sums, counts)
+    return sums, counts
+
+
+def mean_picture(sums: NDArray[np.float64], counts: NDArray[np.uint32], grid: Grid) -> Picture:
+    """The picture of what `accumulate` gathered: sums over counts, NaN where nothing fell."""
+    divisor = counts if sums.ndim == 2 else counts[..., None]
+    image = np.full(sums.shape, np.nan, np.float32)
+    np.divide(sums, divisor, out=image, where=divisor > 0, casting="same_kind")
+    return Picture(image, counts, grid)
+
+
+def map_samples(theta_x: NDArray[Any], theta_y: NDArray[Any], intensity: NDArray[Any], grid: Grid) -> Picture:
+    """The picture of samples that are all in memory: `accumulate`, then `mean_picture`."""
+    return mean_picture(*accumulate(theta_x, theta_y, intensity, grid), grid)
+
+
+def fill_factor(coverage: NDArray[Any]) -> float:
+    """Fraction of the pixels that were visited at least once."""
+    return float(np.count_nonzero(coverage)) / coverage.size
+
+
+def fill_holes(picture: Picture, radius: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Fill the small holes of a picture from their visited neighbours, by normalised convolution.
+
+    A hole's value is the mean of the visited pixels at most ``radius`` columns and rows away, weighted by a Gaussian of
+    sd radius/2 and by how often each was visited (Knutsson & Westin 1993, with coverage as certainty). Visited pixels
+    stay as measured; holes with no visited pixel in reach stay NaN.
+
+    Args:
+        picture: with NaN where never visited.
+        radius: reach [px], >= 1.
+
+    Returns:
+        The filled image, shape of ``picture.image``, and the mask of the pixels that are fill and not measurement,
+        shape (height, width).
+    """
+    from scipy.ndimage import gaussian_filter
+
+    if radius < 1:
+        raise BadInput(f"a fill radius of {radius} pixels", hint="give at least 1")
+    certainty = picture.coverage.astype(float)
+    values = picture.image.reshape(*certainty.shape, -1)
+    visited = certainty > 0
+
+    def spread(field: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(gaussian_filter(field, radius / 2, radius=radius, axes=(0, 1), mode="constant"))
+
+    weight = spread(certainty)
+    filled = ~visited & (weight > 0)
+    total = spread(np.where(visited[..., None], values, 0.0) * certainty[..., None])
+    image = values.copy()
+    image[filled] = total[filled] / weight[filled][:, None]
+    return image.reshape(picture.image.shape), filled
