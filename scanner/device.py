@@ -12,15 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import pi, sqrt
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import tomli_w
 
 from scanner import device_toml
 from scanner.device_toml import CAN_BE_OFF, FINITE, NONZERO, NOT_NEGATIVE, POSITIVE, WHOLE
 from scanner.errors import BadInput, DeviceInvalid
-
-T = TypeVar("T")
 
 AXES = ("x", "y")
 DEFAULT_TOLERANCE = 0.02
@@ -207,26 +205,32 @@ class Axis:
 
     def require_mechanics(self) -> Mechanics:
         """The mechanics; DeviceInvalid where the device states none."""
-        return self._required(self.mechanics, "mechanics", "J, b and k")
+        if self.mechanics is None:
+            raise self._missing("mechanics", "J, b and k")
+        return self.mechanics
 
     def require_capacitance(self) -> Capacitance:
         """The capacitance; DeviceInvalid where the device states none."""
-        return self._required(self.capacitance, "capacitance", "C0, Cb and theta0")
+        if self.capacitance is None:
+            raise self._missing("capacitance", "C0, Cb and theta0")
+        return self.capacitance
 
     def require_drive(self) -> Drive:
         """The drive; DeviceInvalid where the device states none."""
-        return self._required(self.drive, "drive", "kind")
+        if self.drive is None:
+            raise self._missing("drive", "kind")
+        return self.drive
 
     def require_readout(self) -> Readout:
         """The axis's own readout; DeviceInvalid where the device states none."""
-        return self._required(self.readout, "readout", "kind and its values")
+        if self.readout is None:
+            raise self._missing("readout", "kind and its values")
+        return self.readout
 
-    def _required(self, stage: T | None, key: str, content: str) -> T:
-        if stage is None:
-            key = ".".join(part for part in (self.name, key) if part)
-            hint = f"add [{key}] with {content} to the device"
-            raise DeviceInvalid("is missing and needed here", file=self.source, channel=key, hint=hint)
-        return stage
+    def _missing(self, stage: str, content: str) -> DeviceInvalid:
+        key = ".".join(part for part in (self.name, stage) if part)
+        hint = f"add [{key}] with {content} to the device"
+        return DeviceInvalid("is missing and needed here", file=self.source, channel=key, hint=hint)
 
 
 @dataclass(frozen=True)
@@ -352,10 +356,7 @@ def _axis(name: str, table: device_toml.Table) -> Axis:
 
 def _readout(table: device_toml.Table) -> Readout | None:
     readout = table.take_table("readout")
-    if readout is None:
-        return None
-    cls: type[Any] = READOUTS[readout.take_kind(READOUTS)]
-    return readout.made(cls)
+    return None if readout is None else readout.made(READOUTS[readout.take_kind(READOUTS)])
 
 
 def _tolerance(table: device_toml.Table) -> dict[str, float]:
