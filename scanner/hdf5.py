@@ -1,0 +1,74 @@
+"""Opening other people's HDF5: what stands in the file is read, and nothing that only points elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from scanner.errors import BadInput
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """The file, for reading.
+
+    Raises:
+        BadInput: it is not there, empty, no HDF5, or cut short.
+    """
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise BadInput(what, file=path, hint="name a recording (HDF5)")
+    if path.stat().st_size == 0:
+        raise BadInput("the file is empty", file=path, hint="copy it again")
+    try:
+        return h5py.File(path, "r")
+    except PermissionError:
+        raise BadInput("may not be read", file=path, hint="check its permissions") from None
+    except OSError as error:
+        if not h5py.is_hdf5(path):
+            hint = "name a recording, or make one with `lissajous convert`"
+            raise BadInput("is not an HDF5 file", file=path, hint=hint) from None
+        what = "the file is truncated" if "truncated" in str(error) else f"cannot be opened: {error}"
+        raise BadInput(what, file=path, hint="copy it again") from None
+
+
+def child(group: h5py.Group, name: str, kind: type) -> Any:
+    """The group or dataset ``name`` stored in ``group`` itself, None where there is none.
+
+    Raises:
+        BadInput: it is a link (whatever a link points to, another program put it there: the recording must be whole
+            without it), its samples are kept in another file, or it is not of the ``kind`` h5py.Group or h5py.Dataset.
+    """
+    where = f"{group.name.rstrip('/')}/{name}"
+    path = group.file.filename
+    link = group.get(name, getlink=True)
+    if link is None:
+        return None
+    if not isinstance(link, h5py.HardLink):
+        raise BadInput("is a link", file=path, channel=where, hint="store the data itself in the file")
+    try:
+        item = group[name]
+    except (KeyError, OSError) as error:
+        raise BadInput(f"cannot be opened: {error}", file=path, channel=where, hint="copy the file again") from None
+    if not isinstance(item, kind):
+        what = f"is a {type(item).__name__.lower()}, not a {kind.__name__.lower()}"
+        raise BadInput(what, file=path, channel=where, hint="see the form of a recording")
+    if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+        what = "keeps its samples outside this file"
+        raise BadInput(what, file=path, channel=where, hint="store the data itself in the file")
+    return item
+
+
+def attributes(item: h5py.HLObject) -> dict[str, Any]:
+    """Attributes as Python values: text as str, arrays of one element as that element."""
+    return {key: _plain(value) for key, value in item.attrs.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
