@@ -55,7 +55,7 @@ class Recording:
 
         Raises:
             BadInput: no such file, no HDF5, truncated, another format or version, no channels, or a channel that
-                :func:`scanner.channel.checked_channel` refuses. Links out of the file and storage elsewhere are refused too.
+                :func:`scanner.channel.checked_channel` refuses. Links and storage outside the file are refused too.
         """
         path = Path(path)
         file = open_hdf5(path)
@@ -223,8 +223,9 @@ def _device_text(file: h5py.File, path: Path) -> str | None:
 def _open_channel(group: h5py.Group, name: str, path: Path) -> Channel:
     dataset = child(group, name, h5py.Dataset)
     known = attributes(dataset)
+    needed = {key: known.get(key) for key in ("unit", "sample_rate")}
     said = {key: known[key] for key in ("start", "gain", "offset") if key in known}
-    return checked_channel(name, dataset, unit=known.get("unit"), sample_rate=known.get("sample_rate"), file=str(path), **said)
+    return checked_channel(name, dataset, file=str(path), **needed, **said)
 
 
 def _cut(channel: Channel, t0: float, t1: float) -> Channel:
