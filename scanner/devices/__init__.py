@@ -1,0 +1,24 @@
+"""The named devices: TOML files in this folder, each with a note on where its values come from."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+from scanner.device import Device
+from scanner.errors import BadInput
+
+
+def names() -> list[str]:
+    """Names of the devices that come with the program."""
+    return sorted(entry.name.removesuffix(".toml") for entry in files(__name__).iterdir() if entry.name.endswith(".toml"))
+
+
+def load(name: str) -> Device:
+    """The device of that name.
+
+    Raises:
+        BadInput: no such device; the line lists those there are.
+    """
+    if name not in names():
+        raise BadInput(f"no device is named {name!r}", hint=f"there are {', '.join(names())}")
+    return Device.from_toml((files(__name__) / f"{name}.toml").read_text(encoding="utf-8"), source=f"device {name}")

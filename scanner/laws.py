@@ -1,0 +1,60 @@
+"""The physical laws of one axis, each defined once for simulator, estimators and diagnosis alike.
+
+Every function is compiled by numba and takes scalars or arrays. Angles [rad], SI units throughout.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def capacitance(theta, C0, Cb, theta0, theta_th):  # type: ignore[no-untyped-def]
+    """Comb capacitance C(theta) = C0 exp(-((theta - theta_th)/theta0)^2) + Cb [F] (chen2020 eq 13)."""
+    u = (theta - theta_th) / theta0
+    return C0 * np.exp(-u * u) + Cb
+
+
+@njit(cache=True)
+def capacitance_slope(theta, C0, theta0, theta_th):  # type: ignore[no-untyped-def]
+    """dC/dtheta [F/rad]."""
+    u = (theta - theta_th) / theta0
+    return -2.0 * u / theta0 * C0 * np.exp(-u * u)
+
+
+@njit(cache=True)
+def capacitance_curvature(theta, C0, theta0, theta_th):  # type: ignore[no-untyped-def]
+    """d2C/dtheta2 [F/rad2]."""
+    u = (theta - theta_th) / theta0
+    return (4.0 * u * u - 2.0) / (theta0 * theta0) * C0 * np.exp(-u * u)
+
+
+@njit(cache=True)
+def electrostatic_torque(slope, voltage):  # type: ignore[no-untyped-def]
+    """Torque 1/2 C'(theta) V^2 [N m] (chen2020 eq 8); it pulls towards the largest capacitance."""
+    return 0.5 * slope * voltage * voltage
+
+
+@njit(cache=True)
+def angular_acceleration(theta, omega, torque, J, b, k):  # type: ignore[no-untyped-def]
+    """J theta'' + b theta' + k theta = torque, solved for theta'' [rad/s2] (chen2020 eq 9)."""
+    return (torque - b * omega - k * theta) / J
+
+
+@njit(cache=True)
+def transimpedance_voltage(slope, omega, R_s, V_bias):  # type: ignore[no-untyped-def]
+    """Readout -R_s V_bias C'(theta) theta' [V] (chen2019 eq 2, 9)."""
+    return -R_s * V_bias * slope * omega
+
+
+@njit(cache=True)
+def amdm_voltage(filtered_capacitance, a_cir, b_cir):  # type: ignore[no-untyped-def]
+    """Demodulated readout a_cir C + b_cir [V] of the capacitance behind the low-pass sections (chen2020 eq 25)."""
+    return a_cir * filtered_capacitance + b_cir
+
+
+@njit(cache=True)
+def position_voltage(theta, gain, offset):  # type: ignore[no-untyped-def]
+    """Position readout gain theta + offset [V]."""
+    return gain * theta + offset
