@@ -1,0 +1,136 @@
+"""Optics: the beam's spot, the scene at the mirror's angles, and the detector.
+
+The scene covers the field with W x H pixels by the law of the picture (chen2020 eq 2): column j holds
+s = theta_x / half_angle_x in (2j/W - 1, 2(j+1)/W - 1], so its centre lies at s = 2(j + 1/2)/W - 1. Rows likewise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import BadInput
+from scanner.lowpass import lowpass, step_coefficients
+
+Array = NDArray[np.float64]
+FWHM_PER_SD = 2 * math.sqrt(2 * math.log(2))  # of a Gaussian
+
+
+def blur(scene: Array, sd_um: float, field_x_um: float, field_y_um: float) -> Array:
+    """The scene as a Gaussian spot sees it.
+
+    Args:
+        scene: shape (H, W), covering the whole field.
+        sd_um: standard deviation of the spot's intensity [um], 0 for none; a full width at half maximum is
+            ``FWHM_PER_SD`` times that.
+        field_x_um, field_y_um: the whole field's width and height [um].
+
+    Returns:
+        Shape (H, W). Beyond its edge the scene goes on as it ends there, as in ``sample``.
+
+    Raises:
+        BadInput: a spot below half a scene pixel, which sampling would make far too narrow (7 % at that limit,
+            0.1 % from 0.7 pixels on).
+    """
+    import cv2
+
+    if sd_um == 0:
+        return scene.copy()
+    height, width = scene.shape
+    sd_x, sd_y = sd_um * width / field_x_um, sd_um * height / field_y_um
+    if min(sd_x, sd_y) < 0.5:
+        raise BadInput(
+            f"the beam's spot has a standard deviation of {min(sd_x, sd_y):.2g} scene pixels",
+            hint="give the target more pixels, or a wider spot, or one of width 0",
+        )
+    return np.asarray(cv2.GaussianBlur(scene, (0, 0), sd_x, sigmaY=sd_y, borderType=cv2.BORDER_REPLICATE), np.float64)
+
+
+def sample(scene: Array, theta_x: Array, theta_y: Array, half_angle_x: float, half_angle_y: float) -> Array:
+    """Bilinear look-up of the scene at mirror angles.
+
+    Args:
+        scene: shape (H, W); row 0 at theta_y = -half_angle_y, column 0 at theta_x = -half_angle_x.
+        theta_x, theta_y: mechanical angles, one shape [rad].
+        half_angle_x, half_angle_y: half the field [rad].
+
+    Returns:
+        The light, of the angles' shape. Outside the field the scene goes on as it ends at its edge; NaN where an angle
+        is NaN.
+    """
+    # map_coordinates is exact; cv2.remap would round positions to 1/32 pixel and take no more than 32767 of them a row.
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = (
+        (n / 2) * (theta / half_angle + 1) - 0.5
+        for n, theta, half_angle in zip(scene.shape, (theta_y, theta_x), (half_angle_y, half_angle_x), strict=True)
+    )
+    return map_coordinates(scene, np.stack([rows, columns]), order=1, mode="nearest")
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Photons to volts.
+
+    Attributes:
+        gain: [V per photon in a sample].
+        photons_per_sample: mean count in one sampling interval for light 1.
+        read_noise_sd: of the electronics, after the gain [V].
+        bandwidth_hz: of a first-order low-pass between the photons and the electronics [Hz]; None: none.
+        bits: of the converter; None: no conversion.
+        full_scale: of the converter, which spans [0, full_scale) [V].
+    """
+
+    gain: float = 1e-3
+    photons_per_sample: float = 1000.0
+    read_noise_sd: float = 0.0
+    bandwidth_hz: float | None = None
+    bits: int | None = None
+    full_scale: float = 1.25
+
+    def __post_init__(self) -> None:
+        positive = {"gain": self.gain, "photons_per_sample": self.photons_per_sample, "full_scale": self.full_scale}
+        if self.bandwidth_hz is not None:
+            positive["bandwidth_hz"] = self.bandwidth_hz
+        for name, value in positive.items():
+            if not (math.isfinite(value) and value > 0):
+                raise BadInput(f"the detector's {name} is {value}", hint="give a finite value above zero")
+        if not (math.isfinite(self.read_noise_sd) and self.read_noise_sd >= 0):
+            raise BadInput(f"the detector's read_noise_sd is {self.read_noise_sd}", hint="give zero or more")
+        if self.bits is not None and not 1 <= self.bits <= 24:
+            raise BadInput(f"the detector has {self.bits} bits", hint="give 1 to 24, what float32 holds exactly")
+
+
+def detect(light: Array, rate: float, detector: Detector, rng: np.random.Generator) -> NDArray[np.float32]:
+    """What the detector makes of the light: photon noise, bandwidth, gain, read noise, converter, in this order.
+
+    Without bandwidth the mean is ``gain N`` and the variance ``gain^2 N + read_noise_sd^2`` (shot-noise law), with
+    N = photons_per_sample * light. The low-pass takes the light as linear between samples, so that a slow signal comes
+    out late by 1 / (2 pi bandwidth_hz) and not by half a sample less, and the photon noise as even within a sample, so
+    that its variance falls to N tanh(pi bandwidth_hz / rate). It starts from rest at the first sample's light.
+
+    Args:
+        light: relative to full light, not negative, shape (n,), n > 0.
+        rate: [Hz].
+        detector: its constants.
+        rng: the only source of randomness.
+
+    Returns:
+        Shape (n,) [V].
+    """
+    mean = np.multiply(light, detector.photons_per_sample, dtype=np.float64)
+    noise = rng.poisson(mean) - mean
+    if detector.bandwidth_hz is not None:
+        decay, previous, new = step_coefficients(detector.bandwidth_hz, 1 / rate)
+        lowpass(mean, decay, previous, new, mean[0], mean[0])
+        lowpass(noise, decay, 0.0, 1 - decay, 0.0, 0.0)
+    signal = detector.gain * (mean + noise)
+    signal += rng.normal(0.0, detector.read_noise_sd, signal.shape)
+    if detector.bits is not None:
+        codes = 2**detector.bits
+        step = detector.full_scale / codes
+        signal = np.clip(np.rint(signal / step), 0, codes - 1) * step
+    return signal.astype(np.float32)
