@@ -7,7 +7,6 @@ a round trip through a program that is older than it.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import pi, sqrt
@@ -18,7 +17,8 @@ import tomli_w
 
 from scanner import device_toml
 from scanner.device_toml import CAN_BE_OFF, FINITE, NONZERO, NOT_NEGATIVE, POSITIVE, WHOLE
-from scanner.errors import BadInput, DeviceInvalid
+from scanner.errors import DeviceInvalid
+from scanner.files import parse_toml, read_toml
 
 AXES = ("x", "y")
 DEFAULT_TOLERANCE = 0.02
@@ -260,29 +260,20 @@ class Device:
         """The device in the TOML file at ``path``.
 
         Raises:
-            DeviceInvalid: the file is no TOML, lacks a needed key or holds a value that is not physical.
-            BadInput: the file cannot be read.
+            BadInput: the file cannot be read, or is not TOML.
+            DeviceInvalid: it lacks a needed key or holds a value that is not physical.
         """
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except OSError as error:
-            raise BadInput(f"cannot be read: {error.strerror}", file=path) from None
-        except UnicodeDecodeError:
-            raise DeviceInvalid("is not text (UTF-8)", file=path, hint="a device is a TOML file") from None
-        return cls.from_toml(text, source=str(path))
+        return cls.from_table(read_toml(path), source=str(path))
 
     @classmethod
     def from_toml(cls, text: str, source: str | None = None) -> Device:
         """The device that ``text`` describes.
 
         Raises:
+            BadInput: the text is not TOML.
             DeviceInvalid: with ``source``, the key (``x.mechanics.k``), what is wrong and what to do.
         """
-        try:
-            table = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise DeviceInvalid(f"is not TOML: {error}", file=source, hint="correct the place it names") from None
-        return cls.from_table(table, source)
+        return cls.from_table(parse_toml(text, source), source)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], source: str | None = None) -> Device:

@@ -1,11 +1,13 @@
-"""Writing a file so that nobody ever meets half of one."""
+"""Reading TOML with errors that name the file, and writing a file so that nobody ever meets half of one."""
 
 from __future__ import annotations
 
 import os
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from scanner.errors import BadInput
 
@@ -28,3 +30,26 @@ def replacing(path: str | Path) -> Iterator[Path]:
         beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The table in a TOML file.
+
+    Raises:
+        BadInput: the file cannot be read, or is not TOML.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name a TOML file") from None
+    except UnicodeDecodeError:
+        raise BadInput("is not text (UTF-8)", file=path, hint="name a TOML file") from None
+    return parse_toml(text, path)
+
+
+def parse_toml(text: str, source: object) -> dict[str, Any]:
+    """The table that ``text`` holds; BadInput, naming ``source``, where it is not TOML."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BadInput(f"is not TOML: {error}", file=source, hint="correct the place it names") from None

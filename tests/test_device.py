@@ -198,7 +198,7 @@ def test_a_wrong_value_is_named_in_one_line(swap: tuple[str, str], line: str) ->
     ],
 )
 def test_a_text_that_is_no_device(text: str, line: str) -> None:
-    with pytest.raises(DeviceInvalid) as caught:
+    with pytest.raises(BadInput) as caught:
         Device.from_toml(text, source="d.toml")
     assert str(caught.value) == f"d.toml: {line}"
 
@@ -233,7 +233,7 @@ def test_load_names_the_file_it_cannot_read(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"gone\.toml: cannot be read: No such file"):
         Device.load(tmp_path / "gone.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DeviceInvalid, match=r"binary\.toml: is not text"):
+    with pytest.raises(BadInput, match=r"binary\.toml: is not text"):
         Device.load(tmp_path / "binary.toml")
     (tmp_path / "good.toml").write_text(CONTRACT)
     assert Device.load(tmp_path / "good.toml") == Device.from_toml(CONTRACT)
