@@ -6,9 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Phasors = NDArray[np.complex128]
 
 
-def block_phasors(values: Array, rate: float, start: float, frequency: float, block: int) -> tuple[Array, NDArray[np.complex128]]:
+def block_phasors(
+    values: Array, rate: float, start: float, frequency: float, block: int
+) -> tuple[Array, Phasors]:
     """Amplitude and phase of ``values`` near ``frequency`` in consecutive blocks.
 
     Every block is fitted, under a Hann window, with an offset and a sine: values = c + Im(Z exp(2 pi i f (t - tc))), so
@@ -29,7 +32,7 @@ def block_phasors(values: Array, rate: float, start: float, frequency: float, bl
     weights = np.linalg.solve((basis * window) @ basis.T, basis * window)
     fitted = values[: count * block].reshape(count, block) @ weights.T
     centres = start + (np.arange(count) * block + 0.5 * (block - 1)) / rate
-    return centres, fitted[:, 1] + 1j * fitted[:, 2]
+    return np.asarray(centres, np.float64), np.asarray(fitted[:, 1] + 1j * fitted[:, 2], np.complex128)
 
 
 def block_length(frequency: float, rate: float, cycles: float) -> int:

@@ -26,7 +26,7 @@ def capacitance_harmonics(amplitude: float, comb: Capacitance, count: int = 8) -
 
 
 def readout_response(readout: Readout, frequency: NDArray[np.float64] | float) -> NDArray[np.complex128]:
-    """Volts of sense signal a farad (a radian, for a position sensor) at ``frequency`` [Hz], delay of its filters included."""
+    """Volts a farad (a position sensor: a radian) at ``frequency`` [Hz], the filters' delay included."""
     if isinstance(readout, Amdm):
         return readout.a_cir * response(frequency, readout.lpf_hz)
     if isinstance(readout, Position):

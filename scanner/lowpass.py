@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 
-def response(frequency: NDArray[np.float64] | float, cutoffs: Sequence[float]) -> NDArray[np.complex128]:
+def response(frequency: NDArray[Any] | float, cutoffs: Sequence[float]) -> NDArray[np.complex128]:
     """Complex gain at ``frequency`` [Hz] of first-order sections in series, cut-offs [Hz]. Same shape as frequency."""
     gain = np.ones(np.shape(frequency), dtype=np.complex128)
     for cutoff in cutoffs:
@@ -41,7 +42,7 @@ def step_coefficients(cutoff: float, step: float) -> tuple[float, float, float]:
 
 @njit(cache=True)
 def lowpass(signal, e, p, q, u, x):  # type: ignore[no-untyped-def]
-    """Run one section over ``signal`` (n,) in place, from output ``u`` and previous input ``x``; returns the last two."""
+    """Run one section over ``signal`` (n,) in place, from output ``u`` and last input ``x``; returns the new two."""
     for i in range(signal.size):
         new = signal[i]
         u = e * u + p * x + q * new

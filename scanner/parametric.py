@@ -60,7 +60,7 @@ def slow_flow(
 
 
 def stiffness_modulation(axis: Axis, drive: DriveShape) -> float:
-    """delta: amplitude of the electrostatic stiffness at the drive's frequency, over the mean stiffness (small angles)."""
+    """delta: electrostatic stiffness at the drive's frequency over the mean stiffness, for small angles."""
     mechanics, comb = axis.require_mechanics(), axis.require_capacitance()
     per_volt2 = comb.C0 / comb.theta0**2  # -C''(theta_th) / 2
     square = drive.voltage(2.0 * _TURN) ** 2
@@ -117,8 +117,10 @@ def steady_state(
                 [(flow(found.x + step * unit) - flow(found.x - step * unit)) / (2 * step) for unit in np.eye(2)]
             )
             amplitude, phase = float(np.exp(found.x[0])), float(found.x[1])
-            if np.linalg.eigvals(jacobian).real.max() < 0.0 and 1e-4 < amplitude < 1.5 and (
-                best is None or amplitude > best[0]
+            if (
+                np.linalg.eigvals(jacobian).real.max() < 0.0
+                and 1e-4 < amplitude < 1.5
+                and (best is None or amplitude > best[0])
             ):
                 best = amplitude, float((phase + np.pi / 2) % np.pi - np.pi / 2)
     return best

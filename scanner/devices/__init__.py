@@ -10,7 +10,9 @@ from scanner.errors import BadInput
 
 def names() -> list[str]:
     """Names of the devices that come with the program."""
-    return sorted(entry.name.removesuffix(".toml") for entry in files(__name__).iterdir() if entry.name.endswith(".toml"))
+    return sorted(
+        entry.name.removesuffix(".toml") for entry in files(__name__).iterdir() if entry.name.endswith(".toml")
+    )
 
 
 def load(name: str) -> Device:

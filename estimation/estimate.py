@@ -1,0 +1,75 @@
+"""From a recording to its motion: the estimators by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from estimation.signals import device_of
+from scanner.device import Device, Position
+from scanner.errors import BadInput
+from scanner.motion import Motion
+from scanner.recording import Recording
+
+
+def _filter(name: str) -> Callable[[Recording, Device], Motion]:
+    def run(recording: Recording, device: Device) -> Motion:
+        from estimation.filters import follow
+
+        return follow(recording, device, name)
+
+    return run
+
+
+def _steady(name: str) -> Callable[[Recording, Device], Motion]:
+    def run(recording: Recording, device: Device) -> Motion:
+        from estimation import steady
+
+        return getattr(steady, name)(recording, device)
+
+    return run
+
+
+ESTIMATORS: dict[str, tuple[str, Callable[[Recording, Device], Motion]]] = {
+    "constant": ("phase and amplitude of the first stretch, held", _steady("constant")),
+    "acm": ("process model alone, no measurement (chen2020)", _filter("acm")),
+    "ekf": ("extended Kalman filter (chen2020 algorithm 1)", _filter("ekf")),
+    "ukf": ("unscented Kalman filter (chen2020 algorithm 2)", _filter("ukf")),
+    "sensor": ("angle channels or position readouts as they are", _steady("sensor")),
+}
+
+
+def default_estimator(recording: Recording, device: Device) -> str:
+    """``"sensor"`` where no capacitive readout was recorded, ``"ukf"`` where one was."""
+    if "sense" in recording:
+        return "ukf"
+    capacitive = [
+        name
+        for name, axis in device.axes.items()
+        if f"sense_{name}" in recording and axis.readout is not None and not isinstance(axis.readout, Position)
+    ]
+    return "ukf" if capacitive else "sensor"
+
+
+def estimate(
+    recording: Recording,
+    device: Device | None = None,
+    method: str | None = None,
+    flips: Mapping[str, bool] | None = None,
+) -> Motion:
+    """The motion of every axis of the device.
+
+    Args:
+        device: in place of the recording's own.
+        method: a name from ``ESTIMATORS``; ``default_estimator`` otherwise.
+        flips: axes whose sign the user turns, for an even capacitance cannot tell theta from -theta.
+
+    Raises:
+        BadInput: no such estimator, or the recording or the device does not serve it.
+    """
+    from estimation.steady import settle_signs
+
+    device = device_of(recording, device)
+    method = method or default_estimator(recording, device)
+    if method not in ESTIMATORS:
+        raise BadInput(f"no estimator is named {method!r}", hint=f"there are {', '.join(ESTIMATORS)}")
+    return settle_signs(ESTIMATORS[method][1](recording, device), recording, flips or {})

@@ -1,0 +1,145 @@
+"""The filters' model of an axis and its readout: one definition for the readable engine and the compiled one.
+
+Process: half a kick by the drive's torque, the exact damped free flow over a sample, half a kick (Strang's splitting).
+A first-order (Euler) step, as printed in chen2020 eq 10, feeds energy into the motion at a rate omega^2 Ts / 2, more
+than the mirror loses; this one conserves it to (omega Ts)^2 times the small torque.
+
+Measurement: the readout's law; an AMDM readout's low-pass sections are carried as states, so that their delay is right
+at whatever frequency the motion has at the moment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from scanner.device import Amdm, Axis, Device, Position, Readout
+from scanner.errors import DeviceInvalid
+from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, electrostatic_torque
+from scanner.lowpass import step_coefficients
+
+Array = NDArray[np.float64]
+
+AXIS_PARAMETERS = ("m11", "m12", "m21", "m22", "kick", "C0", "Cb", "theta0", "theta_th", "pull", "push")
+
+
+@njit(cache=True)
+def axis_step(theta, omega, v0, v1, m11, m12, m21, m22, kick, C0, Cb, theta0, theta_th, pull, push):  # type: ignore[no-untyped-def]
+    """One sample of the process model.
+
+    Args:
+        theta, omega: state [rad, rad/s].
+        v0, v1: drive voltage at the start and the end of the step [V].
+        m11 ... m22: the free flow, exp([[0, 1], [-k/J, -b/J]] Ts).
+        kick: Ts / (2 J).
+        pull: 1 for an electrostatic drive, 0 for a linear one.
+        push: torque per volt of a linear drive [N m/V], 0 for an electrostatic one.
+
+    Returns:
+        (theta, omega, d theta/d theta0, d theta/d omega0, d omega/d theta0, d omega/d omega0).
+    """
+    torque = pull * electrostatic_torque(capacitance_slope(theta, C0, theta0, theta_th), v0) + push * v0
+    bend = kick * pull * electrostatic_torque(capacitance_curvature(theta, C0, theta0, theta_th), v0)
+    kicked = omega + kick * torque
+    angle = m11 * theta + m12 * kicked
+    rate = m21 * theta + m22 * kicked
+    a11, a21 = m11 + m12 * bend, m21 + m22 * bend
+    torque = pull * electrostatic_torque(capacitance_slope(angle, C0, theta0, theta_th), v1) + push * v1
+    bend = kick * pull * electrostatic_torque(capacitance_curvature(angle, C0, theta0, theta_th), v1)
+    rate += kick * torque
+    return angle, rate, a11, m12, a21 + bend * a11, m22 + bend * m12
+
+
+@njit(cache=True)
+def comb(theta, m11, m12, m21, m22, kick, C0, Cb, theta0, theta_th, pull, push):  # type: ignore[no-untyped-def]
+    """Capacitance [F] and its first two derivatives at ``theta``; takes an axis's parameters whole."""
+    return (
+        capacitance(theta, C0, Cb, theta0, theta_th),
+        capacitance_slope(theta, C0, theta0, theta_th),
+        capacitance_curvature(theta, C0, theta0, theta_th),
+    )
+
+
+@dataclass(frozen=True)
+class FilterModel:
+    """A filter's model in numbers.
+
+    The state is (theta, omega) of each axis in ``axes``, then the output of each low-pass section in units of
+    capacitance [F].
+
+    Attributes:
+        axes: names, in the order of the state.
+        kind: of the readout: ``"amdm"``, ``"transimpedance"`` or ``"position"``.
+        step: sampling interval [s].
+        parameters: ``AXIS_PARAMETERS`` of each axis, shape (axes, 11).
+        sections: (e, p, q) of each low-pass section, shape (sections, 3).
+        gain, offset: of the readout: a_cir, b_cir; -R_s V_bias, 0; gain, offset.
+        noise_var: of the measurement [V^2].
+    """
+
+    axes: tuple[str, ...]
+    kind: str
+    step: float
+    parameters: Array
+    sections: Array
+    gain: float
+    offset: float
+    noise_var: float
+
+    @property
+    def states(self) -> int:
+        """Dimension of the state."""
+        return 2 * len(self.axes) + len(self.sections)
+
+
+def filter_model(
+    device: Device, axes: tuple[str, ...], readout: Readout, step: float, offset: float | None = None
+) -> FilterModel:
+    """The model of ``axes`` behind one ``readout``, sampled every ``step`` seconds.
+
+    Args:
+        offset: of the readout [V], where it was measured; the device's own otherwise.
+
+    Raises:
+        DeviceInvalid: a needed value is missing, or a readout for one axis was given several.
+    """
+    if not isinstance(readout, Amdm) and len(axes) > 1:
+        raise DeviceInvalid(
+            f"a {readout.kind} readout is followed for one axis at a time", file=device.source, channel="readout"
+        )
+    match readout:
+        case Amdm():
+            sections = np.array([step_coefficients(cutoff, step) for cutoff in readout.lpf_hz]).reshape(-1, 3)
+            gain, own_offset = readout.a_cir, readout.b_cir
+        case Position():
+            sections, gain, own_offset = np.empty((0, 3)), readout.gain, readout.offset
+        case _:
+            sections, gain, own_offset = np.empty((0, 3)), -readout.R_s * readout.V_bias, 0.0
+    return FilterModel(
+        axes=axes,
+        kind=readout.kind,
+        step=step,
+        parameters=np.array([axis_parameters(device.axis(name), step, readout) for name in axes]),
+        sections=sections,
+        gain=gain,
+        offset=own_offset if offset is None else offset,
+        noise_var=readout.noise_sd**2,
+    )
+
+
+def axis_parameters(axis: Axis, step: float, readout: Readout) -> list[float]:
+    """``AXIS_PARAMETERS`` of one axis."""
+    from scipy.linalg import expm
+
+    mechanics, drive = axis.require_mechanics(), axis.require_drive()
+    flow = expm(np.array([[0.0, 1.0], [-mechanics.k / mechanics.J, -mechanics.b / mechanics.J]]) * step)
+    if drive.kind == "electrostatic" or not isinstance(readout, Position):
+        bell = axis.require_capacitance()
+        shape = [bell.C0, bell.Cb, bell.theta0, bell.theta_th]
+    else:
+        shape = [0.0, 0.0, 1.0, 0.0]
+    pull, push = (1.0, 0.0) if drive.kind == "electrostatic" else (0.0, drive.torque_per_volt or 0.0)
+    return [*flow.ravel(), step / (2.0 * mechanics.J), *shape, pull, push]

@@ -1,0 +1,118 @@
+"""What a recording offers an estimator: which channel tells of which axis, behind which readout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.reference import Reference, absolute, dominant_frequency, drive_reference
+from scanner.channel import Channel, check_signal
+from scanner.device import Device, Position, Readout
+from scanner.errors import BadInput, ChannelMissing, DeviceInvalid
+from scanner.recording import Recording
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sense:
+    """One sense channel: its readout and the axes whose motion it carries."""
+
+    channel: Channel
+    readout: Readout
+    axes: tuple[str, ...]
+
+
+def device_of(recording: Recording, device: Device | None) -> Device:
+    """The device given, else the recording's own.
+
+    Raises:
+        DeviceInvalid: there is none.
+    """
+    found = device or recording.device
+    if found is None:
+        raise DeviceInvalid(
+            "states no device", file=recording.path, channel="/device", hint="give one with --device FILE"
+        )
+    return found
+
+
+def senses(recording: Recording, device: Device) -> list[Sense]:
+    """The sense channels, checked: every axis of the device in one of them.
+
+    Raises:
+        ChannelMissing: an axis has no sense channel.
+        DeviceInvalid: a channel has no readout. BadInput: a channel cannot be used.
+    """
+    if "sense" in recording:
+        if device.readout is None:
+            raise DeviceInvalid(
+                "is missing and needed for the channel sense",
+                file=device.source,
+                channel="readout",
+                hint="add [readout] with kind and its values at the top level of the device",
+            )
+        found = [Sense(recording["sense"], device.readout, tuple(device.axes))]
+    else:
+        found = [
+            Sense(recording.require(f"sense_{name}", "this estimator needs it"), axis.require_readout(), (name,))
+            for name, axis in device.axes.items()
+        ]
+    for sense in found:
+        check_signal(sense.channel)
+    return found
+
+
+def drive_voltage(recording: Recording, axis: str) -> Channel | None:
+    """The voltage on one axis's combs: its drive, else its bias during a free decay, else None for none recorded."""
+    for name in (f"drive_{axis}", f"bias_{axis}"):
+        if name in recording:
+            check_signal(recording[name], constant_ok=True)
+            return recording[name]
+    return None
+
+
+def reference_of(
+    recording: Recording, device: Device, axis: str, sense: Channel | None = None, even: bool = False
+) -> Reference:
+    """The phase reference of one axis (see ``estimation.reference``).
+
+    Args:
+        sense: a signal of the motion, for its frequency where no drive was recorded.
+        even: the signal carries the motion's frequency twice (a capacitance).
+
+    Raises:
+        BadInput: neither the drive nor the signal holds an oscillation.
+    """
+    own = device.axis(axis)
+    if f"drive_{axis}" in recording:
+        drive = recording[f"drive_{axis}"]
+        check_signal(drive)
+        return drive_reference(drive, "half-drive" if own.require_drive().kind == "electrostatic" else "drive")
+    if sense is None:
+        raise ChannelMissing(
+            "is not in the recording and no other channel tells the motion's frequency",
+            file=recording.path,
+            channel=f"drive_{axis}",
+            hint="record the drive",
+        )
+    double = 2.0 if even else 1.0
+    band = (0.8 * double * own.resonance, 1.25 * double * own.resonance) if own.mechanics else (0.0, np.inf)
+    window = 60.0 / own.resonance if own.mechanics else None
+    frequency = dominant_frequency(sense, *band, window=window) / double
+    return absolute(frequency, sense.start, sense.end)
+
+
+def is_capacitive(readout: Readout) -> bool:
+    """Whether the readout sees a capacitance: it carries twice the motion's frequency and not its sign."""
+    return not isinstance(readout, Position)
+
+
+def intensity_clock(recording: Recording, fallback: Channel) -> tuple[float, float, int]:
+    """(rate [Hz], start [s], samples) of the intensity, or of ``fallback`` where there is none."""
+    channel = recording.channels.get("intensity", fallback)
+    if channel.size < 1:
+        raise BadInput("holds no samples", file=channel.file, channel=channel.name)
+    return channel.sample_rate, channel.start, channel.size
