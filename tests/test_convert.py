@@ -1,0 +1,210 @@
+"""Instruments' files become recordings by a mapping, and what the mapping does not say is asked for, not guessed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.io import savemat
+
+from recon.convert import convert, convert_file
+from scanner.device import Device
+from scanner.errors import BadInput, DeviceInvalid
+from scanner.recording import Recording
+
+ROOT = Path(__file__).parents[1]
+
+MAPPING = """
+format = "matlab"
+name = "bench"
+notes = "warm"
+[channels.sense_x]
+variable = "x"
+unit = "V"
+sample_rate = 1000.0
+[channels.intensity]
+variable = "z"
+scale = 1e4
+offset = -1.0
+unit = "nm"
+sample_rate = 500
+start = 0.25
+[device.x.readout]
+kind = "position"
+gain = 2.0
+noise_sd = 0.1
+"""
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    """A folder with an instrument's file and its mapping."""
+    content = {"x": np.arange(5.0), "z": np.array([[1, 2], [3, 4]], np.int16), "label": "run 7"}
+    content["cell"] = np.array([np.ones(2), np.ones(3)], dtype=object)
+    savemat(tmp_path / "run.mat", content)
+    (tmp_path / "map.toml").write_text(MAPPING)
+    return tmp_path
+
+
+def test_a_mapping_makes_a_recording(bench: Path) -> None:
+    summary = convert_file(bench / "run.mat", bench / "map.toml", bench / "run.h5")
+    with Recording.open(bench / "run.h5") as recording:
+        assert (recording.name, recording.notes) == ("bench", "warm")
+        assert recording.device == Device.from_toml('[x.readout]\nkind = "position"\ngain = 2.0\nnoise_sd = 0.1\n')
+        sense, height = recording["sense_x"], recording["intensity"]
+        assert (sense.unit, sense.sample_rate, sense.start) == ("V", 1000.0, 0.0)
+        assert (height.unit, height.sample_rate, height.start) == ("nm", 500.0, 0.25)
+        np.testing.assert_array_equal(sense.read(), np.arange(5.0))
+        np.testing.assert_array_equal(height.read(), [[9999, 19999], [29999, 39999]])
+    assert summary == {
+        "recording": str(bench / "run.h5"),
+        "source": str(bench / "run.mat"),
+        "duration": pytest.approx(0.254),
+        "device": "unnamed",
+        "channels": {
+            "sense_x": {"unit": "V", "sample_rate": 1000.0, "start": 0.0, "shape": (5,)},
+            "intensity": {"unit": "nm", "sample_rate": 500.0, "start": 0.25, "shape": (2, 2)},
+        },
+    }
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    values=hnp.arrays(st.sampled_from([np.int16, np.float32, np.float64]), st.integers(2, 30)),
+    rate=st.floats(1e-3, 1e8),
+    start=st.floats(-1e3, 1e3),
+    compressed=st.booleans(),
+)
+def test_samples_and_clock_arrive_unchanged(
+    tmp_path_factory: pytest.TempPathFactory, values: np.ndarray, rate: float, start: float, compressed: bool
+) -> None:
+    folder = tmp_path_factory.mktemp("mat")
+    savemat(folder / "a.mat", {"v": values}, do_compression=compressed)
+    channel = f'variable = "v"\nunit = "V"\nsample_rate = {rate!r}\nstart = {start!r}\n'
+    (folder / "m.toml").write_text(f'format = "matlab"\n[channels.sense]\n{channel}')
+    convert_file(folder / "a.mat", folder / "m.toml", folder / "a.h5")
+    with Recording.open(folder / "a.h5") as recording:
+        sense = recording["sense"]
+        assert (recording.name, recording.device) == ("a", None)
+        assert (sense.sample_rate, sense.start) == (rate, start)
+        np.testing.assert_array_equal(sense.read(), values.astype(float))
+
+
+HOLDS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
+
+
+@pytest.mark.parametrize(
+    ("swap", "line"),
+    [
+        (
+            ("sample_rate = 1000.0", ""),
+            f"MAP: channels.sense_x: says no sample_rate of variable 'x'; add sample_rate = ...; {HOLDS}",
+        ),
+        (('unit = "nm"', ""), f"MAP: channels.intensity: says no unit of variable 'z'; add unit = ...; {HOLDS}"),
+        (('variable = "z"', ""), f"MAP: channels.intensity: says no variable; add variable = ...; {HOLDS}"),
+        (('variable = "x"', 'variable = "q"'), f"MAP: channels.sense_x: there is no variable 'q'; {HOLDS}"),
+        (('variable = "x"', "variable = 3"), "MAP: channels.sense_x: variable is 3 and must be text; put it in quotes"),
+        (('unit = "nm"', "unit = 3"), "MAP: channels.intensity: unit is 3 and must be text; put it in quotes"),
+        (
+            ("start = 0.25", "delay = 0.25"),
+            "MAP: channels.intensity: delay is not a known key; "
+            "known: variable, unit, sample_rate, start, scale, offset",
+        ),
+        (
+            ("scale = 1e4", "scale = 0"),
+            "MAP: channels.intensity: scale must be a number other than 0, offset a number; "
+            "channel = scale * variable + offset",
+        ),
+        (
+            ("offset = -1.0", "offset = nan"),
+            "MAP: channels.intensity: scale must be a number other than 0, offset a number; "
+            "channel = scale * variable + offset",
+        ),
+        (('unit = "V"', 'unit = "kg"'), "BOTH: sense_x: unit 'kg' is unknown; accepted units: V, mV, uV"),
+        (
+            ("1000.0", '"1 kHz"'),
+            "BOTH: sense_x: sample_rate is '1 kHz', not a finite number; state sample_rate as a number",
+        ),
+        (("1000.0", "-1"), "BOTH: sense_x: sample_rate is -1 Hz; state a rate greater than 0"),
+        (('"x"', '"z"'), "BOTH: sense_x: has shape (2, 2); store it as (n,)"),
+        (('"x"', '"cell"'), "BOTH: sense_x: holds object, not real numbers; store integers or floats"),
+        (('"x"', '"label"'), "BOTH: sense_x: holds <U5, not real numbers; store integers or floats"),
+        (('"matlab"', '"labview"'), "MAP: format: format 'labview' is unknown; known formats: matlab"),
+        (('format = "matlab"', ""), "MAP: format: states no format; known formats: matlab"),
+        (
+            ('name = "bench"', "sample_rate = 5"),
+            "MAP: sample_rate: is not a known key; known: format, name, notes, acquired, channels, device",
+        ),
+        (("gain = 2.0", ""), "MAP: x.readout.gain: is missing; [x.readout] needs gain, noise_sd"),
+        (("name =", "name"), "MAP: is not TOML: Expected '=' after a key in a key/value pair (at line 3, column 6); "
+         "correct the place it names"),
+    ],
+)  # fmt: skip
+def test_a_mapping_that_does_not_say_enough(bench: Path, swap: tuple[str, str], line: str) -> None:
+    source, mapping = bench / "run.mat", bench / "map.toml"
+    assert swap[0] in MAPPING
+    mapping.write_text(MAPPING.replace(*swap, 1))
+    with pytest.raises(BadInput) as caught:
+        convert_file(source, mapping, bench / "run.h5")
+    assert str(caught.value) == line.replace("MAP", str(mapping)).replace("BOTH", f"{source} by {mapping}")
+    assert not (bench / "run.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", "names no channels; add a table [channels.<name>] for each"),
+        ("channels = 3", "names no channels; add a table [channels.<name>] for each"),
+        (
+            'format = "matlab"\nchannels.sense_x = "x"',
+            "channels.sense_x: is 'x' and must be a table; write [channels.sense_x]",
+        ),
+        ("channels.sense.unit = 'V'\ndevice = 3", "device: must be a table; write [device.x.readout] and so on"),
+    ],
+)
+def test_a_text_that_is_no_mapping(bench: Path, text: str, line: str) -> None:
+    (bench / "map.toml").write_text(text)
+    with pytest.raises(BadInput) as caught:
+        convert(bench / "run.mat", bench / "map.toml")
+    assert str(caught.value) == f"{bench / 'map.toml'}: {line}"
+
+
+def test_a_bad_device_in_a_mapping_is_a_bad_device(bench: Path) -> None:
+    (bench / "map.toml").write_text(MAPPING.replace("[device.x.readout]", "[device.z.readout]"))
+    with pytest.raises(DeviceInvalid, match="holds no axis"):
+        convert(bench / "run.mat", bench / "map.toml")
+
+
+def test_a_file_that_matlab_did_not_write(bench: Path) -> None:
+    whole = (bench / "run.mat").read_bytes()
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    files = {
+        "gone.mat": (None, "no such file; name the instrument's file"),
+        "csv.mat": (b"t,V\n0,1\n", "is not a whole MATLAB file"),
+        "empty.mat": (b"", "is not a whole MATLAB file"),
+        "cut.mat": (whole[: len(whole) - 40], "is not a whole MATLAB file"),
+        "new.mat": (
+            head + bytes(400),
+            "is a MATLAB 7.3 file, which is not read yet; save it with the option -v7 in MATLAB",
+        ),
+    }
+    for name, (content, what) in files.items():
+        if content is not None:
+            (bench / name).write_bytes(content)
+        with pytest.raises(BadInput) as caught:
+            convert(bench / name, bench / "map.toml")
+        assert str(caught.value).startswith(f"{bench / name}: {what}")
+
+
+def test_the_shipped_mapping_holds_for_a_file_like_the_measured_one(tmp_path: Path) -> None:
+    savemat(tmp_path / "s.mat", {"x": np.array([0.0625, 0.1025]), "y": np.array([-0.0085, 0.0]), "z": np.ones(2)})
+    recording = convert(tmp_path / "s.mat", ROOT / "examples/afm_spiral.toml")
+    assert recording.device is not None
+    readout = recording.device.axis("x").require_readout()
+    microns = (recording["sense_x"].read() - readout.offset) / readout.gain  # type: ignore[union-attr]
+    np.testing.assert_allclose(microns, [0.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(recording["intensity"].read(), 1e4)
