@@ -118,6 +118,7 @@ def draw(pictures: dict[str, Picture], gratings: dict[str, Grating], output: Pat
     for panel, (name, picture) in zip(panels, pictures.items(), strict=False):
         grid = picture.grid
         extent = (-grid.half_angle_x, grid.half_angle_x, -grid.half_angle_y, grid.half_angle_y)
+        panel.set_facecolor("lightsteelblue")  # where the scan never came
         low, high = np.nanpercentile(picture.image, [1, 98.5])
         panel.imshow(picture.image, cmap="gray", vmin=low, vmax=high, origin="lower", extent=extent)
         panel.set(title=f"{name}: pitch {gratings[name].pitch:.3f} µm", xlabel="x (µm)", ylabel="y (µm)")
