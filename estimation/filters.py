@@ -158,7 +158,7 @@ def run_compiled(
     theta = np.empty((len(model.axes), signal.size))
     track = np.empty((len(model.axes), signal.size // stride, 4))
     stats, x, P = np.zeros(3), problem.x.copy(), problem.P.copy()
-    measure = np.array([model.gain, model.offset, model.noise_var])
+    measure = np.array([model.gain, model.offset, model.noise_var, model.section_noise])
     kernel(name, model)(
         signal,
         voltage,

@@ -5,7 +5,7 @@ Both kernels share their shape: ``kernel(y, voltage, parameters, sections, measu
 * y (n,): sense signal [V]; NaN is a gap, where the filter only predicts;
 * voltage (axes, n + 1): drive voltage [V], from the sample before the first on;
 * parameters (axes, 11), sections (sections, 3): see ``FilterModel``;
-* measure (3,): gain, offset, noise variance; noise (axes,): spectral height of the torque noise [(rad/s2)^2];
+* measure (4,): gain, offset, noise variance, section noise; noise (axes, 3): of theta and omega a step;
 * x (states,), P (states, states): state before the first sample, updated in place, so that a recording can be run in
   pieces;
 * theta (axes, n): the filtered angle [rad];
@@ -51,8 +51,7 @@ def _kernel(name: str, axes: int, kind: str, sections: int) -> Callable[..., Non
 def _assemble(name: str, axes: int, sections: int, body: list[str]) -> str:
     n = 2 * axes + sections
     before = [
-        "h = measure[0] * 0.0",
-        "gain, offset, R = measure[0], measure[1], measure[2]",
+        "gain, offset, R, section_noise = measure[0], measure[1], measure[2], measure[3]",
         *(f"a{a}_{key} = parameters[{a}, {i}]" for a in range(axes) for i, key in enumerate(AXIS_PARAMETERS)),
         *(f"s{s}_{key} = sections[{s}, {i}]" for s in range(sections) for i, key in enumerate("epq")),
         *(f"q{a}_{i} = noise[{a}, {i}]" for a in range(axes) for i in range(3)),
@@ -60,7 +59,7 @@ def _assemble(name: str, axes: int, sections: int, body: list[str]) -> str:
         *(f"p{i}_{j} = P[{i}, {j}]" for i in range(n) for j in range(i, n)),
         "count, chi2, logdet = 0, 0.0, 0.0",
         "for i in range(y.size):",
-    ][1:]
+    ]
     tail = [
         *(f"theta[{a}, i] = x{2 * a}" for a in range(axes)),
         "if (i + 1) % stride == 0:",
@@ -87,13 +86,14 @@ def _parameters(a: int) -> str:
     return ", ".join(f"a{a}_{key}" for key in AXIS_PARAMETERS)
 
 
-def _noise(axes: int) -> Matrix:
-    """Process noise of each axis: white torque over a sample (chen2020 eq 12)."""
-    return {
+def _noise(axes: int, sections: int) -> Matrix:
+    """Process noise: of each axis white torque over a sample (chen2020 eq 12), of each section its input's error."""
+    torque = {
         key: f"q{a}_{c}"
         for a in range(axes)
         for c, key in enumerate(((2 * a, 2 * a), (2 * a, 2 * a + 1), (2 * a + 1, 2 * a + 1)))
     }
+    return torque | {(u, u): "section_noise" for u in range(2 * axes, 2 * axes + sections)}
 
 
 def _gain_and_update(n: int, covariance: list[str], r: str) -> list[str]:
@@ -151,7 +151,7 @@ def _ekf(axes: int, kind: str, sections: int) -> str:
                     F[u, j] = f"f{u}_{j}"
         F[u, u] = f"s{s}_e"
         lines += [f"x{u}_before = x{u}", f"x{u} = s{s}_e * x{u} + s{s}_p * old{s} + s{s}_q * new{s}"]
-    lines += sandwich(F, n, _noise(axes))
+    lines += sandwich(F, n, _noise(axes, sections))
     H: dict[int, str] = {}
     if sections:
         predicted, H = f"gain * x{n - 1} + offset", {n - 1: "gain"}
@@ -247,7 +247,7 @@ def _ukf(axes: int, kind: str, sections: int) -> str:
         for point in used:
             emit(f"e_{state(i, point)}", f"e_{state(i, point)} = {state(i, point)} - m{i}")
     lines += [f"{at('ez', p)} = {at('z', p)} - mz" for p in used]
-    noise = _noise(axes)
+    noise = _noise(axes, sections)
     for i in range(n):
         for j in range(i, n):
             terms = [f"{weight[p]} * e_{state(i, p)} * e_{state(j, p)}" for p in used]

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from scanner.device import Amdm, Axis, Device, Position, Readout
+from scanner.device import Amdm, Axis, Capacitance, Device, Position, Readout
 from scanner.errors import DeviceInvalid
 from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, electrostatic_torque
 from scanner.lowpass import step_coefficients
@@ -78,6 +78,8 @@ class FilterModel:
         sections: (e, p, q) of each low-pass section, shape (sections, 3).
         gain, offset: of the readout: a_cir, b_cir; -R_s V_bias, 0; gain, offset.
         noise_var: of the measurement [V^2].
+        section_noise: variance that each section gains a step [F^2]: the error of taking its input as linear between
+            samples. Without it the sections are known but for rounding, which then makes the covariance singular.
     """
 
     axes: tuple[str, ...]
@@ -88,6 +90,7 @@ class FilterModel:
     gain: float
     offset: float
     noise_var: float
+    section_noise: float
 
     @property
     def states(self) -> int:
@@ -127,7 +130,12 @@ def filter_model(
         gain=gain,
         offset=own_offset if offset is None else offset,
         noise_var=readout.noise_sd**2,
+        section_noise=max((1e-6 * bell.C0) ** 2 for bell in bells) if (bells := _bells(device, axes)) else 0.0,
     )
+
+
+def _bells(device: Device, axes: tuple[str, ...]) -> list[Capacitance]:
+    return [bell for name in axes if (bell := device.axis(name).capacitance) is not None]
 
 
 def axis_parameters(axis: Axis, step: float, readout: Readout) -> list[float]:

@@ -91,6 +91,8 @@ def run_reference(problem: Problem, name: str, heights: Array, samples: int | No
     Q = np.zeros((n, n))
     for a, (q11, q12, q22) in enumerate(torque_noise(model, heights)):
         Q[2 * a : 2 * a + 2, 2 * a : 2 * a + 2] = [[q11, q12], [q12, q22]]
+    for u in range(2 * len(model.axes), n):
+        Q[u, u] = model.section_noise
     if name == "ekf":
         engine = ExtendedKalmanFilter(dim_x=n, dim_z=1)
     else:

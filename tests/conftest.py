@@ -1,0 +1,20 @@
+"""Shared by all tests."""
+
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+# The first call of a compiled function takes seconds; examples are the same in every run.
+hypothesis.settings.register_profile("house", deadline=None, derandomize=True, max_examples=50)
+hypothesis.settings.load_profile("house")
+
+DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def measured_data() -> Path:
+    """Folder of measured data; a test that asks for it is skipped, and says so, where the folder is absent."""
+    if not DATA.is_dir():
+        pytest.skip(f"no measured data at {DATA}")
+    return DATA
