@@ -211,6 +211,18 @@ def test_channels_of_one_clock_are_cut_and_not_interpolated() -> None:
     np.testing.assert_allclose(values["intensity"][2], 0.6 * slow[0] + 0.4 * slow[1])
 
 
+@pytest.mark.parametrize("rates", [(1e6, 1e6), (1e6, 2.5e5)])
+@pytest.mark.parametrize("lag", [0.3, -0.4, 7.25])
+def test_the_clock_is_the_fastest_channels_own_and_part_of_a_sample_is_a_delay(rates: tuple, lag: float) -> None:
+    sense, drive = ramp(rates[0], 0.1, 100), ramp(rates[1], 0.1 + lag / rates[0], 20)
+    noise = np.random.default_rng(2).normal(size=100)
+    recording = Recording.from_arrays({"sense_x": (noise, *sense[1:]), "drive_x": drive})
+    clock, values = on_clock(recording, ["sense_x", "drive_x"])
+    first = max(0, int(np.ceil(lag)))
+    np.testing.assert_array_equal(values["sense_x"], noise[first : first + clock.n])
+    np.testing.assert_allclose(values["drive_x"], clock.time, rtol=0, atol=1e-12)
+
+
 def test_channels_that_never_meet_are_named_with_their_times() -> None:
     recording = Recording.from_arrays({"sense_x": ramp(10, 0, 5), "drive_x": ramp(10, 3, 5)})
     with pytest.raises(BadInput, match=r"no time in common: sense_x 0 to 0.5 s, drive_x 3 to 3.5 s"):
