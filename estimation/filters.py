@@ -274,10 +274,51 @@ def _axis_motion(
         amplitude=np.abs(phasors),
         frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
         phase_sd=mean_sd,
-        angle=AngleTrack(on_clock_of(filtered.theta[i], channel, clock), clock[0], clock[1]),
+        angle=slow_angle(filtered.theta[i], channel, reference, time, phase, np.abs(phasors), clock),
         reference=reference.kind,
         sign=problem.start.axes[name].sign,
     )
+
+
+def slow_angle(
+    theta: Array,
+    channel: Channel,
+    reference: Reference,
+    knots: Array,
+    phase: Array,
+    amplitude: Array,
+    clock: tuple[float, float, int],
+) -> AngleTrack:
+    """The angle that slow phase and amplitude make, A sin(psi + phi), with the third harmonic that the torque adds.
+
+    A filter's angle holds the sense signal's noise from sample to sample; the motion has no such frequencies. The third
+    harmonic, a part in a thousand of A in a fixed relation to the fundamental, is averaged over the whole of ``theta``.
+
+    Args:
+        theta: filtered angle at the samples of ``channel``, shape (n,) [rad].
+        knots, phase, amplitude: slow clock [s], phase [rad] and amplitude [rad] on it.
+        clock: (rate [Hz], start [s], samples) of the result; NaN where ``channel`` does not reach.
+    """
+
+    def fundamental(time: Array) -> tuple[Array, Array]:
+        return reference.phase(time) + _extended(time, knots, phase), _extended(time, knots, amplitude)
+
+    turn, size = fundamental(channel.time())
+    third = 2.0 * np.mean((theta - size * np.sin(turn)) / size * np.exp(-3j * turn))
+    rate, start, n = clock
+    time = start + np.arange(n) / rate
+    if (rate, start, n) != (channel.sample_rate, channel.start, channel.size):
+        turn, size = fundamental(time)
+    angle = size * (np.sin(turn) + np.abs(third) * np.cos(3.0 * turn + np.angle(third)))
+    angle[(time < channel.start - 0.5 / rate) | (time > channel.end)] = np.nan
+    return AngleTrack(angle, rate, start)
+
+
+def _extended(time: Array, knots: Array, values: Array) -> Array:
+    """Linear interpolation that goes on with the end's slope beyond the knots."""
+    first, last = ((values[i + 1] - values[i]) / (knots[i + 1] - knots[i]) for i in (0, -2))
+    inside = np.interp(time, knots, values)
+    return inside + np.minimum(time - knots[0], 0.0) * first + np.maximum(time - knots[-1], 0.0) * last
 
 
 def _phase_variance(theta: Array, track: Array, w: float) -> Array:

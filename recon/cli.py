@@ -1,0 +1,73 @@
+"""The command line: ``lissajous COMMAND``. Each command is a module of ``recon.commands``, imported when asked for."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+COMMANDS = {
+    "reconstruct": "track the motion of a recording and map its intensities to a picture",
+    "simulate": "make a recording with a known truth",
+    "convert": "turn an instrument's file into a recording",
+}
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0 done, 2 bad arguments or input, 1 anything else."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    parser = _Parser(
+        prog="lissajous", description="Resonant scanners: motion, pictures and missing physics from recordings."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+    for name, text in COMMANDS.items():
+        asked_for = name in given[:1]  # only its module is imported, so that --help stays quick
+        command = commands.add_parser(
+            name, help=text, description=text[0].upper() + text[1:] + "." if asked_for else None
+        )
+        if asked_for:
+            module = importlib.import_module(f"recon.commands.{name.replace('-', '_')}")
+            module.add_arguments(command)
+            command.add_argument(
+                "--json", action="store_true", help="print the summary as JSON, and nothing else, on stdout"
+            )
+    args = parser.parse_args(given)
+    return _run(module, args, f"{parser.prog} {args.command}")
+
+
+def reconstruct_main() -> int:
+    """``reconstruct-from-recording``: ``lissajous reconstruct`` under the name people look for."""
+    return main(["reconstruct", *sys.argv[1:]])
+
+
+def _run(module: object, args: argparse.Namespace, prog: str) -> int:
+    from scanner.errors import BadInput
+
+    try:
+        summary = module.run(args)  # type: ignore[attr-defined]
+        print(json.dumps(summary, indent=1) if args.json else module.tell(summary))  # type: ignore[attr-defined]
+    except BadInput as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:  # a full disk, a folder that may not be written
+        print(f"{prog}: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted; nothing was written", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

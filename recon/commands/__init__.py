@@ -1,0 +1,1 @@
+"""The commands, one module each: ``add_arguments(parser)``, ``run(args) -> summary``, ``tell(summary) -> lines``."""

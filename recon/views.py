@@ -1,0 +1,156 @@
+"""Pictures for people: the reconstruction, its coverage, phase against time, blur by cause. Each becomes a data URI."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.score import AxisError
+from scanner.motion import AxisMotion
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+UNVISITED = "#20405f"  # pixels the beam never reached; no grey of a picture
+COLOURS = ("#2f6fb0", "#c8553d", "#3d8f5f", "#8a5fb0", "#b08a2f")
+
+
+def stretched(image: NDArray[Any], limits: tuple[float, float] | None = None) -> Array:
+    """Values in [0, 1] between the 0.5 and 99.5 percentiles, or ``limits``; NaN stays, detectors are averaged."""
+    values = np.asarray(image if image.ndim == 2 else image.mean(-1), np.float64)
+    low, high = limits or contrast(values)
+    return np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0)
+
+
+def contrast(image: NDArray[Any]) -> tuple[float, float]:
+    """The 0.5 and 99.5 percentiles of the visited pixels."""
+    low, high = np.nanpercentile(image, [0.5, 99.5])
+    return float(low), float(high)
+
+
+def coloured(image: NDArray[Any], limits: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+    """Grey picture as RGB, shape (H, W, 3), with ``UNVISITED`` where there is no value."""
+    grey = stretched(image, limits)
+    rgb = np.repeat((255 * np.nan_to_num(grey)).astype(np.uint8)[..., None], 3, axis=2)
+    rgb[np.isnan(grey)] = [int(UNVISITED[i : i + 2], 16) for i in (1, 3, 5)]
+    return rgb
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    """RGB or grey picture as PNG."""
+    import cv2
+
+    done, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not done:
+        raise OSError("a picture could not be encoded as PNG")
+    return data.tobytes()
+
+
+def save_picture(path: Path, image: NDArray[Any]) -> None:
+    """image.png: the picture for the eye; values stand in image.tif."""
+    path.write_bytes(png(coloured(image)))
+
+
+def uri(data: bytes, kind: str = "image/png") -> str:
+    """Data URI, so that the page needs no other file."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def figure_uri(figure: Figure) -> str:
+    """A figure as SVG in a data URI; text in it cannot reach the page."""
+    import matplotlib.pyplot as plt
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", bbox_inches="tight")
+    plt.close(figure)
+    return uri(buffer.getvalue(), "image/svg+xml")
+
+
+def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.0, 3.0)) -> tuple[Figure, Any]:
+    """A figure in the house's style, drawn without a screen."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    with plt.rc_context(
+        {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "lissajous"}
+    ):
+        return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+
+
+def phase_figure(
+    motions: Mapping[str, AxisMotion],
+    bound: float,
+    errors: Mapping[str, AxisError],
+    seen: Sequence[tuple[float, float, float]] = (),
+    title: str = "",
+) -> str:
+    """Phase of one axis against time with its ±2 sd band, and below, where truth or picture tell one, its error.
+
+    Args:
+        motions: by the name to show. bound: p/m [rad]. errors: by the same names.
+        seen: (time, value, sd) of the phase error that the picture shows [s, rad, rad].
+    """
+    lower = bool(errors) or bool(seen)
+    drawing, axes = figure(2 if lower else 1, 1, (7.0, 5.0 if lower else 2.8))
+    top = axes[0, 0]
+    for (name, axis), colour in zip(motions.items(), COLOURS, strict=False):
+        t, phase = 1e3 * axis.time, np.degrees(axis.phase)
+        phase = phase - 180.0 * np.round((phase[0] - np.degrees(next(iter(motions.values())).phase[0])) / 180.0)
+        sd = np.degrees(axis.phase_sd)
+        top.fill_between(t, phase - 2 * sd, phase + 2 * sd, color=colour, alpha=0.2, lw=0)
+        top.plot(t, phase, color=colour, lw=1.2, label=name)
+    top.set(ylabel="phase [°]", title=title)
+    top.legend(frameon=False, fontsize=8)
+    if lower:
+        bottom = axes[1, 0]
+        largest = np.degrees(bound)
+        bottom.axhspan(-largest, largest, color="#3d8f5f", alpha=0.15, lw=0, label="±p/m")
+        for (name, error), colour in zip(errors.items(), COLOURS, strict=False):
+            bottom.plot(1e3 * error.time, np.degrees(error.phase), color=colour, lw=1.0, label=f"{name}: true error")
+        told = [each for each in seen if np.isfinite(each[2])]
+        if told:
+            t, value, sd = (np.array(column) for column in zip(*told, strict=True))
+            bottom.errorbar(
+                1e3 * t, np.degrees(value), 2 * np.degrees(sd), fmt="o", ms=3, color="#444", label="seen in the picture"
+            )
+        bottom.set(ylabel="phase error [°]")
+        bottom.legend(frameon=False, fontsize=8, ncols=3)
+    axes[-1, 0].set_xlabel("time [ms]")
+    return figure_uri(drawing)
+
+
+def blur_figure(parts: Mapping[str, Mapping[str, float]], p: float) -> str:
+    """Blur by cause [px], a group of bars for each entry of ``parts``, with the tolerated p."""
+    drawing, axes = figure(size=(7.0, 2.6))
+    own = axes[0, 0]
+    causes = list(next(iter(parts.values())))
+    width = 0.8 / len(parts)
+    for i, ((name, values), colour) in enumerate(zip(parts.items(), COLOURS, strict=False)):
+        own.bar(
+            np.arange(len(causes)) + (i - (len(parts) - 1) / 2) * width,
+            list(values.values()),
+            width,
+            color=colour,
+            label=name,
+        )
+    own.axhline(p, color="#444", lw=0.8, ls="--")
+    own.text(len(causes) - 0.5, p, " p", va="center")
+    own.set(xticks=np.arange(len(causes)), xticklabels=causes, ylabel="blur, rms [px]")
+    own.legend(frameon=False, fontsize=8)
+    return figure_uri(drawing)
+
+
+def coverage_image(coverage: NDArray[Any]) -> NDArray[np.uint8]:
+    """Samples a pixel as a picture: white is the 99th percentile and above, ``UNVISITED`` where there are none."""
+    counts = np.where(coverage > 0, coverage, np.nan).astype(np.float64)
+    return coloured(counts, (0.0, float(np.nanpercentile(counts, 99))))
