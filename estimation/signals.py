@@ -90,7 +90,18 @@ def reference_of(
     if f"drive_{axis}" in recording:
         drive = recording[f"drive_{axis}"]
         check_signal(drive)
-        return drive_reference(drive, "half-drive" if own.require_drive().kind == "electrostatic" else "drive")
+        if own.require_drive().kind == "linear":
+            return drive_reference(drive, "drive")
+        reference = drive_reference(drive, "half-drive")
+        if own.mechanics and not 0.75 < reference.frequency / own.resonance < 1.33:
+            raise BadInput(
+                f"oscillates at {2 * reference.frequency:.6g} Hz, and axis {axis} moves at half of that near its resonance "
+                f"of {own.resonance:.6g} Hz",
+                file=drive.file,
+                channel=drive.name,
+                hint="check its sample_rate, and J and k of the device",
+            )
+        return reference
     if sense is None:
         raise ChannelMissing(
             "is not in the recording and no other channel tells the motion's frequency",

@@ -47,7 +47,7 @@ def main(folder: Path) -> None:
         (beside / "report.html").write_text(page, encoding="utf-8")
         (beside / "summary.json").write_text(json.dumps(summaries, indent=1), encoding="utf-8")
         for name, result in results.items():
-            save_picture(beside / f"{name.replace(' ', '-').lower()}.png", result.picture.image)
+            save_picture(beside / f"{name.replace(' ', '-').lower()}.png", result.picture)
     for name, summary in summaries.items():
         x, y, ratio = summary["x"], summary["y"], summary["picture"]["rms"] / summaries["true motion"]["picture"]["rms"]
         print(

@@ -145,7 +145,7 @@ def reconstruct_file(path: Path, output: Path, options: Options) -> dict[str, An
             write_tiff(folder / "fill.tif", mask.astype(np.uint8))
         write_motion(folder / "motion.h5", result.motion)
         write_json(folder / "summary.json", summary)
-        save_picture(folder / "image.png", result.picture.image)
+        save_picture(folder / "image.png", result.picture)
         (folder / "report.html").write_text(reconstruction_report(result, summary), encoding="utf-8")
     return summary
 
@@ -172,13 +172,12 @@ def _register(motion: Motion, intensity: Array, grid: Grid) -> list[PhaseError]:
 
 
 def seen_by_picture(seen: list[PhaseError], axis: str) -> dict[str, float]:
-    """Phase error over the slices that tell one, weighted by their certainty, with its standard error [degrees]."""
+    """Phase error [degrees], mean over the slices that tell one, with its standard error; else nan, inf."""
     told = [estimate for each in seen if np.isfinite((estimate := getattr(each, axis)).sd)]
     if not told:
         return {"value": float("nan"), "sd": float("inf")}
-    weight = np.array([1.0 / estimate.sd**2 for estimate in told])
-    value = float(np.sum(weight * [estimate.value for estimate in told]) / weight.sum())
-    return {"value": float(np.degrees(value)), "sd": float(np.degrees(weight.sum() ** -0.5))}
+    value, sd = (np.array(column) for column in zip(*told, strict=True))
+    return {"value": float(np.degrees(value.mean())), "sd": float(np.degrees(np.sqrt(np.sum(sd**2)) / sd.size))}
 
 
 def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:

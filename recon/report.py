@@ -61,7 +61,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) ->
         f"{grid.height} pixels, {summary['fill']:.1%} of them visited; {result.seconds:.2f} s to compute."
     )
     pictures = (
-        Figure(picture_uri(result.picture.image), f"picture ({result.motion.estimator})"),
+        Figure(picture_uri(views.visible(result.picture)), f"picture ({result.motion.estimator})"),
         Figure(
             views.uri(views.png(views.coverage_image(result.picture.coverage))), "samples a pixel; blue: never visited"
         ),
@@ -81,7 +81,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) ->
 def comparison_report(
     title: str, lead: str, results: Mapping[str, Reconstruction], summaries: Mapping[str, Mapping[str, Any]]
 ) -> str:
-    """Several reconstructions of one recording side by side; the last one is the reference that pictures are held to."""
+    """Several reconstructions of one recording side by side; pictures are held to the last, the reference."""
     *estimated, reference = results
     first = results[estimated[0]]
     limits = views.contrast(results[reference].picture.image)
@@ -109,15 +109,15 @@ def comparison_report(
     return render(title, lead, sections)
 
 
-COVERAGE_CAPTION = "samples a pixel; blue: never visited"
+COVERAGE_CAPTION = "samples a pixel; blue: never visited (in the pictures filled from neighbours up to 2 pixels away)"
 BLUR_TEXT = (
     "Displacement in pixels, rms over the scan, by cause; the causes add in quadrature to the total. The amplitude's "
     "uniform scale is magnification and is not counted."
 )
 PICTURE_TEXT = (
     "Phase errors against the truth of the simulation, rms over the whole scan. The picture's own word needs no truth: "
-    "how far forward and backward sweeps lie apart. Picture error: rms against the noiseless scene over visited pixels, "
-    "once a uniform magnification is taken out, and its ratio to that of the true motion."
+    "how far forward and backward sweeps lie apart. Picture error: rms against the noiseless scene over visited "
+    "pixels, once a uniform magnification is taken out, and its ratio to that of the true motion."
 )
 
 
@@ -196,7 +196,7 @@ def _picture_cell(picture: Mapping[str, float], best: float) -> str:
 
 def _upright(result: Reconstruction) -> Any:
     flip_x, flip_y = mirrored(result)
-    return result.picture.image[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
+    return views.visible(result.picture)[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
 
 
 def _middle(image: Any) -> Any:

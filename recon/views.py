@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.mapping import Picture, fill_holes
 from recon.score import AxisError
 from scanner.motion import AxisMotion
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 UNVISITED = "#20405f"  # pixels the beam never reached; no grey of a picture
+FILL_FOR_THE_EYE = 2  # pixels
 COLOURS = ("#2f6fb0", "#c8553d", "#3d8f5f", "#8a5fb0", "#b08a2f")
 
 
@@ -54,9 +56,14 @@ def png(image: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
-def save_picture(path: Path, image: NDArray[Any]) -> None:
-    """image.png: the picture for the eye; values stand in image.tif."""
-    path.write_bytes(png(coloured(image)))
+def visible(picture: Picture) -> NDArray[np.float32]:
+    """A picture for the eye: holes of a pixel or two filled from their neighbours; wider ones stay NaN."""
+    return fill_holes(picture, FILL_FOR_THE_EYE)[0]
+
+
+def save_picture(path: Path, picture: Picture) -> None:
+    """image.png: the picture for the eye; what was measured, and where, stands in image.tif and coverage.tif."""
+    path.write_bytes(png(coloured(visible(picture))))
 
 
 def uri(data: bytes, kind: str = "image/png") -> str:

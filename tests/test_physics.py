@@ -14,7 +14,7 @@ from scanner.harmonics import capacitance_harmonics, readout_response
 from scanner.integrate import rk4
 from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, electrostatic_torque
 from scanner.lowpass import lowpass, response, step_coefficients
-from scanner.parametric import slow_flow, sine_drive, steady_state, stiffness_modulation, threshold, tongue_edges
+from scanner.parametric import sine_drive, slow_flow, steady_state, stiffness_modulation, threshold, tongue_edges
 
 COMB = Capacitance(C0=5.71e-12, Cb=9.79e-12, theta0=0.2, theta_th=0.01)
 DRIVEN = devices.load("chen2020-driven").axis("x")
