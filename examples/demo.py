@@ -8,14 +8,17 @@ import sys
 import time
 from pathlib import Path
 
+import afm_spiral
+
 from phantoms.experiment import Experiment, run
 from recon.output import finite, replacing_folder
 from recon.pipeline import Options, reconstruct, summarise
-from recon.report import comparison_report
+from recon.report import Figure, Section, comparison_report
 from recon.score import truth_of
-from recon.views import save_picture
+from recon.views import save_picture, uri
 from scanner.recording import Recording
 
+SPIRAL = Path(__file__).parent.parent.parent / "shared" / "data" / "afm_spiral"
 ESTIMATORS = {"constant phase": "constant", "EKF": "ekf", "UKF": "ukf"}
 LEAD = (
     "A tissue picture under a resonant scanner, both axes on one electrode, 400 × 400 pixels, 60 ms at 5 MS/s. Both "
@@ -42,8 +45,11 @@ def main(folder: Path) -> None:
         with_angles = Recording.from_arrays(channels, recording.device, name="true motion")
         results["true motion"] = reconstruct(with_angles, Options(estimator="sensor"), known)
     summaries = {name: finite(summarise(result)) for name, result in results.items()}
+    further = [measured_spiral(folder / "afm_spiral")] if SPIRAL.is_dir() else []
     with replacing_folder(folder) as beside:
-        page = comparison_report("Lissajous: from a drifting scan to a sharp picture", LEAD, results, summaries)
+        page = comparison_report(
+            "Lissajous: from a drifting scan to a sharp picture", LEAD, results, summaries, further
+        )
         (beside / "report.html").write_text(page, encoding="utf-8")
         (beside / "summary.json").write_text(json.dumps(summaries, indent=1), encoding="utf-8")
         for name, result in results.items():
@@ -55,6 +61,20 @@ def main(folder: Path) -> None:
             f"{x['within_bound']:.1%}, {y['within_bound']:.1%}; picture error {ratio:.2f} × that of the true motion"
         )
     print(f"picture: {folder / 'ukf.png'}\nreport:  {folder / 'report.html'}   ({time.perf_counter() - began:.1f} s)")
+
+
+def measured_spiral(folder: Path) -> Section:
+    """The AFM's spiral, reconstructed from its sensors and from the command, as a section of the report."""
+    print("reconstructing the measured AFM spiral ...", file=sys.stderr)
+    afm_spiral.main(SPIRAL, folder)
+    drawing = Figure(
+        uri((folder / "afm_spiral.png").read_bytes()), "from the position sensors, as commanded, raster scan"
+    )
+    text = (
+        "An atomic-force microscope's spiral over a grating of 3 µm pitch, gridded where its position sensors say that "
+        "the stage was, and where it was told to be; beside them the raster scan of the same sample."
+    )
+    return Section("Measured: an AFM spiral", text, figures=[drawing], least="40rem")
 
 
 if __name__ == "__main__":

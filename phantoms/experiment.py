@@ -64,7 +64,8 @@ def run(experiment: Experiment, seed: int = 0, nominal: Device | None = None) ->
         drift={axis: Drift(settling(change, experiment.drift_tau)) for axis, change in experiment.drift.items()},
         angles=experiment.angles,
     )
-    return simulate(experiment.device, plan, Scene(light, experiment.detector), seed, nominal=nominal)
+    recording, truth = simulate(experiment.device, plan, Scene(light, experiment.detector), seed, nominal=nominal)
+    return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}  # of the field's width
 
 
 def device_named(name: str) -> Device:

@@ -43,6 +43,7 @@ class Options:
         pixels: width, height. p: pixels of shift that are tolerated.
         flips: axes whose sign is turned.
         fill_radius: holes up to this many pixels are filled, and marked as fill; 0 fills none.
+        spot: standard deviation of the beam's spot [px], for the blur's account; the recording does not tell it.
     """
 
     device: Path | None = None
@@ -51,6 +52,7 @@ class Options:
     p: float = 1.0
     flips: Mapping[str, bool] = field(default_factory=dict)
     fill_radius: int = 0
+    spot: float | None = None
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Reconstruction:
 
     Attributes:
         motion, picture: the result.
-        p: pixels tolerated.
+        p: pixels tolerated. spot: as in ``Options``.
         seen: phase error of each time slice as forward and backward sweeps show it.
         errors: estimate against truth by axis; empty without a truth.
         truth: None without one.
@@ -72,6 +74,7 @@ class Reconstruction:
     motion: Motion
     picture: Picture
     p: float
+    spot: float | None
     seen: list[PhaseError]
     errors: Mapping[str, AxisError]
     truth: Truth | None
@@ -124,9 +127,19 @@ def reconstruct(recording: Recording, options: Options, truth: Truth | None = No
     for axis in AXES:
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
-    seconds = time.perf_counter() - began
-    recorded = intensity.size / intensity.sample_rate
-    return Reconstruction(motion, picture, options.p, seen, errors, truth, notes, seconds, recorded, recording.name)
+    return Reconstruction(
+        motion=motion,
+        picture=picture,
+        p=options.p,
+        spot=options.spot,
+        seen=seen,
+        errors=errors,
+        truth=truth,
+        notes=notes,
+        seconds=time.perf_counter() - began,
+        recorded=intensity.size / intensity.sample_rate,
+        name=recording.name,
+    )
 
 
 def reconstruct_file(path: Path, output: Path, options: Options) -> dict[str, Any]:
@@ -214,7 +227,8 @@ def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEr
     half = grid.half_angle_x if axis == "x" else grid.half_angle_y
     phase = own.phase_sd if error is None else error.phase
     amplitude = np.zeros(1) if error is None else error.amplitude - np.mean(error.amplitude)
-    return blur.parts(float(np.mean(own.amplitude)), half, result.pixels(axis), phase, amplitude)
+    spot = result.truth.spot_sd * result.pixels("x") if result.spot is None and result.truth else result.spot or 0.0
+    return blur.parts(float(np.mean(own.amplitude)), half, result.pixels(axis), phase, amplitude, spot)
 
 
 def summarise(result: Reconstruction) -> dict[str, Any]:

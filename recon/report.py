@@ -79,9 +79,17 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) ->
 
 
 def comparison_report(
-    title: str, lead: str, results: Mapping[str, Reconstruction], summaries: Mapping[str, Mapping[str, Any]]
+    title: str,
+    lead: str,
+    results: Mapping[str, Reconstruction],
+    summaries: Mapping[str, Mapping[str, Any]],
+    further: Sequence[Section] = (),
 ) -> str:
-    """Several reconstructions of one recording side by side; pictures are held to the last, the reference."""
+    """Several reconstructions of one recording side by side; pictures are held to the last, the reference.
+
+    Args:
+        further: sections to end with.
+    """
     *estimated, reference = results
     first = results[estimated[0]]
     limits = views.contrast(results[reference].picture.image)
@@ -90,21 +98,22 @@ def comparison_report(
         image = _upright(result)
         pictures.append(Figure(picture_uri(image, limits), caption(name, summaries[name])))
         enlarged.append(Figure(picture_uri(_middle(image), limits), f"{name}, the middle enlarged"))
-    heads = [
-        f"{what} {axis}" for axis in AXES for what in ("phase error rms", "within ±p/m", "seen by the picture [°],")
-    ]
     best = summaries[reference]["picture"]["rms"]
-    rows = [[name, *_figures_of(summaries[name]), _picture_cell(summaries[name]["picture"], best)] for name in results]
-    blurs = {f"{name}, {axis}": summaries[name][axis]["blur_px"] for name in estimated for axis in AXES}
+    columns = [[*_figures_of(summaries[name]), _picture_cell(summaries[name]["picture"], best)] for name in results]
+    whats = ("phase error, rms,", "scan within ±p/m,", "error seen by the picture,")
+    heads = [*(f"{what} {axis}" for axis in AXES for what in whats), "picture error"]
+    rows = [[head, *cells] for head, *cells in zip(heads, *columns, strict=True)]
+    blurs = {name: _both_axes(summaries[name]) for name in estimated}
     coverage = Figure(views.uri(views.png(views.coverage_image(first.picture.coverage))), COVERAGE_CAPTION)
     tracked = {name: results[name] for name in estimated}
     sections = [
         Section("One recording, one picture an estimator", figures=pictures, pixelated=True),
         Section("Enlarged", figures=enlarged, pixelated=True),
-        Section("In figures", PICTURE_TEXT, Table(["", *heads, "picture error"], rows)),
+        Section("In figures", PICTURE_TEXT, Table(["", *results], rows)),
         Section("Phase", _phase_text(first), None, phase_figures(tracked), "26rem"),
         Section("Blur", BLUR_TEXT, figures=[blur_of(blurs, first.p)], least="30rem"),
         Section("Coverage", figures=[coverage], least="20rem", pixelated=True),
+        *further,
     ]
     return render(title, lead, sections)
 
@@ -129,7 +138,7 @@ def axis_table(summary: Mapping[str, Any]) -> Table:
     rows += [
         ["bound p/m [°]", *(f"{summary[a]['bound_deg']:.4f}" for a in AXES)],
         ["scan within the bound", *(f"{summary[a]['within_bound']:.1%}" for a in AXES)],
-        ["phase error seen by the picture [°]", *(_seen(summary[a]["picture_phase_error_deg"]) for a in AXES)],
+        ["phase error seen by the picture", *(_seen(summary[a]["picture_phase_error_deg"]) for a in AXES)],
         ["phase's drift over the scan [°]", *(f"{summary[a]['phase_drift_deg']:.3f}" for a in AXES)],
         ["amplitude [rad]", *(f"{summary[a]['amplitude_rad']:.5f}" for a in AXES)],
         ["frequency [Hz]", *(f"{summary[a]['frequency_hz']:.3f}" for a in AXES)],
@@ -177,7 +186,7 @@ def _seen(value: Mapping[str, Any]) -> str:
     return (
         "nothing to tell"
         if value["value"] is None or value["sd"] is None
-        else f"{value['value']:+.3f} ± {value['sd']:.3f}"
+        else f"{value['value']:+.3f}° ± {value['sd']:.3f}°"
     )
 
 
@@ -188,6 +197,13 @@ def _figures_of(summary: Mapping[str, Any]) -> list[str]:
         cells += [f"{own['phase_rmse_deg']:.3f}°" if "phase_rmse_deg" in own else "", f"{own['within_bound']:.1%}"]
         cells.append(_seen(own["picture_phase_error_deg"]))
     return cells
+
+
+def _both_axes(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Blur by cause, the two axes' displacements added in quadrature [px]."""
+    return {
+        cause: float(np.hypot(*(summary[axis]["blur_px"][cause] for axis in AXES))) for cause in summary["x"]["blur_px"]
+    }
 
 
 def _picture_cell(picture: Mapping[str, float], best: float) -> str:

@@ -46,10 +46,17 @@ class AxisError:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulation knew: angles with their clock by axis, and the noiseless scene over the whole field."""
+    """What a simulation knew.
+
+    Attributes:
+        angles: (values [rad], sample rate [Hz], start [s]) by axis.
+        scene: noiseless, over the whole field, beam spot included; None where not told.
+        spot_sd: of the beam, as a fraction of the field's width; 0 where not told.
+    """
 
     angles: Mapping[str, tuple[Array, float, float]]
     scene: Array | None
+    spot_sd: float
 
 
 def truth_of(path: Path) -> Truth | None:
@@ -72,7 +79,11 @@ def truth_of(path: Path) -> Truth | None:
         angles[axis] = (np.asarray(values, np.float64), float(attrs["sample_rate"]), float(attrs.get("start", 0.0)))
     scene = (told or {}).get("scene")
     scene = scene[0] if isinstance(scene, tuple) else scene
-    return Truth(angles, None if scene is None else np.asarray(scene, np.float64)) if angles else None
+    if not angles:
+        return None
+    return Truth(
+        angles, None if scene is None else np.asarray(scene, np.float64), float((told or {}).get("spot_sd", 0.0))
+    )
 
 
 def axis_error(axis: AxisMotion, angle: Array, rate: float, start: float) -> AxisError:

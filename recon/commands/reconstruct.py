@@ -45,6 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help="fill holes up to PX pixels wide, marked in fill.tif (0: none)",
     )
+    parser.add_argument(
+        "--spot", type=positive, metavar="PX", help="sd of the beam's spot in pixels, for the blur's account"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of whatever is drawn at random (nothing is, at present)")
 
 
@@ -61,13 +64,12 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             p=args.p,
             flips={"x": args.flip_x, "y": args.flip_y},
             fill_radius=args.fill,
+            spot=args.spot,
         ),
     )
 
 
 def tell(summary: dict[str, Any]) -> str:
-    from math import isfinite
-
     lines = [f"{summary['output']}: {summary['estimator']}, {summary['samples']} samples, fill {summary['fill']:.1%}"]
     for axis in summary["axes"]:
         own = summary[axis]
@@ -75,8 +77,8 @@ def tell(summary: dict[str, Any]) -> str:
         line += f", bound {own['bound_deg']:.3f}° held {own['within_bound']:.1%}"
         if "phase_rmse_deg" in own:
             line += f", true error {own['phase_rmse_deg']:.3f}° rms"
-        seen = own.get("picture_phase_error_deg")
-        if seen is not None and isfinite(seen["sd"]):
+        seen = own["picture_phase_error_deg"]
+        if seen["sd"] is not None:
             line += f", the picture shows {seen['value']:+.3f}° ± {seen['sd']:.3f}°"
         lines.append(f"{line}; sign {own['sign']}")
     lines.append(f"  picture {summary['output']}/image.png, report {summary['output']}/report.html")
