@@ -29,11 +29,22 @@ def _steady(name: str) -> Callable[[Recording, Device], Motion]:
     return run
 
 
+def _tracker(causal: bool) -> Callable[[Recording, Device], Motion]:
+    def run(recording: Recording, device: Device) -> Motion:
+        from estimation.tracker import track
+
+        return track(recording, device, causal)
+
+    return run
+
+
 ESTIMATORS: dict[str, tuple[str, Callable[[Recording, Device], Motion]]] = {
     "constant": ("phase and amplitude of the first stretch, held", _steady("constant")),
     "acm": ("process model alone, no measurement (chen2020)", _filter("acm")),
     "ekf": ("extended Kalman filter (chen2020 algorithm 1)", _filter("ekf")),
     "ukf": ("unscented Kalman filter (chen2020 algorithm 2)", _filter("ukf")),
+    "tracker": ("block demodulation and a smoother on the slow flow of phase and amplitude", _tracker(False)),
+    "tracker-causal": ("the same, each moment from what came before it", _tracker(True)),
     "sensor": ("angle channels or position readouts as they are", _steady("sensor")),
 }
 

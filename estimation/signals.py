@@ -39,8 +39,11 @@ def device_of(recording: Recording, device: Device | None) -> Device:
     return found
 
 
-def senses(recording: Recording, device: Device) -> list[Sense]:
+def senses(recording: Recording, device: Device, gaps_ok: bool = False) -> list[Sense]:
     """The sense channels, checked: every axis of the device in one of them.
+
+    Args:
+        gaps_ok: samples may be missing (NaN); the samples are then not looked through.
 
     Raises:
         ChannelMissing: an axis has no sense channel.
@@ -60,8 +63,9 @@ def senses(recording: Recording, device: Device) -> list[Sense]:
             Sense(recording.require(f"sense_{name}", "this estimator needs it"), axis.require_readout(), (name,))
             for name, axis in device.axes.items()
         ]
-    for sense in found:
-        check_signal(sense.channel)
+    if not gaps_ok:
+        for sense in found:
+            check_signal(sense.channel)
     return found
 
 

@@ -138,15 +138,14 @@ def settle_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool]
         elif turn:
             sign = f"known: --flip-{name}"
         if turn:
-            track = replace(axis.angle, values=-axis.angle.values)
-            axis = replace(axis, phase=axis.phase + np.pi, angle=track)
+            axis = replace(axis, phase=axis.phase + np.pi, angle=axis.angle.turned())
         axes[name] = replace(axis, sign=sign)
     return replace(motion, axes=axes)
 
 
 def _opposes(axis: AxisMotion, angle: Channel) -> bool:
-    n = min(axis.angle.values.size, 100_000)
+    n = min(axis.angle.size, 100_000)
     time = axis.angle.start + np.arange(n) / axis.angle.sample_rate
     m = min(angle.size, int(np.ceil((time[-1] - angle.start) * angle.sample_rate)) + 1)
     told = np.interp(time, angle.time(0, m), angle.read(0, m))
-    return float(np.nansum(told * axis.angle.values[:n])) < 0.0
+    return float(np.nansum(told * axis.angle.read(0, n))) < 0.0

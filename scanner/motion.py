@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,19 @@ class AngleTrack:
     values: Array
     sample_rate: float
     start: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return self.values.size
+
+    def read(self, first: int = 0, stop: int | None = None) -> Array:
+        """Angles of samples ``first`` up to ``stop``, shape (n,) [rad]; what a long recording is gone through by."""
+        return self.values[first:stop]
+
+    def turned(self) -> AngleTrack:
+        """The same motion with the other sign."""
+        return replace(self, values=-self.values)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,5 @@
+"""The tracker: block demodulation, and a smoother on the slow flow of phase and amplitude."""
+
+from estimation.tracker.track import track
+
+__all__ = ["track"]

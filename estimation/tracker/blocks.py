@@ -1,0 +1,235 @@
+"""Block demodulation: the information of thousands of samples brought together, in one pass and flat memory.
+
+A block's samples are projected on a constant and on cosine and sine of every harmonic that can be there. The harmonics
+of two axes are not orthogonal over a block, so what is kept is the projection s = B'y and the Gram matrix G = B'B, of
+which whatever is linear in the harmonics loses nothing. One table of B serves all blocks as long as the reference's
+frequency stays, which makes the projection one matrix product; a block with missing or clipped samples gets a Gram
+matrix of its own from the samples that are left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from scanner.channel import Channel
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+CHUNK = 1 << 20  # samples read at a time
+CLIPPED_RUN = 8  # equal samples in a row at a block's extreme: noise would not let them be equal
+TABLE_REACH = 0.03  # cycles that the highest harmonic may slip against its table over a block
+
+
+@dataclass(frozen=True)
+class Projections:
+    """Blocks of one channel, projected. m = 1 + 2 lines: constant, then cosine and sine of each line.
+
+    Attributes:
+        sums: B'y, shape (blocks, m).
+        grams: B'B, shape (geometries, m, m). moments: B'TB, T the samples' times from the block's middle: what a line
+            that changes over the block adds [s]. geometry: which of them is a block's, shape (blocks,).
+        squares: y'y, shape (blocks,). counts: samples used, shape (blocks,).
+        tuned: angular frequency that the table of each block is made for, shape (blocks, references) [rad/s].
+    """
+
+    sums: Array
+    grams: Array
+    moments: Array
+    geometry: Index
+    squares: Array
+    counts: Index
+    tuned: Array
+
+
+def basis(length: int, rate: float, lines: Index, tuned: Array) -> Array:
+    """B' of one block about its middle, shape (1 + 2 lines, length).
+
+    Args:
+        lines: (reference, order) of each line, shape (lines, 2). tuned: of each reference [rad/s].
+    """
+    turn = (lines[:, 1] * tuned[lines[:, 0]])[:, None] * _offsets(length, rate)
+    rows = np.stack([np.cos(turn), np.sin(turn)], axis=1).reshape(-1, length)
+    return np.concatenate([np.ones((1, length)), rows])
+
+
+def project(
+    channel: Channel,
+    starts: Index,
+    length: int,
+    lines: Index,
+    omega: Array,
+    settling: int = 0,
+    prepared: Callable[[Array], Array] | None = None,
+) -> Projections:
+    """Project a channel's blocks, reading it chunk by chunk.
+
+    Args:
+        starts: first sample of each block, increasing, shape (blocks,). length: of every block.
+        lines: as in ``basis``. omega: angular frequency of each reference in each block, shape (blocks, references).
+        settling: samples at the channel's beginning that are left out.
+        prepared: done to the samples before (a square).
+    """
+    blocks, m = starts.size, 1 + 2 * len(lines)
+    sums, squares, tuned = np.zeros((blocks, m)), np.zeros(blocks), np.empty_like(omega)
+    geometry, counts = np.zeros(blocks, np.int64), np.full(blocks, length)
+    grams: list[Array] = []
+    moments: list[Array] = []
+    offset = _offsets(length, channel.sample_rate)
+    highest = np.array([max(lines[lines[:, 0] == i, 1], default=1) for i in range(omega.shape[1])])
+    for group in _steady_groups(omega * highest, 2 * np.pi * TABLE_REACH * channel.sample_rate / length):
+        tuned[group] = 0.5 * (omega[group].min(axis=0) + omega[group].max(axis=0))
+        table = basis(length, channel.sample_rate, lines, tuned[group.start])
+        whole = len(grams)
+        grams.append(table @ table.T)
+        moments.append(table * offset @ table.T)
+        folded = np.ascontiguousarray(table[:, (length + 1) // 2 :])
+        for part in _chunks(starts, length, group):
+            first = int(starts[part.start])
+            values = channel.read(first, int(starts[part.stop - 1]) + length)
+            if first < settling:
+                values[: settling - first] = np.nan
+            values = values if prepared is None else prepared(values)
+            rows = _rows(values, starts[part] - first, length)
+            _project(rows, folded, sums[part], squares[part])
+            geometry[part] = whole
+            for i in np.flatnonzero(np.isnan(squares[part]) | _flat(rows)):
+                k, used = part.start + int(i), _usable(rows[i])
+                own, left = table[:, used], rows[i, used]
+                sums[k], squares[k], counts[k] = own @ left, left @ left, left.size
+                geometry[k] = len(grams)
+                grams.append(own @ own.T)
+                moments.append(own * offset[used] @ own.T)
+    return Projections(sums, np.array(grams), np.array(moments), geometry, squares, counts, tuned)
+
+
+def _offsets(length: int, rate: float) -> Array:
+    """Times of a block's samples from its middle [s]."""
+    return (np.arange(length, dtype=np.float64) - 0.5 * (length - 1)) / rate
+
+
+def solved(projections: Projections) -> Array:
+    """Least-squares coefficients of every block, shape (blocks, m); of the smallest norm where samples are missing."""
+    out = np.empty_like(projections.sums)
+    for g, gram in enumerate(projections.grams):
+        mine = projections.geometry == g
+        out[mine] = projections.sums[mine] @ np.linalg.pinv(gram, hermitian=True)
+    return out
+
+
+def residual_variance(projections: Projections) -> Array:
+    """Variance of the samples about their block's least-squares fit, shape (blocks,); NaN where too few are left."""
+    freedom = projections.counts - projections.sums.shape[1]
+    rest = projections.squares - np.einsum("ij,ij->i", projections.sums, solved(projections))
+    return np.where(freedom > 0, np.maximum(rest, 0.0) / np.maximum(freedom, 1), np.nan)
+
+
+def _steady_groups(omega: Array, reach: float) -> Iterator[slice]:
+    """Runs of blocks whose frequencies stay within ``reach`` of each other."""
+    edges = [*_group_starts(omega, reach), len(omega)]
+    yield from map(slice, edges[:-1], edges[1:])
+
+
+@njit(cache=True)
+def _group_starts(omega, reach):  # type: ignore[no-untyped-def]
+    starts = [0]
+    low, high = omega[0].copy(), omega[0].copy()
+    for k in range(1, len(omega)):
+        low, high = np.minimum(low, omega[k]), np.maximum(high, omega[k])
+        if (high - low > reach).any():
+            starts.append(k)
+            low, high = omega[k].copy(), omega[k].copy()
+    return starts
+
+
+def _chunks(starts: Index, length: int, group: slice) -> Iterator[slice]:
+    step = max(1, CHUNK // length)
+    for first in range(group.start, group.stop, step):
+        yield slice(first, min(first + step, group.stop))
+
+
+def _rows(values: Array, starts: Index, length: int) -> Array:
+    """One block a row: a view where the blocks follow each other without a gap."""
+    if starts[-1] == (starts.size - 1) * length:
+        return values[: starts.size * length].reshape(starts.size, length)
+    return np.lib.stride_tricks.sliding_window_view(values, length)[starts]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _project(rows, table, sums, squares):  # type: ignore[no-untyped-def]
+    """B'y and y'y of each row; NaN where a sample is NaN.
+
+    About a block's middle the cosines are even and the sines odd, so the row is folded first and each product is
+    half as long. Four products share each load.
+    """
+    length, m = rows.shape[1], table.shape[0]
+    half, odd_length = length // 2, length % 2
+    even, odd = np.empty(half), np.empty(half)
+    for i in range(rows.shape[0]):
+        row, square = rows[i], 0.0
+        for j in range(half):
+            a, b = row[half - 1 - j], row[half + odd_length + j]
+            even[j], odd[j] = a + b, b - a
+            square += a * a + b * b
+        total = 0.0
+        for j in range(half):
+            total += even[j]
+        for c in range(1, m, 4):
+            last = min(c + 2, m - 2)  # a single line at the end is taken twice
+            c0, s0, c1, s1 = table[c], table[c + 1], table[last], table[last + 1]
+            p, q, r, s = 0.0, 0.0, 0.0, 0.0
+            for j in range(half):
+                p += even[j] * c0[j]
+                q += odd[j] * s0[j]
+                r += even[j] * c1[j]
+                s += odd[j] * s1[j]
+            sums[i, c], sums[i, c + 1], sums[i, last], sums[i, last + 1] = p, q, r, s
+        if odd_length:
+            middle = row[half]
+            square += middle * middle
+            total += middle
+            for c in range(1, m, 2):
+                sums[i, c] += middle
+        sums[i, 0], squares[i] = total, square
+
+
+@njit(cache=True, error_model="numpy", fastmath=True)
+def _flat(rows):  # type: ignore[no-untyped-def]
+    """Finite blocks in which enough samples lie at an extreme to be a clipped stretch, shape (blocks,)."""
+    out = np.zeros(rows.shape[0], np.bool_)
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        low, high = row[0], row[0]
+        for j in range(row.size):
+            low, high = min(low, row[j]), max(high, row[j])
+        at_low, at_high = 0, 0
+        for j in range(row.size):
+            at_low += row[j] == low
+            at_high += row[j] == high
+        out[i] = max(at_low, at_high) >= CLIPPED_RUN
+    return out
+
+
+@njit(cache=True)
+def _usable(row):  # type: ignore[no-untyped-def]
+    """Samples that are finite and in no run of equal ones at the block's extremes, shape (length,)."""
+    used = np.isfinite(row)
+    if not used.any():
+        return used
+    low, high = row[used].min(), row[used].max()
+    if low == high:
+        return used
+    run = 0
+    for j in range(row.size + 1):
+        if j < row.size and (row[j] == low or row[j] == high) and (run == 0 or row[j] == row[j - 1]):
+            run += 1
+            continue
+        if run >= CLIPPED_RUN:
+            used[j - run : j] = False
+        run = 1 if j < row.size and (row[j] == low or row[j] == high) else 0
+    return used

@@ -1,0 +1,199 @@
+"""One sense channel made ready for the smoother: references, drives, readout and projections, block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.reference import Reference
+from estimation.signals import Sense, drive_voltage, is_capacitive
+from estimation.tracker.blocks import Projections, project, residual_variance, solved
+from estimation.tracker.orbit import DRIVEN, SENSED, AxisLaw, axis_law
+from estimation.tracker.smoother import Signal
+from scanner.channel import Channel
+from scanner.device import Amdm, Axis, Device
+from scanner.errors import BadInput
+from scanner.harmonics import capacitance_harmonics, readout_response
+from scanner.recording import Recording
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Index = NDArray[np.int64]
+
+SLOWEST_CYCLES = 2.0  # of the slowest axis in a block, at the least
+DECAY_SHARE = 0.2  # of the fastest decay time, where that is longer
+NYQUIST_SHARE = 0.45  # of the sampling rate: the highest harmonic that is used
+SETTLING = 15.0  # time constants of the readout's sections; at the beginning nobody knows their state
+RUNGS = 400  # of the ladder from line to amplitude
+POSITION_LINES = 3
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A sense channel, its axes' laws and its blocks.
+
+    Attributes:
+        sense, references: where it comes from.
+        laws: of ``sense.axes``, in their order.
+        time: of the blocks' middles, shape (blocks,) [s].
+        signal: for the smoother.
+        clean: fraction of the samples that were used.
+    """
+
+    sense: Sense
+    references: Mapping[str, Reference]
+    laws: tuple[AxisLaw, ...]
+    time: Array
+    signal: Signal
+    clean: float
+
+
+def prepare(recording: Recording, device: Device, sense: Sense, references: Mapping[str, Reference]) -> Prepared:
+    """Demodulate one sense channel and the drives that belong to it.
+
+    Raises:
+        BadInput: the channel is too short, or none of its samples can be used.
+        DeviceInvalid: the device lacks a value.
+    """
+    channel, axes = sense.channel, [device.axis(name) for name in sense.axes]
+    length = _block_length(axes, [references[name].frequency for name in sense.axes], channel.sample_rate)
+    count = channel.size // length
+    if count < 3:
+        raise BadInput(
+            f"is {channel.size} samples long; {3 * length} are needed to track a motion",
+            file=channel.file,
+            channel=channel.name,
+            hint="record for longer",
+        )
+    starts = np.arange(count) * length
+    width = length / channel.sample_rate
+    time: Array = channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate)
+    own = [references[name] for name in sense.axes]
+    psi = np.stack([_mean_phase(reference, time, width) for reference in own], axis=1)
+    w = np.gradient(psi, time, axis=0)
+    lines = _lines(axes, sense, w, channel.sample_rate)
+    settling = 0
+    if isinstance(sense.readout, Amdm) and sense.readout.lpf_hz:
+        settling = int(SETTLING / (2 * np.pi * min(sense.readout.lpf_hz)) * channel.sample_rate)
+    projections = project(channel, starts, length, lines, w, settling)
+    if not projections.counts.any():
+        raise BadInput("holds no sample that can be used", file=channel.file, channel=channel.name)
+    laws = tuple(axis_law(axis, sense.readout) for axis in axes)
+    forces = [
+        _force(drive_voltage(recording, name), time, width, psi[:, i], w[:, i], laws[i])
+        for i, name in enumerate(sense.axes)
+    ]
+    passed, passed_by_w = _passed(sense, lines, w)
+    whitened, roots, slants, unroots = _whitened(projections)
+    signal = Signal(
+        psi=psi,
+        w=w,
+        force=np.stack(forces, axis=1),
+        step=width,
+        width=width,
+        lines=lines,
+        passed=passed,
+        passed_by_w=passed_by_w,
+        mean_gain=float(readout_response(sense.readout, 0.0).real),
+        tuned=projections.tuned,
+        whitened=whitened,
+        roots=roots,
+        slants=slants,
+        unroots=unroots,
+        geometry=projections.geometry,
+        noise_var=float(np.nanmedian(residual_variance(projections))),
+        known=np.zeros(psi.shape),
+        known_var=np.full(psi.shape, np.inf),
+        ladder=np.stack([_ladder(axis, sense) for axis in axes]),
+        main=2 if is_capacitive(sense.readout) else 1,
+    )
+    return Prepared(sense, references, laws, time, signal, float(projections.counts.sum()) / (count * length))
+
+
+def _block_length(axes: list[Axis], frequencies: list[float], rate: float) -> int:
+    width = SLOWEST_CYCLES / min(frequencies)
+    decays = [axis.quality / (np.pi * axis.resonance) for axis in axes if axis.mechanics is not None]
+    return max(64, round(max([width, DECAY_SHARE * min(decays)] if decays else [width]) * rate))
+
+
+def _mean_phase(reference: Reference, time: Array, width: float) -> Array:
+    """Reference phase averaged over each block (Simpson): what a demodulation with a straight line sees of a sweep."""
+    before, middle, after = (reference.phase(time + shift * width) for shift in (-0.5, 0.0, 0.5))
+    return (before + 4.0 * middle + after) / 6.0
+
+
+def _lines(axes: list[Axis], sense: Sense, w: Array, rate: float) -> Index:
+    found = []
+    for i, axis in enumerate(axes):
+        if is_capacitive(sense.readout):
+            even = axis.require_capacitance().theta_th == 0.0
+            orders = range(2 if even else 1, SENSED + 1, 2 if even else 1)
+        else:
+            orders = range(1, POSITION_LINES + 1)
+        found += [(i, n) for n in orders if n * w[:, i].max() < 2 * np.pi * NYQUIST_SHARE * rate]
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def _force(channel: Channel | None, time: Array, width: float, psi: Array, w: Array, law: AxisLaw) -> Complex:
+    """Harmonics of the drive's force about each block, shape (blocks, DRIVEN); zero where nothing was recorded."""
+    force = np.zeros((time.size, DRIVEN), np.complex128)
+    if channel is None:
+        return force
+    rate = channel.sample_rate
+    length = round(width * rate)
+    wanted = np.round((time - channel.start) * rate - 0.5 * (length - 1)).astype(np.int64)
+    starts = np.clip(wanted, 0, channel.size - length)
+    if channel.size < length or np.abs(starts - wanted).max() > length:
+        raise BadInput(
+            f"covers {channel.start:.6g} to {channel.end:.6g} s, the blocks {time[0]:.6g} to {time[-1]:.6g} s",
+            file=channel.file,
+            channel=channel.name,
+            hint="record both over the same time",
+        )
+    orders = np.arange(1, 2 * DRIVEN + 1)
+    orders = orders[orders * law.turn * w.max() < 2 * np.pi * NYQUIST_SHARE * rate]
+    lines = np.stack([np.zeros_like(orders), orders * law.turn], axis=1)
+    square = np.square if law.pull else None
+    fitted = solved(project(channel, starts, length, lines, w[:, None], prepared=square))
+    late = channel.start + (starts + 0.5 * (length - 1)) / rate - time
+    force[:, 0] = fitted[:, 0]
+    for m in range(1, min(DRIVEN, orders.size + 1)):
+        turned = np.exp(-1j * m * law.turn * (psi + w * late))
+        force[:, m] = (fitted[:, 2 * m - 1] - 1j * fitted[:, 2 * m]) * turned
+    return force
+
+
+def _passed(sense: Sense, lines: Index, w: Array) -> tuple[Complex, Complex]:
+    """Readout's response at each line of each block, and its derivative by the motion's angular frequency."""
+    f = w[:, lines[:, 0]] * lines[:, 1] / (2 * np.pi)
+    step = 1e-4
+    high, low = (readout_response(sense.readout, f * (1.0 + s)) for s in (step, -step))
+    return readout_response(sense.readout, f), (high - low) / (2.0 * step * w[:, lines[:, 0]])
+
+
+def _whitened(projections: Projections) -> tuple[Array, Array, Array, Array]:
+    """(R's, R'G, R'M, R), R'GR = 1, from each geometry's eigenvectors; directions with no samples stay zero."""
+    values, vectors = np.linalg.eigh(projections.grams)
+    held = values > 1e-9 * np.maximum(values[:, -1:], 1.0)
+    unroots = vectors * np.where(held, 1.0 / np.sqrt(np.where(held, values, 1.0)), 0.0)[:, None, :]
+    turned = np.swapaxes(unroots, 1, 2)
+    whitened = np.empty_like(projections.sums)
+    for g, unroot in enumerate(unroots):
+        mine = projections.geometry == g
+        whitened[mine] = projections.sums[mine] @ unroot
+    return whitened, turned @ projections.grams, turned @ projections.moments, np.ascontiguousarray(unroots)
+
+
+def _ladder(axis: Axis, sense: Sense) -> Array:
+    """Amplitudes and the size of their main line, up to the largest line there is, shape (2, RUNGS)."""
+    if not is_capacitive(sense.readout):
+        amplitudes = np.linspace(0.0, 2.0, RUNGS)
+        return np.stack([amplitudes, amplitudes])
+    comb = axis.require_capacitance()
+    amplitudes = np.linspace(1e-4, 1.6, RUNGS) * comb.theta0
+    sizes = np.array([abs(capacitance_harmonics(float(a), comb, 2)[2]) for a in amplitudes])
+    top = int(sizes.argmax())  # beyond it a larger swing gives no larger line
+    return np.stack([np.minimum(amplitudes, amplitudes[top]), np.maximum.accumulate(sizes)])

@@ -1,0 +1,312 @@
+"""Kalman filter and fixed-interval smoother over blocks, compiled.
+
+State of each axis: phase phi, ln A, relative change of stiffness, its trend [1/s], relative change of damping, ln gain;
+then the readout's offset, one for all axes of an electrode. Between two blocks phase and amplitude follow the slow flow
+(``orbit``), linearised about the state and integrated exactly, with each block's own drive; the trend of the stiffness,
+the damping and the gain walk at random. A block's projections are the measurement: whitened by its Gram matrix they are
+independent of each other, so that they come in one at a time and nothing is inverted.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from estimation.tracker.orbit import turn_of
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+PHASE, LOG, STIFFNESS, TREND, DAMPING, GAIN = range(6)
+STATES = 6  # of an axis
+
+FLOOR = 1e-3  # of theta0: a smaller amplitude is no motion
+LOST = (0.5, 0.3)  # sd of phase [rad] and ln A beyond which the block itself tells where the motion is
+SIGNIFICANT = 6.0  # standard deviations that a line must have to be taken for a motion
+MISFIT = 4.0  # mean squared innovation beyond which a block's noise counts as larger
+
+
+class Signal(NamedTuple):
+    """One sense channel, block by block.
+
+    Attributes:
+        psi: reference phase at the block's middle, shape (blocks, axes) [rad].
+        w: its rate there, shape (blocks, axes) [rad/s].
+        force: harmonics of the drive's force, shape (blocks, axes, DRIVEN).
+        step: time to the next block [s]. width: of a block [s].
+        lines: (axis, order) of each line, shape (lines, 2).
+        passed: readout's response at each line, shape (blocks, lines); passed_by_w: its derivative by the motion's
+            angular frequency.
+        mean_gain: of the readout at rest, 0 where it does not pass a mean.
+        tuned: angular frequency of the projections' tables, shape (blocks, axes).
+        whitened: R's with R R' the inverse of the Gram matrix, shape (blocks, m).
+        roots: R'G of each geometry, shape (geometries, m, m). slants: R' times the moments. unroots: R.
+        geometry: of each block.
+        noise_var: of a sample [V^2].
+        known: phase measured otherwise, shape (blocks, axes) [rad]; known_var: its variance, inf for none [rad^2].
+        ladder: amplitudes [rad] and the size of the main line of C or theta there, shape (axes, 2, rungs).
+        main: order of the main line: 2 for a capacitance, 1 for a position.
+    """
+
+    psi: Array
+    w: Array
+    force: Complex
+    step: float
+    width: float
+    lines: NDArray[np.int64]
+    passed: Complex
+    passed_by_w: Complex
+    mean_gain: float
+    tuned: Array
+    whitened: Array
+    roots: Array
+    slants: Array
+    unroots: Array
+    geometry: NDArray[np.int64]
+    noise_var: float
+    known: Array
+    known_var: Array
+    ladder: Array
+    main: int
+
+
+@njit(cache=True, error_model="numpy")
+def _flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
+    """One axis over ``h`` seconds: new state (6,), its Jacobian (6, 6) and the covariance (6, 6) that walking adds.
+
+    walk: spectral densities of white noise on phase and ln A [1/s], trend [1/s^3], damping [1/s], gain [1/s].
+    """
+    k, b = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
+    turn = turn_of(law, np.exp(x[LOG]), x[PHASE], w, k, b, force)
+    a11, a12 = turn.by_phase.imag, turn.by_log.imag
+    a21, a22 = turn.by_phase.real, turn.by_log.real
+    # e0, e1, e2: exp(a h) and its first two integrals, by their series; the h here is a fraction of the decay time
+    e0, e1, e2 = np.eye(2), np.eye(2) * h, np.eye(2) * (0.5 * h * h)
+    p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
+    for n in range(1, 9):
+        scale = h / n
+        p11, p12, p21, p22 = (
+            (a11 * p11 + a12 * p21) * scale,
+            (a11 * p12 + a12 * p22) * scale,
+            (a21 * p11 + a22 * p21) * scale,
+            (a21 * p12 + a22 * p22) * scale,
+        )
+        one, two = h / (n + 1), h * h / ((n + 1) * (n + 2))
+        e0[0, 0] += p11
+        e0[0, 1] += p12
+        e0[1, 0] += p21
+        e0[1, 1] += p22
+        e1[0, 0] += p11 * one
+        e1[0, 1] += p12 * one
+        e1[1, 0] += p21 * one
+        e1[1, 1] += p22 * one
+        e2[0, 0] += p11 * two
+        e2[0, 1] += p12 * two
+        e2[1, 0] += p21 * two
+        e2[1, 1] += p22 * two
+    stiff, damp = law.k * turn.by_stiffness / k, law.b * turn.by_damping / b
+    new, jacobian, added = x.copy(), np.eye(STATES), np.zeros((STATES, STATES))
+    early = np.zeros(STATES)  # what a kick of the trend in the middle of the step becomes
+    for i in range(2):
+        rate_0, rate_1 = turn.rate.imag, turn.rate.real
+        by_trend = e2[i, 0] * stiff.imag + e2[i, 1] * stiff.real
+        new[i] += e1[i, 0] * rate_0 + e1[i, 1] * rate_1 + by_trend * x[TREND]
+        jacobian[i, 0], jacobian[i, 1] = e0[i, 0], e0[i, 1]
+        jacobian[i, STIFFNESS] = e1[i, 0] * stiff.imag + e1[i, 1] * stiff.real
+        jacobian[i, TREND] = by_trend
+        jacobian[i, DAMPING] = e1[i, 0] * damp.imag + e1[i, 1] * damp.real
+        early[i] = 0.25 * by_trend
+        added[i, i] = walk[0] * h
+    new[STIFFNESS] += h * x[TREND]
+    jacobian[STIFFNESS, TREND] = h
+    early[STIFFNESS], early[TREND] = 0.5 * h, 1.0
+    for i in range(STATES):
+        for j in range(STATES):
+            added[i, j] += walk[1] * h * early[i] * early[j]
+    added[DAMPING, DAMPING] += walk[2] * h
+    added[GAIN, GAIN] += walk[3] * h
+    for i in range(2):
+        half = 0.5 * jacobian[i, DAMPING]
+        added[i, DAMPING] += walk[2] * h * half
+        added[DAMPING, i] += walk[2] * h * half
+        added[i, i] += walk[2] * h * half * half
+    return new, jacobian, added
+
+
+@njit(cache=True, error_model="numpy")
+def _predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untyped-def]
+    """State and covariance of block k + 1 from those of block k, and the Jacobian of the step."""
+    n = x.size
+    F = np.eye(n)
+    for half in range(2):
+        G, Q = np.eye(n), np.zeros((n, n))
+        for a in range(len(laws)):
+            law = laws[a]
+            at = a * STATES
+            w = (signal.psi[k + 1, a] - signal.psi[k, a]) / signal.step
+            new, jacobian, added = _flow(
+                law, x[at : at + STATES], w, signal.force[k + half, a], 0.5 * signal.step, walk[a]
+            )
+            new[LOG] = max(new[LOG], np.log(FLOOR * law.theta0))
+            x[at : at + STATES] = new
+            G[at : at + STATES, at : at + STATES] = jacobian
+            Q[at : at + STATES, at : at + STATES] = added
+        Q[n - 1, n - 1] = offset_walk * 0.5 * signal.step
+        P = G @ P @ G.T + Q
+        F = G @ F
+    return P, F
+
+
+@njit(cache=True, error_model="numpy")
+def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
+    """Coefficients (m,) that block k's projections should show in the state ``x``, their rates, and their Jacobian."""
+    m = signal.roots.shape[1]
+    values, rates, jacobian = np.zeros(m), np.zeros(m), np.zeros((m, x.size))
+    values[0], jacobian[0, x.size - 1] = x[x.size - 1], 1.0
+    for a in range(len(laws)):
+        law = laws[a]
+        at = a * STATES
+        stiff, damp = law.k * (1.0 + x[at + STIFFNESS]), law.b * (1.0 + x[at + DAMPING])
+        turn = turn_of(law, np.exp(x[at + LOG]), x[at + PHASE], signal.w[k, a], stiff, damp, signal.force[k, a])
+        values[0] += signal.mean_gain * turn.seen[0].real
+        jacobian[0, at + LOG] = signal.mean_gain * turn.seen_by_log[0].real
+        rates[0] += jacobian[0, at + LOG] * turn.rate.real
+        slip = signal.w[k, a] + turn.rate.imag - signal.tuned[k, a]
+        gain = np.exp(x[at + GAIN])
+        for i in range(signal.lines.shape[0]):
+            if signal.lines[i, 0] == a:
+                order = signal.lines[i, 1]
+                passed = signal.passed[k, i] + signal.passed_by_w[k, i] * turn.rate.imag
+                turned = gain * passed * np.exp(1j * order * (signal.psi[k, a] + x[at + PHASE]))
+                turned *= np.sinc(order * slip * signal.width / (2.0 * np.pi))
+                line, by_log = turned * turn.seen[order], turned * turn.seen_by_log[order]
+                by_phase = 1j * order * line
+                rate = by_log * turn.rate.real + 1j * order * slip * line
+                for j, part in ((1 + 2 * i, 1.0 + 0.0j), (2 + 2 * i, 1.0j)):  # Re with the cosine, -Im with the sine
+                    values[j], rates[j] = (part * line).real, (part * rate).real
+                    jacobian[j, at + PHASE], jacobian[j, at + LOG] = (part * by_phase).real, (part * by_log).real
+                    jacobian[j, at + GAIN] = values[j]
+    return values, rates, jacobian
+
+
+@njit(cache=True, error_model="numpy")
+def _acquire(signal, k, a, x, P):  # type: ignore[no-untyped-def]
+    """Set phase and amplitude of axis ``a`` from block k's main line alone; False where it shows none."""
+    root, unroot = signal.roots[signal.geometry[k]], signal.unroots[signal.geometry[k]]
+    fitted = unroot @ signal.whitened[k]
+    at = a * STATES
+    for i in range(signal.lines.shape[0]):
+        if signal.lines[i, 0] == a and signal.lines[i, 1] == signal.main:
+            line = complex(fitted[1 + 2 * i], -fitted[2 + 2 * i])
+            var = signal.noise_var * max((unroot[1 + 2 * i] ** 2).sum(), (unroot[2 + 2 * i] ** 2).sum())
+            missing = (root[:, 1 + 2 * i] ** 2).sum() <= 0.0
+            if missing or abs(line) < SIGNIFICANT * np.sqrt(var):
+                return False
+            size = abs(line / signal.passed[k, i]) / np.exp(x[at + GAIN])
+            x[at + LOG] = np.log(np.interp(size, signal.ladder[a, 1], signal.ladder[a, 0]))
+            sine = 0.5 * np.pi * (signal.main == 1)  # theta = A sin u is Re(-i A exp(i u)), C's second line is positive
+            turn = np.angle(line / signal.passed[k, i] * np.exp(-1j * signal.main * signal.psi[k, a])) + sine
+            period = 2.0 * np.pi / signal.main
+            phase = turn / signal.main
+            x[at + PHASE] = phase + period * np.round((x[at + PHASE] - phase) / period)
+            for j in (at + PHASE, at + LOG):
+                P[j, :] = 0.0
+                P[:, j] = 0.0
+            P[at + PHASE, at + PHASE], P[at + LOG, at + LOG] = LOST[0] ** 2, LOST[1] ** 2
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _update(signal, k, x, P, values, rates, jacobian):  # type: ignore[no-untyped-def]
+    """Bring block k's measurements in, one at a time; returns (log-likelihood, squared innovations, measurements)."""
+    n, root = x.size, signal.roots[signal.geometry[k]]
+    H, r = root @ jacobian, signal.whitened[k] - root @ values - signal.slants[signal.geometry[k]] @ rates
+    before, kept = x.copy(), P.copy()
+    noise = signal.noise_var
+    for attempt in range(2):
+        x[:], P[:] = before, kept
+        chi2, logdet, count = 0.0, 0.0, 0
+        for i in range(r.size):
+            if (root[i] ** 2).sum() <= 0.0:  # a direction in which the block has no samples
+                continue
+            PH = P @ H[i]
+            S = H[i] @ PH + noise
+            e = r[i] - H[i] @ (x - before)
+            for u in range(n):
+                x[u] += PH[u] / S * e
+                for v in range(n):
+                    P[u, v] -= PH[u] * PH[v] / S
+            chi2 += e * e / S
+            logdet += np.log(S)
+            count += 1
+        if attempt == 0 and chi2 > MISFIT * count:
+            noise *= chi2 / count
+        else:
+            break
+    for a in range(signal.psi.shape[1]):
+        if np.isfinite(signal.known_var[k, a]):
+            at = a * STATES + PHASE
+            PH, S = P[at].copy(), P[at, at] + signal.known_var[k, a]
+            e = signal.known[k, a] - x[at]
+            x += PH / S * e
+            P -= np.outer(PH, PH) / S
+    return -0.5 * (chi2 + logdet), chi2, count
+
+
+@njit(cache=True, error_model="numpy")
+def run_filter(laws, signal, x, P, live, walk, offset_walk, xs, Ps, xp, Pp, Fs):  # type: ignore[no-untyped-def]
+    """Filter all blocks.
+
+    Args:
+        laws: tuple of ``AxisLaw``. signal: ``Signal``.
+        x, P: state before the first block. live: whether the motion of each axis was found, shape (axes,); changed.
+        walk: shape (axes, 4), see ``_flow``. offset_walk: [V^2/s].
+        xs, Ps: filtered; xp, Pp: predicted; Fs: Jacobian of the step that leads to each block; shape (blocks, ...).
+
+    Returns:
+        (log-likelihood, sum of squared normalised innovations, measurements).
+    """
+    total, chi2, count = 0.0, 0.0, 0
+    poor = 0
+    for k in range(signal.whitened.shape[0]):
+        F = np.eye(x.size)
+        if k > 0:
+            P, F = _predict(laws, signal, k - 1, x, P, walk, offset_walk)
+        for a in range(len(laws)):
+            at = a * STATES
+            lost = P[at + PHASE, at + PHASE] > LOST[0] ** 2 or P[at + LOG, at + LOG] > LOST[1] ** 2
+            if (not live[a] or lost or poor >= 3) and _acquire(signal, k, a, x, P):
+                F[at : at + 2, :] = 0.0
+                live[a] = True
+        xp[k], Pp[k], Fs[k] = x, P, F
+        here = _update(signal, k, x, P, *expected(laws, signal, k, x))
+        poor = poor + 1 if here[1] > 10 * MISFIT * here[2] else 0
+        total, chi2, count = total + here[0], chi2 + here[1], count + here[2]
+        xs[k], Ps[k] = x, P
+    return total, chi2, count
+
+
+@njit(cache=True, error_model="numpy")
+def run_smoother(xs, Ps, xp, Pp, Fs):  # type: ignore[no-untyped-def]
+    """Rauch-Tung-Striebel, in place on ``xs`` and ``Ps``."""
+    for k in range(xs.shape[0] - 2, -1, -1):
+        gain = np.linalg.solve(Pp[k + 1], Fs[k + 1] @ Ps[k]).T
+        xs[k] += gain @ (xs[k + 1] - xp[k + 1])
+        P = Ps[k] + gain @ (Ps[k + 1] - Pp[k + 1]) @ gain.T
+        Ps[k] = 0.5 * (P + P.T)
+
+
+@njit(cache=True, error_model="numpy")
+def turns(laws, signal, xs, rates, moved):  # type: ignore[no-untyped-def]
+    """Rates d(ln A)/dt + i dphi/dt (blocks, axes) and own harmonics (blocks, axes, MOVED + 1) along a track."""
+    for k in range(xs.shape[0]):
+        for a in range(len(laws)):
+            law, x = laws[a], xs[k, a * STATES : (a + 1) * STATES]
+            stiff, damp = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
+            turn = turn_of(law, np.exp(x[LOG]), x[PHASE], signal.w[k, a], stiff, damp, signal.force[k, a])
+            rates[k, a] = turn.rate
+            moved[k, a] = turn.moved

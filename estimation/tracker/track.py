@@ -1,0 +1,284 @@
+"""From a recording to its motion by block demodulation and smoothing: ``--estimator tracker``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.signals import intensity_clock, is_capacitive, reference_of, senses
+from estimation.tracker import smoother
+from estimation.tracker.angle import SlowAngle, SlowMotion
+from estimation.tracker.orbit import MOVED
+from estimation.tracker.signal import Prepared, prepare
+from estimation.tracker.smoother import FLOOR, LOG, LOST, PHASE, SIGNIFICANT, STATES, Signal
+from scanner.device import Amdm, Device, Position
+from scanner.errors import BadInput
+from scanner.motion import AxisMotion, Motion
+from scanner.recording import Recording
+
+Array = NDArray[np.float64]
+
+STIFFNESS_SPREAD = 0.003  # relative: how far a resonance may have moved since its calibration, beside its tolerance
+DAMPING_SPREAD = 0.05
+TREND_SD = 0.3  # of the stiffness [1/s]: 0.3 % within 10 ms
+OFFSET_SD = 1.0  # of the readout [V]
+START_WALK = (1e-7, 0.1, 1e-5)  # white phase noise [rad2/s], trend [1/s3], damping [1/s]: where the tuning starts
+LEAST_WALK = (1e-9, 1e-4, 1e-8)
+GAIN_WALK, OFFSET_WALK = 1e-8, 1e-8  # [1/s], [V2/s]: a readout's drift is slow against the scan
+TUNED_BLOCKS = 300  # in up to three stretches
+WINDOW, LAG = 4096, 512  # blocks smoothed at a time, and how far a window looks ahead of what it gives
+LISTENED = 64  # blocks that may be taken together to find a motion in noise
+PROBED = 200  # blocks from which the sign is told
+
+
+@dataclass(frozen=True)
+class Belief:
+    """State and covariance before a block, and whether each axis's motion has been found."""
+
+    x: Array
+    P: Array
+    live: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Track:
+    """State along the blocks.
+
+    Attributes:
+        states: shape (blocks, states), see ``smoother``. sds: their standard deviations.
+        log_likelihood: of the projections, up to a constant.
+        chi2: mean squared normalised innovation; 1 where model and noise are right.
+        live: whether the motion of each axis was found.
+    """
+
+    states: Array
+    sds: Array
+    log_likelihood: float
+    chi2: float
+    live: NDArray[np.bool_]
+
+
+def track(recording: Recording, device: Device, causal: bool = False) -> Motion:
+    """Phase and amplitude of all axes from their sense signals.
+
+    Args:
+        causal: each block from what came before it only (a filter); its latency is half a block. By default all
+            blocks from all of the recording (a smoother).
+
+    Raises:
+        BadInput: a channel shows no motion, or cannot be used. ChannelMissing: an axis has no sense channel.
+        DeviceInvalid: the device lacks a value.
+    """
+    axes: dict[str, AxisMotion] = {}
+    info: dict[str, object] = {}
+    for sense in senses(recording, device, gaps_ok=True):
+        even = is_capacitive(sense.readout)
+        references = {name: reference_of(recording, device, name, sense.channel, even) for name in sense.axes}
+        prepared = prepare(recording, device, sense, references)
+        start, signs = signed(prepared, starting_belief(prepared, device))
+        walk = tuned_walk(prepared, start)
+        found = follow(prepared, start, walk, causal)
+        for i, name in enumerate(sense.axes):
+            if not found.live[i]:
+                raise BadInput(
+                    f"shows no motion of axis {name} near {references[name].frequency:.6g} Hz",
+                    file=sense.channel.file,
+                    channel=sense.channel.name,
+                    hint="the resonance did not start; check drive voltage and frequency",
+                )
+        clock = intensity_clock(recording, sense.channel)
+        axes |= {name: _axis_motion(prepared, found, i, clock, signs[i]) for i, name in enumerate(sense.axes)}
+        info[sense.channel.name] = _facts(prepared, found, walk)
+    return Motion(axes, "tracker-causal" if causal else "tracker", info)
+
+
+def starting_belief(prepared: Prepared, device: Device) -> Belief:
+    """What is known before the first block: the device within its tolerances, and the motion of the first blocks."""
+    readout, signal = prepared.sense.readout, prepared.signal
+    n = STATES * len(prepared.laws) + 1
+    x, variance = np.zeros(n), np.zeros(n)
+    own_gain = "a_cir" if isinstance(readout, Amdm) else "gain" if isinstance(readout, Position) else "R_s"
+    for a, name in enumerate(prepared.sense.axes):
+        at = a * STATES
+        x[at + LOG] = np.log(FLOOR * prepared.laws[a].theta0)
+        gain = np.hypot(device.tolerance(name, own_gain), device.tolerance(name, "C0"))
+        variance[at : at + STATES] = np.square([
+            LOST[0],
+            LOST[1],
+            np.hypot(device.tolerance(name, "k"), STIFFNESS_SPREAD),
+            TREND_SD,
+            np.hypot(device.tolerance(name, "b"), DAMPING_SPREAD),
+            gain,
+        ])  # fmt: skip
+    x[-1] = readout.b_cir if isinstance(readout, Amdm) else readout.offset if isinstance(readout, Position) else 0.0
+    variance[-1] = OFFSET_SD**2
+    live = np.array([_listen(signal, a, x) for a in range(len(prepared.laws))])
+    return Belief(x, np.diag(variance), live)
+
+
+def _listen(signal: Signal, a: int, x: Array) -> bool:
+    """Set phase and amplitude of axis ``a`` in ``x`` from as few first blocks as show its main line; False for none."""
+    (i,) = np.flatnonzero((signal.lines[:, 0] == a) & (signal.lines[:, 1] == signal.main))
+    count = min(LISTENED, len(signal.whitened))
+    unroots = signal.unroots[signal.geometry[:count]]
+    fitted = np.einsum("kij,kj->ki", unroots, signal.whitened[:count])
+    back = np.exp(-1j * signal.main * signal.psi[:count, a]) / signal.passed[:count, i]
+    lines = (fitted[:, 1 + 2 * i] - 1j * fitted[:, 2 + 2 * i]) * back
+    variances = signal.noise_var * (unroots[:, 1 + 2 * i] ** 2).sum(axis=1) * np.abs(back) ** 2
+    told = variances > 0.0
+    blocks = 1
+    while blocks <= count:
+        used = told[:blocks]
+        line, sd = lines[:blocks][used].sum(), np.sqrt(variances[:blocks][used].sum())
+        if used.any() and abs(line) > SIGNIFICANT * sd:
+            line = line / used.sum()
+            x[a * STATES + LOG] = np.log(np.interp(abs(line), signal.ladder[a, 1], signal.ladder[a, 0]))
+            x[a * STATES + PHASE] = (np.angle(line) + (0.5 * np.pi if signal.main == 1 else 0.0)) / signal.main
+            return True
+        blocks *= 2
+    return False
+
+
+def _walks(values: Array) -> Array:
+    """Spectral densities of each axis, shape (axes, 4), from the three that are tuned."""
+    return np.concatenate([values, np.full((len(values), 1), GAIN_WALK)], axis=1)
+
+
+def tuned_walk(prepared: Prepared, start: Belief) -> Array:
+    """Process noise of each axis by maximum likelihood, to half a decade, shape (axes, 3): see ``START_WALK``."""
+    parts = _stretches(prepared.signal)
+    best = np.tile(START_WALK, (len(prepared.laws), 1))
+
+    def likelihood(values: Array) -> float:
+        return sum(_filtered(prepared, part, start, _walks(values))[0] for part in parts)
+
+    top = likelihood(best)
+    for factor in (10.0, 10.0**0.5):
+        for at in np.ndindex(best.shape):
+            for step in (factor, 1.0 / factor):
+                trial = best.copy()
+                trial[at] *= step
+                while trial[at] >= LEAST_WALK[at[1]] and (value := likelihood(trial)) > top:
+                    best, top = trial.copy(), value
+                    trial[at] *= step
+    return best
+
+
+def _stretches(signal: Signal) -> list[Signal]:
+    blocks = len(signal.whitened)
+    if blocks <= TUNED_BLOCKS:
+        return [signal]
+    third = TUNED_BLOCKS // 3
+    return [window(signal, at, at + third) for at in (0, (blocks - third) // 2, blocks - third)]
+
+
+def window(signal: Signal, first: int, stop: int) -> Signal:
+    """Blocks ``first`` up to ``stop`` of a signal."""
+    by_block = ("psi", "w", "force", "passed", "passed_by_w", "tuned", "whitened", "geometry", "known", "known_var")
+    return signal._replace(**{name: getattr(signal, name)[first:stop] for name in by_block})
+
+
+def _filtered(
+    prepared: Prepared, signal: Signal, start: Belief, walk: Array
+) -> tuple[float, float, int, NDArray[np.bool_], tuple[Array, Array, Array, Array, Array]]:
+    """(log-likelihood, chi2, measurements, live, (xs, Ps, xp, Pp, Fs)) of ``smoother.run_filter``."""
+    m, n = len(signal.whitened), start.x.size
+    kept = (np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n)))
+    live = start.live.copy()
+    told = smoother.run_filter(prepared.laws, signal, start.x.copy(), start.P.copy(), live, walk, OFFSET_WALK, *kept)
+    return *told, live, kept
+
+
+def follow(prepared: Prepared, start: Belief, values: Array, causal: bool = False) -> Track:
+    """The track of all blocks, window by window, so that memory does not grow with the covariances of all blocks."""
+    blocks, walk = len(prepared.time), _walks(values)
+    states, sds = np.empty((blocks, start.x.size)), np.empty((blocks, start.x.size))
+    live = start.live.copy()
+    total, chi2, count, first, belief = 0.0, 0.0, 0, 0, start
+    while first < blocks:
+        done = min(first + WINDOW, blocks)
+        part = window(prepared.signal, first, min(done + LAG, blocks))
+        ll, squares, used, found, (xs, Ps, xp, Pp, Fs) = _filtered(prepared, part, belief, walk)
+        live = live | found
+        inner = done - first
+        if done < blocks:
+            motion = xp[inner, LOG::STATES][: len(prepared.laws)]
+            floor = np.log([2.0 * FLOOR * law.theta0 for law in prepared.laws])
+            belief = Belief(xp[inner].copy(), Pp[inner].copy(), motion > floor)
+        if not causal:
+            smoother.run_smoother(xs, Ps, xp, Pp, Fs)
+        states[first:done] = xs[:inner]
+        sds[first:done] = np.sqrt(np.maximum(np.diagonal(Ps[:inner], axis1=1, axis2=2), 0.0))
+        total, chi2, count, first = total + ll, chi2 + squares, count + used, done
+    return Track(states, sds, total, chi2 / max(count, 1), live)
+
+
+def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
+    """The start with each axis's sign as its odd harmonics tell it over the first blocks, and what told it.
+
+    An even capacitance has no odd harmonics and leaves theta and -theta alike. Where there are some, they follow from
+    the even ones but for their sign.
+    """
+    axes = len(prepared.laws)
+    if not is_capacitive(prepared.sense.readout):
+        return start, ["known: position readout"] * axes
+    signal = window(prepared.signal, 0, PROBED)
+    kept = _filtered(prepared, signal, start, _walks(np.tile(START_WALK, (axes, 1))))[-1]
+    agreement, weight = np.zeros(axes), np.zeros(axes)
+    for k, state in enumerate(kept[0]):
+        unroot = signal.unroots[signal.geometry[k]]
+        fitted, variances = unroot @ signal.whitened[k], signal.noise_var * (unroot**2).sum(axis=1)
+        told = smoother.expected(prepared.laws, signal, k, state)[0]
+        for i, (a, order) in enumerate(signal.lines):
+            pair = slice(1 + 2 * i, 3 + 2 * i)
+            if order % 2 and (variances[pair] > 0.0).all():
+                agreement[a] += float(np.sum(fitted[pair] * told[pair] / variances[pair]))
+                weight[a] += float(np.sum(told[pair] ** 2 / variances[pair]))
+    known = np.abs(agreement) > SIGNIFICANT * np.sqrt(np.maximum(weight, 1.0))
+    x = start.x.copy()
+    x[PHASE::STATES][:axes] += np.where(known & (agreement < 0.0), np.pi, 0.0)
+    return replace(start, x=x), ["known: the combs' offset theta_th" if sure else "ambiguous" for sure in known]
+
+
+def _axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, float, int], sign: str) -> AxisMotion:
+    signal, at = prepared.signal, i * STATES
+    axes = len(prepared.laws)
+    rates = np.empty((len(prepared.time), axes), np.complex128)
+    moved = np.empty((len(prepared.time), axes, MOVED + 1), np.complex128)
+    smoother.turns(prepared.laws, signal, found.states, rates, moved)
+    log, phase = found.states[:, at + LOG], found.states[:, at + PHASE]
+    lines = moved[:, i] / np.exp(log)[:, None]
+    lines[:, 1] = -1j
+    if prepared.laws[i].theta_th == 0.0 and prepared.laws[i].pull:
+        lines = np.ascontiguousarray(lines[:, 1::2])
+    reference = prepared.references[prepared.sense.axes[i]]
+    # a block sees the reference averaged over itself, which is not its value in the middle when the drive sweeps
+    phase = phase + signal.psi[:, i] - reference.phase(prepared.time)
+    slow = SlowMotion(reference, prepared.time, phase, rates[:, i].imag.copy(), log, rates[:, i].real.copy(), lines)
+    return AxisMotion(
+        time=prepared.time,
+        phase=phase,
+        amplitude=np.exp(log),
+        frequency=(signal.w[:, i] + rates[:, i].imag) / (2 * np.pi),
+        phase_sd=found.sds[:, at + PHASE],
+        angle=SlowAngle(slow, *clock),
+        reference=reference.kind,
+        sign=sign,
+    )
+
+
+def _facts(prepared: Prepared, found: Track, walk: Array) -> dict[str, object]:
+    names = ("white_phase", "stiffness_trend", "damping")
+    return {
+        "block_s": prepared.signal.width,
+        "used": prepared.clean,
+        "noise_sd": float(np.sqrt(prepared.signal.noise_var)),
+        "mean_squared_innovation": found.chi2,
+        "log_likelihood": found.log_likelihood,
+        "walk": {
+            axis: dict(zip(names, row.tolist(), strict=True))
+            for axis, row in zip(prepared.sense.axes, walk, strict=True)
+        },
+    }
