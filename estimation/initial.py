@@ -114,12 +114,17 @@ def start_from_signal(sense: Sense, device: Device, references: Mapping[str, Ref
 
 def amplitude_of_line(size: float, comb: Capacitance, gain: float) -> tuple[float, float]:
     """Amplitude [rad] whose second harmonic of C, times ``gain`` [V/F], is ``size`` [V]; and d size/dA [V/rad]."""
-    amplitudes = np.linspace(1e-4, 1.6, 1601) * comb.theta0
+    amplitudes = np.linspace(0.0, 1.6, 161) * comb.theta0
     lines = gain * np.array([abs(capacitance_harmonics(float(a), comb, 2)[2]) for a in amplitudes])
     top = int(lines.argmax())  # beyond it a larger swing gives no larger line
-    amplitude = float(np.interp(size, lines[: top + 1], amplitudes[: top + 1]))
-    slope = float(np.interp(amplitude, amplitudes, np.gradient(lines, amplitudes)))
-    return amplitude, max(slope, 1e-3 * gain * comb.C0 / comb.theta0)
+    # The line grows as A^2 at first: interpolated in its square root it is nearly straight.
+    amplitude = float(np.interp(np.sqrt(size), np.sqrt(lines[: top + 1]), amplitudes[: top + 1]))
+    for _ in range(3):  # and two or three steps of Newton take the rest of the error away
+        step = 1e-4 * comb.theta0
+        here, there = (gain * abs(capacitance_harmonics(a, comb, 2)[2]) for a in (amplitude, amplitude + step))
+        slope = max((there - here) / step, 1e-3 * gain * comb.C0 / comb.theta0)
+        amplitude = float(np.clip(amplitude + (size - here) / slope, amplitudes[1], amplitudes[top]))
+    return amplitude, slope
 
 
 def _from_capacitance(
