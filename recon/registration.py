@@ -1,0 +1,313 @@
+"""Forward against backward: the phase error that the picture itself shows.
+
+A sample whose true angle is A sin(α + d) but which was mapped to A sin α is shown d·A cos α behind its true place on
+forward sweeps (cos α > 0) and ahead of it on backward ones. So sweeps in opposite directions show one place 2 m d pixels
+apart at the centre of the line, and less towards its edges. What is estimated here is the d of both axes for which all
+samples of one place agree in the least-squares sense, whichever way the mirror went; no sharpness of a picture is looked
+at and no truth is needed. An error of the amplitude moves both directions alike and leaves d alone.
+
+The model of a sample is I = f(u + d c) + noise, of the unknown picture f at its true place, where the mapped place u and
+its motion with the phase, c = A cos α, are known. f is eliminated by smoothing intensities and places alike (Robinson
+1988, "Root-N-consistent semiparametric regression"): with the normalised convolution S,
+
+    I - S[I] = ∇f · ((u - S[u]) + d (c - S[c])) + noise,
+
+which is solved for d by Gauss-Newton, the samples being remapped with each new d.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.mapping import Grid
+from scanner.errors import BadInput
+
+Array = NDArray[np.float64]
+
+REACH = math.radians(15.0)  # errors looked for, either way; the directions' pictures still share 2/3 of the field there
+SEARCH_CELLS = 128  # of phase, across half a turn
+RESOLUTION = math.pi / SEARCH_CELLS / 4  # of the search; what is known no better than that is not known
+SIGMA = 1.5  # of the smoothing, in cells
+SAMPLES_PER_CELL = 2.0  # with fewer, the pattern of the scan lines shows in the result
+BLOCKS = 64  # of time in a slice, whose scores count as independent; in space they would share the scan's pattern
+DAMPING = 0.7  # a smoothed picture's gradient is too flat by up to a half, so that the full step overshoots
+
+
+class Estimate(NamedTuple):
+    """A value with its standard error; (nan, inf) where the samples do not tell."""
+
+    value: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class PhaseError:
+    """How far the true phase is ahead of the assumed one.
+
+    Attributes:
+        time: middle of the slice, from the first sample on [s].
+        x, y: value and standard error [rad].
+    """
+
+    time: float
+    x: Estimate
+    y: Estimate
+
+
+class _Samples(NamedTuple):
+    """Mapped place from the centre of the field [px], its motion with the phase [px/rad], what was seen, which block."""
+
+    x: Array
+    y: Array
+    dx: Array
+    dy: Array
+    intensity: Array
+    block: NDArray[np.int64]
+
+
+class _Comparison(NamedTuple):
+    """Normal equations of the module's model, for each slice: score (slices, BLOCKS, 2), information (slices, 2, 2)."""
+
+    score: Array
+    information: Array
+
+
+def phase_error(
+    theta_x: NDArray[Any],
+    theta_y: NDArray[Any],
+    intensity: NDArray[Any],
+    rate: float,
+    grid: Grid,
+    amplitude_x: float | Array,
+    amplitude_y: float | Array,
+    slices: int = 1,
+) -> list[PhaseError]:
+    """Phase error of both axes in each slice of a scan, from the agreement of forward and backward sweeps.
+
+    The slices share one picture, so that short ones, which leave most of the field unseen, have something to be compared
+    with; within a slice the error counts as constant.
+
+    Args:
+        theta_x, theta_y: angles the samples were mapped with, shape (n,) [rad]; smooth, as a model or a filter makes them.
+        intensity: shape (n,) or (n, detectors); detectors are averaged. Samples with NaN are left out.
+        rate: samples a second [Hz].
+        grid: the pixels; no detail finer than a pixel is compared.
+        amplitude_x, amplitude_y: of the angles, a number or shape (n,) [rad].
+        slices: equal parts in time.
+
+    Returns:
+        One entry a slice. An axis whose error the samples do not tell has value nan and sd inf.
+
+    Raises:
+        BadInput: shapes that do not belong together, or fewer than one slice.
+    """
+    theta_x, theta_y, intensity = np.asarray(theta_x, float), np.asarray(theta_y, float), np.asarray(intensity, float)
+    if not theta_x.shape == theta_y.shape == intensity.shape[:1]:
+        raise BadInput(
+            f"angles of shape {theta_x.shape} and {theta_y.shape} with an intensity of shape {intensity.shape}",
+            hint="give one angle of each axis for each intensity",
+        )
+    if slices < 1:
+        raise BadInput(f"{slices} slices", hint="give at least 1")
+    n = theta_x.size
+    pixels_x, pixels_y = 0.5 * grid.width / grid.half_angle_x, 0.5 * grid.height / grid.half_angle_y
+    columns = (
+        theta_x * pixels_x,
+        theta_y * pixels_y,
+        quadrature(theta_x, amplitude_x) * pixels_x,
+        quadrature(theta_y, amplitude_y) * pixels_y,
+        intensity.mean(axis=1) if intensity.ndim == 2 else intensity,
+        np.arange(n) * (slices * BLOCKS) // max(n, 1),
+    )
+    seen = np.all([np.isfinite(column) for column in columns], axis=0)
+    value, sd = _register(_Samples(*(column[seen] for column in columns)), grid, slices)
+    times = (np.arange(slices) + 0.5) * n / slices / rate
+    return [
+        PhaseError(float(t), *(Estimate(float(v), float(s)) for v, s in zip(values, sds, strict=True)))
+        for t, values, sds in zip(times, value, sd, strict=True)
+    ]
+
+
+def quadrature(theta: Array, amplitude: float | Array) -> Array:
+    """A cos α of the angle A sin α, shape (n,) [rad]: positive on forward sweeps, negative on backward ones."""
+    if theta.size < 2:
+        return np.zeros_like(theta)
+    magnitude = np.abs(np.fft.rfft(np.nan_to_num(theta)))
+    period = theta.size / (1 + int(np.argmax(magnitude[1:])))
+    lag = max(round(period / 16), 1)  # long enough that noise does not turn the direction round
+    index = np.arange(theta.size)
+    rise = theta[np.minimum(index + lag, theta.size - 1)] - theta[np.maximum(index - lag, 0)]
+    return np.sign(rise) * np.sqrt(np.maximum(np.square(amplitude) - np.square(theta), 0.0))
+
+
+def _register(samples: _Samples, grid: Grid, slices: int) -> tuple[Array, Array]:
+    """Phase errors and their standard errors, shape (slices, 2), of the cell size that tells each of them best."""
+    part = samples.block // BLOCKS
+    if np.bincount(part, minlength=slices).min() < 4 * BLOCKS:
+        return np.full((slices, 2), np.nan), np.full((slices, 2), np.inf)
+    start = np.array([_search(_Samples(*(column[part == s] for column in samples))) for s in range(slices)])
+    best, limit = start, np.full_like(start, RESOLUTION)
+    finest = max(1.0, math.sqrt(SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size))
+    for cell in (4 * finest, 2 * finest, finest):  # noise asks for large cells, fine detail for small ones
+        value, sd = _solve(samples, best, grid, cell)
+        better = (sd < limit) & (np.abs(value - start) < 2 * RESOLUTION)  # further off is another minimum
+        best, limit = np.where(better, value, best), np.where(better, sd, limit)
+    told = limit < RESOLUTION
+    return np.where(told, best, np.nan), np.where(told, limit, np.inf)
+
+
+def _solve(samples: _Samples, error: Array, grid: Grid, cell: float) -> tuple[Array, Array]:
+    """Gauss-Newton from ``error`` on over cells of one size [px]: values and standard errors, shape (slices, 2)."""
+    to_cells = 0.5 * np.array([grid.width, grid.height]) / cell
+    for _ in range(10):
+        here = _compare(samples, error, grid, cell)
+        step = DAMPING * (np.linalg.pinv(here.information) @ here.score.sum(1)[..., None])[..., 0]
+        step = np.clip(step, -1 / to_cells, 1 / to_cells)  # the gradient reaches no further than a cell
+        error = error + step
+        if np.abs(step * to_cells).max() < 0.01:
+            break
+    here = _compare(samples, error, grid, cell)
+    slope = np.empty_like(here.information)  # measured: noise in a gradient would count as a feature there
+    for axis in range(2):
+        shift = np.eye(2)[axis] / to_cells
+        ahead, behind = (_compare(samples, error + s, grid, cell).score.sum(1) for s in (shift, -shift))
+        slope[:, :, axis] = (behind - ahead) * to_cells[axis] / 2
+    slope_of, expected = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (slope, here.information))
+    # Noise in the gradient shows as a slope too small, detail lost in the smoothing as one too large, and what the scan's
+    # pattern makes of the other axis's features as little information.
+    told = (slope_of > 0.5 * expected) & (slope_of < 2 * expected) & (expected > 0.05 * expected.max(1, keepdims=True))
+    value, sd = error.copy(), np.full_like(error, np.inf)
+    for s, axes in enumerate(told):
+        if axes.any():
+            shares = here.score[s][:, axes] @ np.linalg.pinv(slope[s][np.ix_(axes, axes)]).T
+            value[s, axes] += shares.sum(0)
+            sd[s, axes] = np.linalg.norm(shares, axis=0)
+    return value, sd
+
+
+def _compare(samples: _Samples, error: Array, grid: Grid, cell: float) -> _Comparison:
+    """Remap with the phase errors given, smooth over cells of the given size [px], compare each sample with its place."""
+    import cv2
+
+    slices = len(error)
+    shape = (math.ceil(grid.height / cell) + 1, math.ceil(grid.width / cell) + 1)
+    sums = np.zeros((6, *shape))
+    cos, sin = np.cos(error), np.sin(error)
+    _splat(samples, cos, sin, cell, sums)
+    size = 2 * math.ceil(3 * SIGMA) + 1
+    for field in sums:
+        cv2.GaussianBlur(field, (size, size), SIGMA, dst=field, borderType=cv2.BORDER_CONSTANT)
+    picture = np.divide(sums[1], sums[0], out=np.full(shape, np.nan), where=sums[0] > 1e-9)
+    gradient = np.nan_to_num(np.gradient(picture)) / cell
+    score, information = np.zeros((slices, BLOCKS, 2)), np.zeros((slices, 2, 2))
+    _accumulate_normal(samples, cos, sin, cell, sums, gradient, score, information)
+    return _Comparison(score, information)
+
+
+@numba.njit(cache=True, inline="always")
+def _locate(place: float, motion: float, cos: float, sin: float, cell: float, n: int) -> tuple[float, float, int, float]:
+    """Corrected place, its motion, and the cell below it with the fraction of the way to the next; cell -1 outside."""
+    corrected = place * cos + motion * sin
+    position = corrected / cell + 0.5 * (n - 1)
+    inside = 0.0 <= position < n - 1
+    index = int(position) if inside else -1
+    return corrected, motion * cos - place * sin, index, position - index
+
+
+@numba.njit(cache=True, nogil=True)
+def _splat(samples, cos, sin, cell, sums):  # type: ignore[no-untyped-def]
+    """Spread count, intensity, place and motion of each sample over the four cells around its corrected place."""
+    _, height, width = sums.shape
+    for i in range(samples.x.size):
+        s = samples.block[i] // BLOCKS
+        x, dx, column, right = _locate(samples.x[i], samples.dx[i], cos[s, 0], sin[s, 0], cell, width)
+        y, dy, row, down = _locate(samples.y[i], samples.dy[i], cos[s, 1], sin[s, 1], cell, height)
+        if column < 0 or row < 0:
+            continue
+        for r in range(2):
+            for c in range(2):
+                weight = (down if r else 1.0 - down) * (right if c else 1.0 - right)
+                sums[0, row + r, column + c] += weight
+                sums[1, row + r, column + c] += weight * samples.intensity[i]
+                sums[2, row + r, column + c] += weight * x
+                sums[3, row + r, column + c] += weight * y
+                sums[4, row + r, column + c] += weight * dx
+                sums[5, row + r, column + c] += weight * dy
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate_normal(samples, cos, sin, cell, sums, gradient, score, information):  # type: ignore[no-untyped-def]
+    _, height, width = sums.shape
+    mean, along = np.empty(6), np.empty(2)
+    for i in range(samples.x.size):
+        s = samples.block[i] // BLOCKS
+        x, dx, column, right = _locate(samples.x[i], samples.dx[i], cos[s, 0], sin[s, 0], cell, width)
+        y, dy, row, down = _locate(samples.y[i], samples.dy[i], cos[s, 1], sin[s, 1], cell, height)
+        if column < 0 or row < 0:
+            continue
+        mean[:] = 0.0
+        along[:] = 0.0
+        for r in range(2):
+            for c in range(2):
+                weight = (down if r else 1.0 - down) * (right if c else 1.0 - right)
+                for k in range(6):
+                    mean[k] += weight * sums[k, row + r, column + c]
+                along[0] += weight * gradient[1, row + r, column + c]
+                along[1] += weight * gradient[0, row + r, column + c]
+        mean /= mean[0]
+        residual = samples.intensity[i] - mean[1] - along[0] * (x - mean[2]) - along[1] * (y - mean[3])
+        z_x, z_y = along[0] * (dx - mean[4]), along[1] * (dy - mean[5])
+        score[s, samples.block[i] % BLOCKS, 0] += z_x * residual
+        score[s, samples.block[i] % BLOCKS, 1] += z_y * residual
+        information[s, 0, 0] += z_x * z_x
+        information[s, 0, 1] += z_x * z_y
+        information[s, 1, 0] += z_x * z_y
+        information[s, 1, 1] += z_y * z_y
+
+
+def _search(samples: _Samples) -> Array:
+    """A coarse start: the phase errors (x, y) within REACH for which the pictures of opposite directions match best.
+
+    Over arcsin(θ/A) instead of θ, forward and backward pictures are shifted against each other by 2 d everywhere, so that
+    all errors can be tried at once: by the normalised correlation of the pairs of samples that come to lie in one cell
+    (Padfield 2012, "Masked object registration in the Fourier domain").
+    """
+    from scipy.ndimage import gaussian_filter
+
+    n = SEARCH_CELLS
+    column, row = (
+        np.minimum((np.arcsin(place / np.hypot(place, motion).max()) / math.pi + 0.5) * n, n - 1).astype(int)
+        for place, motion in ((samples.x, samples.dx), (samples.y, samples.dy))
+    )
+    index = ((2 * (samples.dy > 0) + (samples.dx > 0)) * n + row) * n + column
+    value = samples.intensity - samples.intensity.mean()
+
+    def transforms(weights: Array) -> NDArray[np.complex128]:
+        backward, forward_x, forward_y, forward = np.bincount(index, weights, 4 * n * n).reshape(4, n, n)
+        # upside down, the mixed pair is shifted the same way as the other one
+        pairs = [[forward, backward], [forward_x[::-1], forward_y[::-1]]]
+        return np.asarray(np.fft.rfft2(pairs, (2 * n, 2 * n)))
+
+    one, first, second = (transforms(value**power) for power in range(3))
+    lag = np.fft.fftfreq(2 * n, 1 / (2 * n)) * math.pi / n
+    allowed = np.abs(lag) <= 2 * REACH
+    window = np.ix_(allowed, allowed)
+
+    def correlate(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Array:
+        sums = np.fft.irfft2((a[:, 0].conj() * b[:, 1]).sum(0), (2 * n, 2 * n))
+        return np.asarray(gaussian_filter(sums, 0.7, mode="wrap")[window])  # few pairs fall on one lag alone
+
+    pairs = np.maximum(correlate(one, one), 0.5)
+    mean_a, mean_b, square_a, square_b, product = (
+        correlate(*sums) / pairs for sums in ((first, one), (one, first), (second, one), (one, second), (first, first))
+    )
+    variance = np.maximum((square_a - mean_a**2) * (square_b - mean_b**2), np.finfo(float).tiny)
+    match = (product - mean_a * mean_b) / np.sqrt(variance)
+    best_y, best_x = np.unravel_index(np.argmax(match), match.shape)
+    return np.array([lag[allowed][best_x], lag[allowed][best_y]]) / 2
