@@ -1,0 +1,261 @@
+"""From calibration recordings to the numbers of a device (chen2020 IV-A, chen2019 IV-B), each with its uncertainty.
+
+A ringdown fixes k/J and b/J and no more: J, k and b scaled alike ring down alike. What sets the torque's scale, J,
+comes from driven motion, where inertia stands against a torque ½ C'(θ) V² whose size is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.demodulate import block_length, block_phasors
+from scanner.device import Axis, Capacitance, Mechanics
+from scanner.errors import BadInput
+from scanner.integrate import rk4
+from scanner.laws import capacitance, capacitance_slope, electrostatic_torque
+from scanner.lowpass import lowpass, step_coefficients
+
+Array = NDArray[np.float64]
+
+CYCLES = 20.0  # of the motion, a block of a driven record
+STEPS_A_CYCLE = 40  # of Runge-Kutta in a ringdown's fit: phase right to 1e-6 a cycle
+
+
+@dataclass(frozen=True)
+class Value:
+    """An identified number and its standard deviation."""
+
+    value: float
+    sd: float
+
+    @property
+    def ci95(self) -> tuple[float, float]:
+        """Interval that holds the truth 95 times in 100."""
+        return self.value - 1.96 * self.sd, self.value + 1.96 * self.sd
+
+
+def linear_fit(basis: Array, target: Array) -> tuple[Array, Array]:
+    """Least squares with columns scaled to one size, so that farads and volts may stand side by side.
+
+    Args:
+        basis: shape (n, p). target: shape (n,).
+
+    Returns:
+        Coefficients, shape (p,), and their covariance for white residuals, shape (p, p).
+    """
+    size = np.linalg.norm(basis, axis=0)
+    gram = np.linalg.inv((basis / size).T @ (basis / size))
+    fitted = gram @ ((basis / size).T @ target)
+    residual = target - (basis / size) @ fitted
+    covariance = gram * (residual @ residual) / (target.size - fitted.size)
+    return fitted / size, covariance / np.outer(size, size)
+
+
+@dataclass(frozen=True)
+class Driven:
+    """One stretch of driven motion at one drive frequency.
+
+    Attributes:
+        angle: shape (n,) [rad]. voltage: on the combs at the same samples [V].
+        frequency: of the motion [Hz]. rate: of the samples [Hz].
+    """
+
+    angle: Array
+    voltage: Array
+    frequency: float
+    rate: float
+
+
+def mechanics_from_driven(comb: Capacitance, records: Sequence[Driven]) -> dict[str, Value]:
+    """``J``, ``b`` and ``k`` from driven motion: the equation of motion (chen2020 eq 9), at the motion's frequency.
+
+    A block's phasors of angle and torque obey (k/J - w^2 + j w b/J) Θ = T / J, linear in k/J, b/J and 1/J. Phase and
+    amplitude at one drive frequency give two equations, so two frequencies are needed.
+
+    Raises:
+        BadInput: one frequency only.
+    """
+    if len({round(record.frequency, 3) for record in records}) < 2:
+        raise BadInput("driven records at two or more drive frequencies are needed to tell k, b and J", hint="sweep")
+    rows, targets = [], []
+    for record in records:
+        w = 2 * np.pi * record.frequency
+        slope = capacitance_slope(record.angle, comb.C0, comb.theta0, comb.theta_th)
+        block = block_length(record.frequency, record.rate, CYCLES)
+        turn, torque = (
+            block_phasors(values, record.rate, 0.0, record.frequency, block)[1]
+            for values in (record.angle, electrostatic_torque(slope, record.voltage))
+        )
+        unit = np.exp(-1j * np.angle(turn))  # every block's angle made real: rows are then in phase and in quadrature
+        row = np.stack([np.abs(turn), 1j * w * np.abs(turn), -torque * unit], axis=1)
+        rows += [row.real, row.imag]
+        targets += [w**2 * np.abs(turn), np.zeros(turn.size)]
+    (stiff, loss, inverse), covariance = linear_fit(np.concatenate(rows), np.concatenate(targets))
+    jacobian = {
+        "J": np.array([0.0, 0.0, -1.0 / inverse**2]),
+        "b": np.array([0.0, 1.0 / inverse, -loss / inverse**2]),
+        "k": np.array([1.0 / inverse, 0.0, -stiff / inverse**2]),
+    }
+    values = {"J": 1.0 / inverse, "b": loss / inverse, "k": stiff / inverse}
+    return {key: Value(float(values[key]), float(np.sqrt(g @ covariance @ g))) for key, g in jacobian.items()}
+
+
+def ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, Value], Array]:
+    """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, under a bias, ``J`` from a free decay, by fitting its trajectory.
+
+    Args:
+        angle: shape (n,) [rad]. rate: [Hz].
+        axis: where the fit starts, and the capacitance that a bias pulls at.
+        bias: voltage on the combs [V]. It stiffens small swings more than large ones by an amount that goes as 1/J,
+            which is all that a ringdown can tell of J.
+
+    Returns:
+        the values, and the residual of the fit, shape (n,) [rad].
+
+    Raises:
+        BadInput: nothing rings, or the fit does not follow it.
+    """
+    from scipy.optimize import least_squares
+
+    mechanics = axis.require_mechanics()
+    comb = axis.require_capacitance() if bias else None
+    stride = max(1, round(rate / (mechanics.resonance * STEPS_A_CYCLE)))  # samples a step: few are enough
+    steps_a_stride = max(1, round(mechanics.resonance * STEPS_A_CYCLE / rate))
+    used = angle[::stride]
+    step = stride / rate / steps_a_stride
+    n = (used.size - 1) * steps_a_stride
+    voltage = np.full(2 * n + 1, bias)
+    shape = (comb.C0, comb.theta0, comb.theta_th) if comb else (0.0, 1.0, 0.0)
+    w0, loss0 = _first_guess(used, rate / stride, mechanics)
+    scale = np.array([1e-3 * w0, 0.1 * loss0, 0.01 * np.abs(used).max(), 0.01 * w0 * np.abs(used).max(), 0.1])
+
+    def trajectory(x: Array) -> Array:
+        w, loss, theta, omega, log_inverse = start + scale * np.append(x, np.zeros(5 - x.size))
+        J = mechanics.J * np.exp(-log_inverse)
+        b, k = np.full(2 * n + 1, loss * J), np.full(2 * n + 1, w * w * J)
+        return rk4(theta, omega, voltage, b, k, step, steps_a_stride, J, *shape, 0.0)[0]
+
+    around = np.arange(min(used.size, 2 * STEPS_A_CYCLE))
+    line = np.polynomial.polynomial.polyfit(around[:9] * stride / rate, used[:9], 3)
+    start = np.array([w0, loss0, line[0], line[1], 0.0])
+    free = 5 if comb else 4
+    x = np.zeros(free)
+    for part in (used.size // 8, used.size // 3, used.size):  # a window that grows keeps the phase within reach
+        if part > 4 * free:
+            fit = least_squares(lambda x, part=part: trajectory(x)[:part] - used[:part], x, x_scale=1.0, method="trf")
+            x = fit.x
+    residual = used - trajectory(x)
+    if residual.std() > 0.3 * used.std():
+        raise BadInput(
+            "the free decay does not follow the equation of motion", hint="cut the record to the decay alone"
+        )
+    variance = float(residual @ residual) / (used.size - free)
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * variance
+    sd = scale[:free] * np.sqrt(np.diag(covariance))
+    w, loss = start[:2] + scale[:2] * x[:2]
+    values = {"k_over_J": Value(float(w * w), float(2 * w * sd[0])), "b_over_J": Value(float(loss), float(sd[1]))}
+    if comb:
+        J = mechanics.J * np.exp(-scale[4] * x[4])
+        values["J"] = Value(float(J), float(J * sd[4]))
+    return values, residual
+
+
+def _first_guess(angle: Array, rate: float, mechanics: Mechanics) -> tuple[float, float]:
+    """Angular frequency and b/J of a decay from the phasors of its blocks."""
+    f = mechanics.resonance
+    block = block_length(f, rate, 6.0)
+    if angle.size < 4 * block:
+        raise BadInput("the free decay is shorter than 24 cycles", hint="record for longer")
+    time, z = block_phasors(angle, rate, 0.0, f, block)
+    z = z * np.exp(-2j * np.pi * f * time)
+    keep = np.abs(z) > 0.05 * np.abs(z).max()
+    keep[np.argmin(keep) if not keep.all() else keep.size :] = False
+    if keep.sum() < 3:
+        raise BadInput("shows no free decay near the device's resonance", hint="check the device's k and J")
+    slope = np.polyfit(time[keep], np.unwrap(np.angle(z[keep])), 1)[0]
+    decay = np.polyfit(time[keep], np.log(np.abs(z[keep])), 1)[0]
+    return 2 * np.pi * f + float(slope), max(-2.0 * float(decay), 1e-3)
+
+
+@dataclass(frozen=True)
+class ReadoutFit:
+    """An AMDM readout against a reference angle.
+
+    Attributes:
+        values: ``a_cir`` [V/F], ``b_cir`` [V], ``delay`` [s] beyond the sections, ``square`` [V/F^2] of the squared
+            capacitance, ``feed`` [1] and ``feed_rate`` [s] of the drive that leaks through.
+        coefficients: of all ``readout_features``, 0 for a term left out, shape (6,).
+        noise_sd: of the residual [V].
+    """
+
+    values: Mapping[str, Value]
+    coefficients: Array
+    noise_sd: float
+
+
+def readout_features(comb: Capacitance, angle: Array, voltage: Array, rate: float, sections: Sequence[float]) -> Array:
+    """What an AMDM output is a sum of: C, 1, C', C^2 behind the sections, the drive and its rate; shape (n, 6)."""
+    C = capacitance(angle, comb.C0, comb.Cb, comb.theta0, comb.theta_th)
+    square = C * C
+    for cutoff in sections:
+        coefficients = step_coefficients(cutoff, 1.0 / rate)
+        lowpass(C, *coefficients, C[0], C[0])
+        lowpass(square, *coefficients, square[0], square[0])
+    one = np.ones_like(C)
+    swing = voltage - voltage.mean()
+    return np.stack([C, one, np.gradient(C, 1 / rate), square, swing, np.gradient(voltage, 1 / rate)], axis=1)
+
+
+FEATURES = ("a_cir", "b_cir", "delay", "square", "feed", "feed_rate")
+
+
+def readout_from_driven(
+    comb: Capacitance,
+    records: Sequence[Driven],
+    senses: Sequence[Array],
+    sections: Sequence[float],
+    terms: Sequence[str] = FEATURES,
+    skip: float = 1e-4,
+) -> ReadoutFit:
+    """Gain and offset of an AMDM readout, and what the formula a_cir C + b_cir leaves out, by least squares.
+
+    Args:
+        records: with the reference angle. senses: the output at the same samples [V].
+        sections: corner of every low-pass section [Hz].
+        terms: which of ``FEATURES``; the paper's own fit is ``("a_cir", "b_cir")`` and no sections.
+        skip: that the sections need to settle [s].
+    """
+    columns = [FEATURES.index(term) for term in terms]
+    basis, target = [], []
+    for record, sense in zip(records, senses, strict=True):
+        first = round(skip * record.rate)
+        features = readout_features(comb, record.angle, record.voltage, record.rate, sections)
+        basis.append(features[first:, columns])
+        target.append(sense[first:])
+    stacked, y = np.concatenate(basis), np.concatenate(target)
+    fitted, covariance = linear_fit(stacked, y)
+    values = {term: Value(float(fitted[i]), float(np.sqrt(covariance[i, i]))) for i, term in enumerate(terms)}
+    coefficients = np.zeros(len(FEATURES))
+    coefficients[columns] = fitted
+    if "delay" in values:  # C(t - delay) = C - delay C'
+        slope, a_cir = values["delay"], values["a_cir"].value
+        values["delay"] = Value(-slope.value / a_cir, slope.sd / abs(a_cir))
+    return ReadoutFit(values, coefficients, float(np.std(y - stacked @ fitted)))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The capacitance's Gaussian profile from a sense signal and a reference angle.
+
+    Attributes:
+        values: ``theta0``, ``theta_th`` [rad], ``delay`` of the sense signal against the angle [s], and the linear
+            ones: ``C0`` [F] of a transimpedance readout, ``a_cir`` [V/F] and ``b_cir`` [V] of an AMDM one.
+        residual_sd: of the fit [V].
+    """
+
+    values: Mapping[str, Value]
+    residual_sd: float
