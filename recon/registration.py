@@ -1,14 +1,14 @@
 """Forward against backward: the phase error that the picture itself shows.
 
 A sample whose true angle is A sin(α + d) but which was mapped to A sin α is shown d·A cos α behind its true place on
-forward sweeps (cos α > 0) and ahead of it on backward ones. So sweeps in opposite directions show one place 2 m d pixels
-apart at the centre of the line, and less towards its edges. What is estimated here is the d of both axes for which all
-samples of one place agree in the least-squares sense, whichever way the mirror went; no sharpness of a picture is looked
-at and no truth is needed. An error of the amplitude moves both directions alike and leaves d alone.
+forward sweeps (cos α > 0) and ahead of it on backward ones. So sweeps in opposite directions show one place 2 m d
+pixels apart at the centre of the line, and less towards its edges. What is estimated here is the d of both axes for
+which all samples of one place agree in the least-squares sense, whichever way the mirror went; no sharpness of a
+picture is looked at and no truth is needed. An error of the amplitude moves both directions alike and leaves d alone.
 
-The model of a sample is I = f(u + d c) + noise, of the unknown picture f at its true place, where the mapped place u and
-its motion with the phase, c = A cos α, are known. f is eliminated by smoothing intensities and places alike (Robinson
-1988, "Root-N-consistent semiparametric regression"): with the normalised convolution S,
+The model of a sample is I = f(u + d c) + noise, of the unknown picture f at its true place, where the mapped place u
+and its motion with the phase, c = A cos α, are known. f is eliminated by smoothing intensities and places alike
+(Robinson 1988, "Root-N-consistent semiparametric regression"): with the normalised convolution S,
 
     I - S[I] = ∇f · ((u - S[u]) + d (c - S[c])) + noise,
 
@@ -61,7 +61,7 @@ class PhaseError:
 
 
 class _Samples(NamedTuple):
-    """Mapped place from the centre of the field [px], its motion with the phase [px/rad], what was seen, which block."""
+    """Mapped place from the field's centre [px], its motion with the phase [px/rad], what was seen, which block."""
 
     x: Array
     y: Array
@@ -90,11 +90,11 @@ def phase_error(
 ) -> list[PhaseError]:
     """Phase error of both axes in each slice of a scan, from the agreement of forward and backward sweeps.
 
-    The slices share one picture, so that short ones, which leave most of the field unseen, have something to be compared
-    with; within a slice the error counts as constant.
+    The slices share one picture, so that short ones, which leave most of the field unseen, have something to be
+    compared with; within a slice the error counts as constant. A slice wants some 15 periods of the slower axis.
 
     Args:
-        theta_x, theta_y: angles the samples were mapped with, shape (n,) [rad]; smooth, as a model or a filter makes them.
+        theta_x, theta_y: angles the samples were mapped with, shape (n,) [rad].
         intensity: shape (n,) or (n, detectors); detectors are averaged. Samples with NaN are left out.
         rate: samples a second [Hz].
         grid: the pixels; no detail finer than a pixel is compared.
@@ -117,14 +117,14 @@ def phase_error(
         raise BadInput(f"{slices} slices", hint="give at least 1")
     n = theta_x.size
     pixels_x, pixels_y = 0.5 * grid.width / grid.half_angle_x, 0.5 * grid.height / grid.half_angle_y
-    columns = (
+    columns: list[NDArray[Any]] = [
         theta_x * pixels_x,
         theta_y * pixels_y,
         quadrature(theta_x, amplitude_x) * pixels_x,
         quadrature(theta_y, amplitude_y) * pixels_y,
         intensity.mean(axis=1) if intensity.ndim == 2 else intensity,
         np.arange(n) * (slices * BLOCKS) // max(n, 1),
-    )
+    ]
     seen = np.all([np.isfinite(column) for column in columns], axis=0)
     value, sd = _register(_Samples(*(column[seen] for column in columns)), grid, slices)
     times = (np.arange(slices) + 0.5) * n / slices / rate
@@ -179,8 +179,8 @@ def _solve(samples: _Samples, error: Array, grid: Grid, cell: float) -> tuple[Ar
         ahead, behind = (_compare(samples, error + s, grid, cell).score.sum(1) for s in (shift, -shift))
         slope[:, :, axis] = (behind - ahead) * to_cells[axis] / 2
     slope_of, expected = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (slope, here.information))
-    # Noise in the gradient shows as a slope too small, detail lost in the smoothing as one too large, and what the scan's
-    # pattern makes of the other axis's features as little information.
+    # Noise in the gradient shows as a slope too small, detail lost in the smoothing as one too large, and what the
+    # scan's pattern makes of the other axis's features as little information.
     told = (slope_of > 0.5 * expected) & (slope_of < 2 * expected) & (expected > 0.05 * expected.max(1, keepdims=True))
     value, sd = error.copy(), np.full_like(error, np.inf)
     for s, axes in enumerate(told):
@@ -192,7 +192,7 @@ def _solve(samples: _Samples, error: Array, grid: Grid, cell: float) -> tuple[Ar
 
 
 def _compare(samples: _Samples, error: Array, grid: Grid, cell: float) -> _Comparison:
-    """Remap with the phase errors given, smooth over cells of the given size [px], compare each sample with its place."""
+    """Remap with the phase errors given, smooth over cells of one size [px], and compare each sample with its place."""
     import cv2
 
     slices = len(error)
@@ -211,7 +211,7 @@ def _compare(samples: _Samples, error: Array, grid: Grid, cell: float) -> _Compa
 
 
 @numba.njit(cache=True, inline="always")
-def _locate(place: float, motion: float, cos: float, sin: float, cell: float, n: int) -> tuple[float, float, int, float]:
+def _locate(place, motion, cos, sin, cell, n):  # type: ignore[no-untyped-def]
     """Corrected place, its motion, and the cell below it with the fraction of the way to the next; cell -1 outside."""
     corrected = place * cos + motion * sin
     position = corrected / cell + 0.5 * (n - 1)
@@ -274,9 +274,9 @@ def _accumulate_normal(samples, cos, sin, cell, sums, gradient, score, informati
 def _search(samples: _Samples) -> Array:
     """A coarse start: the phase errors (x, y) within REACH for which the pictures of opposite directions match best.
 
-    Over arcsin(θ/A) instead of θ, forward and backward pictures are shifted against each other by 2 d everywhere, so that
-    all errors can be tried at once: by the normalised correlation of the pairs of samples that come to lie in one cell
-    (Padfield 2012, "Masked object registration in the Fourier domain").
+    Over arcsin(θ/A) instead of θ, forward and backward pictures are shifted against each other by 2 d everywhere, so
+    that all errors can be tried at once: by the normalised correlation of the pairs of samples that come to lie in one
+    cell (Padfield 2012, "Masked object registration in the Fourier domain").
     """
     from scipy.ndimage import gaussian_filter
 
