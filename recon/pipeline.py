@@ -16,6 +16,7 @@ from tqdm import tqdm
 from estimation.estimate import default_estimator, estimate
 from estimation.signals import device_of
 from recon import blur
+from recon.coverage import fill_against_time
 from recon.mapping import Grid, Picture, fill_factor, fill_holes, map_samples
 from recon.output import finite, replacing_folder, write_json, write_motion, write_tiff
 from recon.registration import PhaseError, phase_error
@@ -31,6 +32,7 @@ Array = NDArray[np.float64]
 AXES = ("x", "y")
 SLICE = 0.01  # seconds of scan in which forward and backward sweeps are registered
 MOST_SLICES = 24
+FILLS = (0.25, 0.5, 0.75, 0.9, 0.99)
 
 
 @dataclass(frozen=True)
@@ -246,6 +248,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         **grouped,
         **axes,
         "fill": fill_factor(result.picture.coverage),
+        "seconds_to_fill": seconds_to_fill(result),
         "samples": int(result.picture.coverage.sum()),
         "seconds": result.seconds,
         "recorded_seconds": result.recorded,
@@ -253,6 +256,14 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "notes": result.notes,
         "info": dict(result.motion.info),
     }
+
+
+def seconds_to_fill(result: Reconstruction) -> dict[str, float | None]:
+    """Frame time after which each of ``FILLS`` was reached [s]; None where the scan was too short for it."""
+    x, y = (result.motion.axes[axis].angle for axis in AXES)
+    time, fill = fill_against_time(x.values, y.values, x.sample_rate, result.picture.grid)
+    at = np.searchsorted(fill, FILLS)
+    return {f"{wanted:g}": float(time[k]) if k < time.size else None for wanted, k in zip(FILLS, at, strict=True)}
 
 
 def _picture_score(result: Reconstruction) -> dict[str, Any] | None:

@@ -67,7 +67,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) ->
         ),
     )
     sections = [
-        Section("Picture", figures=pictures, least="20rem", pixelated=True),
+        Section("Picture", _fill_text(summary), figures=pictures, least="20rem", pixelated=True),
         Section(
             "Phase", _phase_text(result), axis_table(summary), phase_figures({result.motion.estimator: result}), "26rem"
         ),
@@ -175,6 +175,12 @@ def caption(name: str, summary: Mapping[str, Any]) -> str:
     if not all("phase_rmse_deg" in summary[a] for a in AXES):
         return name
     return f"{name}: phase error {summary['x']['phase_rmse_deg']:.2f}° in x, {summary['y']['phase_rmse_deg']:.2f}° in y"
+
+
+def _fill_text(summary: Mapping[str, Any]) -> str:
+    times = {fill: seconds for fill, seconds in summary["seconds_to_fill"].items() if seconds is not None}
+    reached = ", ".join(f"{float(fill):.0%} after {1e3 * seconds:.3g} ms" for fill, seconds in times.items())
+    return f"Pixels visited: {reached}." if reached else ""
 
 
 def _phase_text(result: Reconstruction) -> str:

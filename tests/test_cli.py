@@ -59,6 +59,10 @@ def test_reconstruct_writes_what_the_contract_says(scan: Path, tmp_path: Path, c
         assert summary["sign"][axis] == "ambiguous"
         assert 0 < summary["angle_rmse_rad"][axis] < 2e-3
     assert summary["seconds"] > 0
+    times = summary["seconds_to_fill"]
+    assert times["0.25"] < times["0.5"]
+    assert times["0.99"] is None
+    assert summary["fill"] < 0.99
     with h5py.File(out / "motion.h5") as motion:
         for axis in "xy":
             group = motion[axis]
