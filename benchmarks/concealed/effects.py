@@ -1,0 +1,226 @@
+"""The catalogue's effects as this truth has them: their law's size in each family, and how a size becomes numbers.
+
+A size is relative to the world that it falls on (of the stiffness at full swing, of the signal's height, of a period),
+and zero is off; everything else about the law (a time constant, a phase) is its shape, drawn once and kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.concealed.scanner_truth import Truth
+from benchmarks.concealed.worlds import World
+
+Rng = np.random.Generator
+Shape = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a law needs to know to be sized.
+
+    Attributes:
+        world: the scanner and its drive.
+        middle, height: of the clean sense signal, half its range above the middle [V].
+    """
+
+    world: World
+    middle: float
+    height: float
+
+    @property
+    def omega(self) -> float:
+        """Of the motion [rad/s]."""
+        return self.world.omega
+
+    @property
+    def drive_omega(self) -> float:
+        """Of the drive: twice the motion's where combs pull [rad/s]."""
+        return self.omega * (1 if self.world.truth.torque_per_volt else 2)
+
+
+Law = Callable[[Scene, Truth, float, Shape], dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One thing that a nominal device leaves out.
+
+    Attributes:
+        name: as in the catalogue, or this folder's own for an effect in no catalogue.
+        stage: where the signal meets it.
+        sizes: smallest and largest size, by family; a family that is missing cannot show it.
+        law: numbers of :class:`Truth` for a size and a shape, three draws from [0, 1).
+        signed: the size may be negative.
+        shaped: the law has a shape that a fit would be free to choose.
+        needs_angle: shows only against a reference detector.
+        parameters: what the key calls a number and in how much of which unit, where that is not the number itself.
+        listed: stands in the catalogue.
+    """
+
+    name: str
+    stage: str
+    sizes: Mapping[str, tuple[float, float]]
+    law: Law
+    signed: bool = False
+    shaped: bool = False
+    needs_angle: frozenset[str] = frozenset()
+    parameters: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    listed: bool = True
+
+    def shows_in(self, world: World) -> bool:
+        """Whether a recording of this world could show it."""
+        return world.family in self.sizes and (world.family not in self.needs_angle or world.angle_sd is not None)
+
+    def draw_size(self, family: str, rng: Rng) -> float:
+        """Even in its logarithm between smallest and largest."""
+        low, high = self.sizes[family]
+        return float(np.exp(rng.uniform(np.log(low), np.log(high)))) * (rng.choice([-1, 1]) if self.signed else 1)
+
+    def on(self, truth: Truth, scene: Scene, size: float, shape: Shape) -> Truth:
+        """The truth with this effect in it."""
+        return truth._replace(**self.law(scene, truth, size, shape))
+
+    def key(self, fields: dict[str, float]) -> dict[str, float]:
+        """A law's numbers by the names that the sealed key and a diagnosis give them."""
+        named = {name: (*self.parameters.get(name, (name, 1.0)), value) for name, value in fields.items()}
+        return {key: value * unit for key, unit, value in named.values()}
+
+
+def everywhere(low: float, high: float) -> dict[str, tuple[float, float]]:
+    return {"ring": (low, high), "drive": (low, high), "tf": (low, high)}
+
+
+def combs(low: float, high: float) -> dict[str, tuple[float, float]]:
+    return {"ring": (low, high), "drive": (low, high)}
+
+
+def _between(low: float, high: float, u: float) -> float:
+    return float(low + (high - low) * u)
+
+
+def _tau(scene: Scene, u: float) -> float:
+    """A drift's time constant: a sixth of the recording to all of it [s]."""
+    return scene.world.duration * _between(0.16, 1.0, u)
+
+
+def _beside_harmonics(omega: float, u: float) -> float:
+    """A frequency from 0.1 to 12 times ``omega`` that is no near neighbour of its multiples [rad/s]."""
+    ratio = 0.1 * 120**u
+    return omega * (np.floor(ratio) + 0.15 + 0.7 * (ratio % 1.0))
+
+
+def _filter_lag(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
+    first = {"section_1": p.section_1 * (1 + r)}
+    return first if u[0] < 0.5 else first | {"section_2": p.section_2 * (1 + r)}
+
+
+def _square_law(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
+    at = p.Cb + 0.6 * p.C0
+    return {"square_Cp": 1e-12 / r - at, "square_at": at}
+
+
+def _second_mode(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
+    ratio = _between(0.55, 0.88, 2 * u[0]) if u[0] < 0.5 else _between(1.13, 1.9, 2 * u[0] - 1)
+    omega = ratio * s.omega
+    return {
+        "mode_frequency": omega,
+        "mode_damping": omega / _between(30, 120, u[1]),
+        "mode_coupling": r * s.omega**2,
+    }
+
+
+def _mode_coupling(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
+    # The mode at half the frequency is pumped once theta passes 2 omega_q^2 / (Q exchange), r times below the swing.
+    omega, quality = 0.5 * s.omega * _between(0.998, 1.002, u[0]), _between(60, 120, u[1])
+    return {
+        "mode_frequency": omega,
+        "mode_damping": omega / quality,
+        "mode_coupling": 1e-3 * omega**2,  # too little to be seen; something must start what then grows
+        "mode_exchange": r * 2 * omega**2 / (quality * s.world.swing),
+    }
+
+
+def _offset_drift(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
+    weights = 2 * u - 1
+    weights = weights / np.abs(weights).sum()
+    return {f"drift_{i}": r * s.height * w for i, w in enumerate(weights, start=1)}
+
+
+IN_HERTZ = {
+    "drive_corner": ("f_c", 1 / (2 * pi)),
+    "readout_corner": ("f_c", 1 / (2 * pi)),
+    "section_1": ("f_c", 1 / (2 * pi)),
+    "section_2": ("f_c2", 1 / (2 * pi)),
+    "tone_frequency": ("f", 1 / (2 * pi)),
+    "mode_frequency": ("f2", 1 / (2 * pi)),
+}
+
+CATALOGUE: tuple[Effect, ...] = (
+    Effect("cubic-stiffness", "mechanics", everywhere(0.003, 0.1), signed=True,
+           law=lambda s, p, r, u: {"k3": r * p.k / s.world.swing**2}),
+    Effect("quadratic-stiffness", "mechanics", everywhere(0.03, 0.15), signed=True,
+           law=lambda s, p, r, u: {"k2": r * p.k / s.world.swing}),
+    Effect("quintic-stiffness", "mechanics", everywhere(0.003, 0.05), signed=True,
+           law=lambda s, p, r, u: {"k5": r * p.k / s.world.swing**4}),
+    Effect("quadratic-drag", "mechanics", everywhere(0.2, 1.5),
+           law=lambda s, p, r, u: {"b2": r * p.b / (s.world.swing * s.omega)}),
+    Effect("cubic-damping", "mechanics", everywhere(0.2, 1.5),
+           law=lambda s, p, r, u: {"b3": r * p.b / s.world.swing**2}),
+    Effect("coulomb-friction", "mechanics", everywhere(0.02, 0.15),
+           law=lambda s, p, r, u: {"tau_c": r * p.b * s.world.swing * s.omega}),
+    Effect("resonance-drift", "mechanics", {"ring": (5e-4, 0.04), "drive": (5e-4, 4e-3), "tf": (5e-4, 0.04)},
+           signed=True, shaped=True, parameters={"dk_tau": ("tau", 1)},
+           law=lambda s, p, r, u: {"dk": r, "dk_tau": _tau(s, u[0])}),
+    Effect("damping-drift", "mechanics", everywhere(0.05, 0.5), signed=True, shaped=True,
+           parameters={"db_tau": ("tau", 1)}, law=lambda s, p, r, u: {"db": r, "db_tau": _tau(s, u[0])}),
+    Effect("viscoelastic", "mechanics", {"ring": (0.02, 0.2), "drive": (0.001, 0.008), "tf": (0.02, 0.2)}, shaped=True,
+           law=lambda s, p, r, u: {"k_v": r * p.k, "tau_v": 0.2 * 30 ** float(u[0]) / s.omega}),
+    Effect("second-mode", "mechanics", {"ring": (0.02, 0.15), "drive": (0.01, 0.05), "tf": (0.02, 0.15)}, shaped=True,
+           parameters=IN_HERTZ, law=_second_mode),
+    Effect("mode-coupling", "mechanics", {"drive": (1.5, 4.0), "tf": (3.0, 6.0)}, shaped=True,
+           parameters=IN_HERTZ, law=_mode_coupling),
+    Effect("inertia-scale", "mechanics", {"drive": (0.05, 0.3)}, signed=True, law=lambda s, p, r, u: {"scale": 1 + r}),
+    Effect("comb-offset", "capacitance", combs(0.002, 0.015), signed=True,
+           law=lambda s, p, r, u: {"theta_c": r}),
+    Effect("profile-shape", "capacitance", combs(0.01, 0.1), signed=True, law=lambda s, p, r, u: {"shape": r}),
+    Effect("drive-droop", "drive", {"drive": (0.03, 0.15)}, parameters={"droop": ("g", 1)},
+           law=lambda s, p, r, u: {"droop": 1 - r}),
+    Effect("drive-lag", "drive", {"drive": (0.1, 0.5), "tf": (0.1, 0.5)},
+           parameters=IN_HERTZ, law=lambda s, p, r, u: {"drive_corner": s.drive_omega / r}),
+    Effect("charging", "drive", combs(0.5, 3.0), signed=True, shaped=True,
+           parameters={"charge": ("V_c", 1), "charge_tau": ("tau", 1)},
+           law=lambda s, p, r, u: {"charge": r, "charge_tau": _tau(s, u[0])}),
+    Effect("carrier-torque", "drive", {"drive": (0.01, 0.03)},
+           law=lambda s, p, r, u: {"carrier": r * 1350.0}),
+    Effect("readout-lag", "readout", everywhere(0.02, 0.2), needs_angle=frozenset({"ring"}),
+           parameters=IN_HERTZ, law=lambda s, p, r, u: {"readout_corner": s.omega / r}),
+    Effect("filter-lag", "readout", {"drive": (0.05, 0.25)}, signed=True,
+           parameters=IN_HERTZ, law=_filter_lag),
+    Effect("square-law", "readout", {"drive": (0.055, 0.070)}, law=_square_law, parameters={"square_Cp": ("C_p", 1)}),
+    Effect("feedthrough", "readout", {"drive": (0.02, 0.15), "tf": (0.02, 0.15)},
+           law=lambda s, p, r, u: {"feedthrough": r * s.height / (30.0 if p.drive_mean else 2.0)}),
+    Effect("offset-drift", "readout", everywhere(0.03, 0.2), law=_offset_drift, shaped=True),
+    Effect("gain-drift", "readout", everywhere(0.05, 0.25), signed=True, parameters={"gain_drift": ("drift", 1)},
+           law=lambda s, p, r, u: {"gain_drift": r}),
+    Effect("saturation", "readout", everywhere(0.1, 0.4),
+           law=lambda s, p, r, u: {"limit": s.middle + (1 - r) * s.height}),
+    Effect("sensor-cubic", "readout", {"ring": (0.05, 0.2), "tf": (0.05, 0.2)}, parameters={"sensor_cubic": ("c3", 1)},
+           law=lambda s, p, r, u: {"sensor_cubic": r / s.height**2}),
+    Effect("interference", "readout", everywhere(0.02, 0.1), shaped=True, parameters=IN_HERTZ,
+           law=lambda s, p, r, u: {"tone": r * s.height, "tone_frequency": _beside_harmonics(s.omega, float(u[0])),
+                                   "tone_phase": 2 * pi * float(u[1])}),
+    Effect("carrier-leakage", "readout", {"drive": (0.001, 0.05)}, shaped=True,
+           law=lambda s, p, r, u: {"leak": r * (p.Cb + 0.6 * p.C0), "leak_phase": _between(0.3, 1.5, u[0])}),
+    Effect("channel-delay", "timing", {"ring": (10e-6, 150e-6), "drive": (0.1e-6, 3e-6), "tf": (5e-6, 150e-6)},
+           needs_angle=frozenset({"ring"}), law=lambda s, p, r, u: {"delay": r}),
+    Effect("clock-skew", "timing", everywhere(5e-6, 200e-6), signed=True, needs_angle=frozenset({"ring"}),
+           law=lambda s, p, r, u: {"skew": r}),
+    Effect("angle-nonlinearity", "optics", combs(0.005, 0.05), signed=True, needs_angle=frozenset({"ring", "drive"}),
+           parameters={"angle_cubic": ("c3", 1)}, law=lambda s, p, r, u: {"angle_cubic": r / s.world.swing**2}),
+)  # fmt: skip
