@@ -1,0 +1,104 @@
+"""Run the diagnosis on sealed recordings, open the keys, and count.
+
+    python -m benchmarks.concealed.score RECORDINGS KEYS.json OUT [--timeout 600] [--workers 2]
+
+Writes ``OUT/<recording>/`` (what the diagnosis wrote), ``OUT/score.json`` and ``OUT/score.md``. A recording whose
+diagnosis was run into the same OUT is not run again. Keys with one effect and no distances are taken as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from benchmarks.concealed.table import markdown, summary
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording, its opened key and what the diagnosis said.
+
+    Attributes:
+        key: in the form of :func:`opened`.
+        diagnosis: None where none was written.
+        seconds: wall time.
+        failure: why there is no diagnosis, else an empty string.
+    """
+
+    name: str
+    key: dict[str, Any]
+    diagnosis: dict[str, Any] | None
+    seconds: float
+    failure: str = ""
+
+
+def opened(key: dict[str, Any]) -> dict[str, Any]:
+    """A key in one form, whether it came with a list of effects or with one effect and its stage."""
+    if "effects" in key:
+        return key
+    none = key["effect"] == "none"
+    only = {"effect": key["effect"], "stage": key["stage"], "listed": True, "parameters": key["parameters"]}
+    return key | {"kind": "none" if none else "one", "effects": [] if none else [only]}
+
+
+def diagnose(recording: Path, out: Path, command: list[str], timeout: float) -> None:
+    """One run of the command line; what became of it is left in ``out/run.json``."""
+    out.mkdir(parents=True, exist_ok=True)
+    started, failure = time.monotonic(), ""
+    try:
+        done = subprocess.run(
+            [*command, "diagnose", str(recording), "-o", str(out), "--json"],
+            capture_output=True, text=True, timeout=timeout, check=False,
+        )  # fmt: skip
+        if done.returncode:
+            failure = f"exit {done.returncode}: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else ''}"
+    except subprocess.TimeoutExpired:
+        failure = f"more than {timeout:g} s"
+    (out / "run.json").write_text(json.dumps({"seconds": time.monotonic() - started, "failure": failure}))
+
+
+def load(name: str, key: dict[str, Any], out: Path) -> Run:
+    """What a run left behind."""
+    ran = json.loads((out / "run.json").read_text())
+    written = out / "diagnosis.json"
+    diagnosis = json.loads(written.read_text()) if written.exists() and not ran["failure"] else None
+    failure = ran["failure"] or ("" if diagnosis else "no diagnosis.json")
+    return Run(name, opened(key), diagnosis, ran["seconds"], failure)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Diagnose sealed recordings, then open their keys and count.")
+    parser.add_argument("recordings", type=Path)
+    parser.add_argument("keys", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--timeout", type=float, default=600.0, metavar="SECONDS")
+    parser.add_argument("--workers", type=int, default=2, choices=(1, 2))
+    parser.add_argument("--command", default=str(Path(sys.executable).with_name("lissajous")))
+    options = parser.parse_args(arguments)
+    keys = json.loads(options.keys.read_text())
+
+    def run(name: str) -> Run:
+        out = options.out / name
+        if not (out / "run.json").exists():
+            diagnose(options.recordings / f"{name}.h5", out, [options.command], options.timeout)
+        return load(name, keys[name], out)
+
+    with ThreadPoolExecutor(options.workers) as pool:
+        runs = list(tqdm(pool.map(run, keys), total=len(keys), desc="diagnosed", disable=None))
+    score = summary(runs)
+    (options.out / "score.json").write_text(json.dumps(score, indent=1))
+    (options.out / "score.md").write_text(markdown(score))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
