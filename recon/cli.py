@@ -12,6 +12,8 @@ from typing import NoReturn
 COMMANDS = {
     "reconstruct": "track the motion of a recording and map its intensities to a picture",
     "simulate": "make a recording with a known truth",
+    "predict": "play a recording's drive through a device and compare",
+    "diagnose": "locate, name and model what the nominal device leaves out",
     "convert": "turn an instrument's file into a recording",
 }
 

@@ -1,0 +1,1 @@
+"""What the nominal device leaves out: located, named, modelled, and the improvement shown."""

@@ -1,0 +1,182 @@
+"""Output-error fit: the free numbers that bring simulated channels closest to recorded ones, priors included.
+
+Trajectories are fitted, not derivatives: the start of every recording is free, windows grow from a few turns of the
+mirror to the whole, and every residual is whitened by the noise that was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.mismatch.experiment import Run
+from estimation.mismatch.model import Model
+from estimation.mismatch.noise import Whitener
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FOLDS = 20
+"""Blocks of time that a recording is cut into; every ``HELD``-th is held out of every fit."""
+
+HELD = 5
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model fitted.
+
+    Attributes:
+        model: what was fitted.
+        x: free numbers at the best fit.
+        chi2: of the fitted samples; ``penalty``: of the priors.
+        residual: whitened, all samples of all channels, shape (N,).
+        jacobian: of the whitened residual, shape (N, len(x)).
+        rows: fitted samples; ``held``: held-out ones.
+        evidence: -2 log evidence (Laplace): chi2 + penalty + the price of the free numbers. Less is better.
+    """
+
+    model: Model
+    x: Array
+    chi2: float
+    penalty: float
+    residual: Array
+    jacobian: Array
+    rows: Mask
+    held: Mask
+    evidence: float
+
+    @property
+    def covariance(self) -> Array:
+        """Posterior covariance of x."""
+        inverse = np.linalg.inv(self.jacobian[self.rows].T @ self.jacobian[self.rows] + np.diag(self.model.precision))
+        return np.asarray(inverse)
+
+    @property
+    def held_chi2(self) -> float:
+        """Reduced chi-square of held-out samples."""
+        return float(np.mean(self.residual[self.held] ** 2))
+
+
+class Comparison:
+    """Whitened residuals of a model against recordings, with the samples that are fitted and those held out.
+
+    Attributes:
+        runs, whiteners: channels in order, one whitener each, by run.
+        rows, held: masks over all whitened samples.
+        time: of every whitened sample as a fraction of its recording.
+        channel: index of its channel, counted over all runs.
+    """
+
+    def __init__(self, runs: Sequence[Run], whiteners: Sequence[Sequence[Whitener]]):
+        self.runs, self.whiteners = tuple(runs), tuple(tuple(w) for w in whiteners)
+        flat = [w for run in self.whiteners for w in run]
+        self.time = np.concatenate([w.time for w in flat])
+        self.channel = np.concatenate([np.full(w.samples, i) for i, w in enumerate(flat)])
+        keep = np.concatenate([w.keep for w in flat])
+        held = (np.floor(self.time * FOLDS).astype(int) % HELD) == HELD // 2
+        self.rows, self.held = keep & ~held, keep & held
+        self._whitened: dict[tuple[int, str, str, float], Array] = {}
+
+    def residual(self, model: Model, x: Array, stop: float = 1.0) -> Array:
+        """Whitened data minus model, shape (N,); beyond ``stop`` it is zero."""
+        parts = []
+        for run, whiteners, signals in zip(self.runs, self.whiteners, model.outputs(x, stop), strict=True):
+            for output, whiten, signal in zip(run.outputs, whiteners, signals, strict=True):
+                difference = np.zeros(output.data.size)
+                difference[: signal.size] = output.data[: signal.size] - signal
+                parts.append(whiten(difference))
+        whole = np.concatenate(parts)
+        return np.where(np.isfinite(whole), whole, 1e6)
+
+    def _additive(self, model: Model, stop: float) -> dict[int, Array]:
+        """Columns of the free numbers that only add to a channel: the same at any x."""
+        columns: dict[int, Array] = {}
+        first = 0
+        for r, (run, whiteners) in enumerate(zip(self.runs, self.whiteners, strict=True)):
+            for output, whiten in zip(run.outputs, whiteners, strict=True):
+                for i, values in model.basis[(r, output.name)]:
+                    key = (r, output.name, model.free[i].name, stop)
+                    if key not in self._whitened:
+                        shown = -values.copy()
+                        shown[int(stop * values.size) if stop < 1.0 else values.size :] = 0.0
+                        self._whitened[key] = whiten(shown)
+                    columns[i] = np.zeros(self.time.size)
+                    columns[i][first : first + whiten.samples] = self._whitened[key]
+                first += whiten.samples
+        return columns
+
+    def jacobian(self, model: Model, x: Array, base: Array, steps: Array, stop: float = 1.0) -> Array:
+        """Derivatives of the residual by one-sided differences; ``steps`` adapts in place to a change of 0.3."""
+        columns = np.empty((base.size, x.size))
+        additive = self._additive(model, stop)
+        for i in range(x.size):
+            if i in additive:
+                columns[:, i] = additive[i]
+                continue
+            moved = x.copy()
+            moved[i] += steps[i]
+            columns[:, i] = (self.residual(model, moved, stop) - base) / steps[i]
+            size = np.linalg.norm(columns[:, i])
+            steps[i] = np.clip(0.3 / size if size else 1e-2, 1e-7, 3e-2)
+        return columns
+
+
+def solve(
+    comparison: Comparison,
+    model: Model,
+    x: Array,
+    stop: float = 1.0,
+    turns: int = 12,
+    steps: Array | None = None,
+    tolerance: float = 0.05,
+) -> Fit:
+    """Levenberg-Marquardt on the fitted samples up to the fraction ``stop`` of the recordings.
+
+    Args:
+        x: where to start.
+        turns: Jacobians at most.
+        steps: difference steps, adapted in place.
+        tolerance: stop when a step lowers chi-square by less.
+    """
+    steps = np.full(x.size, 1e-4) if steps is None else steps
+    rows = comparison.rows & (comparison.time < stop - (0.02 * stop if stop < 1.0 else -1.0))
+    precision = model.precision
+    residual = comparison.residual(model, x, stop)
+    value = residual[rows] @ residual[rows] + precision @ (x * x)
+    damping = 1e-4
+    jacobian = comparison.jacobian(model, x, residual, steps, stop)
+    for turn in range(turns):
+        part = jacobian[rows]
+        normal = part.T @ part + np.diag(precision)
+        gradient = part.T @ residual[rows] + precision * x
+        gain = 0.0
+        while damping < 1e8:
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            tried = comparison.residual(model, x + step, stop)
+            new = tried[rows] @ tried[rows] + precision @ ((x + step) ** 2)
+            if new < value:
+                gain, value, residual, x = value - new, new, tried, x + step
+                damping = max(damping / 8.0, 1e-9)
+                break
+            if gradient @ -step < 0.1 * tolerance:
+                break
+            damping *= 6.0
+        last = gain < tolerance or turn == turns - 1
+        if gain > 0.0 or turn == 0:
+            jacobian = comparison.jacobian(model, x, residual, steps, stop)
+        if last:
+            break
+    return made_fit(comparison, model, x, residual, jacobian, rows)
+
+
+def made_fit(comparison: Comparison, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:
+    """A fit with its evidence by Laplace's method: the priors' widths price every free number."""
+    chi2, penalty = float(residual[rows] @ residual[rows]), float(model.precision @ (x * x))
+    information = jacobian[rows].T @ jacobian[rows]
+    scaled = information / np.sqrt(np.outer(model.precision, model.precision))
+    price = float(np.linalg.slogdet(np.eye(x.size) + scaled)[1])
+    return Fit(model, x, chi2, penalty, residual, jacobian, rows, comparison.held, chi2 + penalty + price)

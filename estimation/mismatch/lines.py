@@ -1,0 +1,52 @@
+"""Lines in what a fit leaves: tones that follow neither the drive nor the motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimation.mismatch.fit import Fit
+from estimation.mismatch.noise import near_lines, noise_psd, periodogram
+
+SURE = 30.0
+"""A bin this many times the noise around it is a line: exp(-30) of a million bins of noise is none."""
+
+
+def strongest_foreign_line(fit: Fit) -> float | None:
+    """Frequency of the strongest line in any sense channel that lies on no harmonic of motion or drive [Hz], else None.
+
+    Hum counts too: whether it is noise or interference is decided by its size, in the fit.
+    """
+    best: tuple[float, float] | None = None
+    model = fit.model
+    x = np.array(
+        [
+            0.0 if f.kind == "additive" and f.name != "offset" else value
+            for f, value in zip(model.free, fit.x, strict=True)
+        ]
+    )
+    for run, signals in zip(model.runs, model.outputs(x), strict=True):
+        for output, signal in zip(run.outputs, signals, strict=True):
+            if output.kind != "sense":
+                continue
+            rest = output.data - signal
+            rest = rest[output.guard[0] : rest.size - output.guard[1]]
+            power = periodogram(rest - rest.mean())[: output.bins]
+            duration = rest.size * output.step
+            frequency = np.arange(power.size) / duration
+            motion = run.scales[output.axes[0]].rate / (2 * np.pi)
+            lines = [0.0, *(motion * np.arange(1, 20)), *run.lines[output.axes[0]]]
+            width = 0.06 * motion if run.lines[output.axes[0]].size < 200 else 4.0 / duration
+            ratio = power / noise_psd(rest, power.size, output.step, lines, width)
+            ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0
+            top = int(np.argmax(ratio))
+            if ratio[top] > SURE and (best is None or ratio[top] > best[0]):
+                best = float(ratio[top]), _peak(power, top) / duration
+    return None if best is None else best[1]
+
+
+def _peak(power: np.ndarray, top: int) -> float:
+    """Position of a peak between bins, by a parabola through the logarithms of three."""
+    if not 0 < top < power.size - 1:
+        return float(top)
+    a, b, c = np.log(power[top - 1 : top + 2])
+    return top + 0.5 * float((a - c) / (a - 2 * b + c))

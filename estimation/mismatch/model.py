@@ -1,0 +1,297 @@
+"""The nominal device with some terms, as a function of free numbers: what the channels would have shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.mismatch.experiment import Output, Run, readout_of
+from scanner.device import Amdm, Axis, Device, Readout
+from scanner.response import Added, Path, added_terms, move, reference, sense
+from scanner.terms import Parameter, Scales, Term
+
+Array = NDArray[np.float64]
+
+START_SD = 3.0
+"""Prior of a start value in units of the motion's amplitude: none to speak of."""
+
+REFERENCE_GAIN_SD = 0.02
+"""Relative gain of a reference angle, where nothing is stated: the contract's default tolerance."""
+
+OFFSET_SD = 0.05
+"""Prior of an offset that nobody states, in units of the signal's deviation."""
+
+MAINS = (50.0, 60.0)
+"""Mains frequencies [Hz]. Hum at their first ``HUM_MULTIPLES`` multiples is noise, not physics, as long as it stays
+below the noise's own deviation: its quadratures are free with a prior of ``HUM_SD`` of that. A stronger tone is
+interference."""
+
+HUM_MULTIPLES = 3
+HUM_SD = 0.5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term that may be missing, on one axis, acting on one of its channels."""
+
+    term: Term
+    axis: str
+    channel: str
+
+    @property
+    def key(self) -> str:
+        """For messages and comparisons: ``x.cubic-stiffness``, ``x.channel-delay:angle``."""
+        suffix = "" if self.channel == self.term.channels[0] else f":{self.channel}"
+        return f"{self.axis}.{self.term.effect}{suffix}"
+
+
+@dataclass(frozen=True)
+class Free:
+    """One free number, standard normal a priori: value = centre + scale x, or as its term's parameter says.
+
+    Attributes:
+        kind: ``"nominal"``, ``"term"``, ``"start"``, ``"hidden"``, ``"gain"`` or ``"additive"``.
+        owner: axis, candidate's key, or channel.
+        name: of the value (``"mechanics.k"``, ``"k3"``, ...).
+        run: which recording it belongs to, -1 for all.
+        precision: of the prior, 1 for a standard normal one.
+    """
+
+    kind: str
+    owner: str
+    name: str
+    run: int = -1
+    precision: float = 1.0
+    parameter: Parameter | None = None
+
+
+class Model:
+    """Simulated channels of one or more recordings against free numbers x.
+
+    Attributes:
+        runs: the recordings.
+        device: nominal.
+        candidates: terms added.
+        free: what x holds, in order.
+    """
+
+    def __init__(self, runs: Sequence[Run], device: Device, candidates: Sequence[Candidate] = ()):
+        self.runs, self.device, self.candidates = tuple(runs), device, tuple(candidates)
+        self.given = {name: added_terms(axis) for name, axis in device.axes.items()}
+        self.axes = tuple(name for name in device.axes if any(name in run.inputs for run in runs))
+        self.free = tuple(self._free())
+        self.precision = np.array([each.precision for each in self.free])
+        self._where = {(f.kind, f.owner, f.name, f.run): i for i, f in enumerate(self.free)}
+        self.basis = {
+            (r, output.name): [
+                (self._where[("additive", output.name, name, r)], values)
+                for name, values in self.additives(output).items()
+            ]
+            for r, run in enumerate(self.runs)
+            for output in run.outputs
+        }
+        self._paths: dict[tuple[object, ...], Path] = {}
+
+    def _free(self) -> list[Free]:
+        free = [
+            Free("nominal", axis, name) for axis in self.axes for name, _, _ in nominal_parameters(self.device, axis)
+        ]
+        for each in self.candidates:
+            free += [Free("term", each.key, p.name, parameter=p) for p in each.term.free]
+        for r, run in enumerate(self.runs):
+            for axis in run.inputs:
+                free += [Free("start", axis, name, r, START_SD**-2) for name in ("angle", "rate")]
+            for each in self.candidates:
+                if each.axis in run.inputs:
+                    free += [Free("hidden", each.key, str(i), r) for i in range(len(each.term.hidden))]
+            for output in run.outputs:
+                if output.kind == "angle":
+                    free.append(Free("gain", output.name, "gain", r))
+                free += [Free("additive", output.name, name, r) for name in self.additives(output)]
+        return free
+
+    def additives(self, output: Output) -> dict[str, Array]:
+        """What may lie under a channel whatever the mirror does, each shape (n,): an unstated offset, and hum."""
+        found = {}
+        if output.kind == "angle" or not isinstance(readout_of(self.device, output.axes[0]), Amdm):
+            found["offset"] = np.full(output.data.size, OFFSET_SD * output.data.std())
+        if output.kind == "sense":
+            noise = output.noise_sd or 0.0
+            turn = 2 * np.pi * output.step * np.arange(output.data.size)
+            for mains in MAINS:
+                for multiple in range(1, HUM_MULTIPLES + 1):
+                    size, f = HUM_SD * noise / multiple, mains * multiple
+                    found[f"cos {f:g} Hz"], found[f"sin {f:g} Hz"] = size * np.cos(f * turn), size * np.sin(f * turn)
+        return found
+
+    def index(self, kind: str, owner: str, name: str, run: int = -1) -> int | None:
+        """Place in x of one free number, None where the model has no such."""
+        return self._where.get((kind, owner, name, run))
+
+    def scales(self, axis: str) -> Scales:
+        """Natural sizes of an axis: of the first recording in which it moves."""
+        return next(run.scales[axis] for run in self.runs if axis in run.scales)
+
+    def values(self, candidate: Candidate, x: Array) -> tuple[float, ...]:
+        """Physical values of a candidate's parameters."""
+        at = [self._where[("term", candidate.key, p.name, -1)] for p in candidate.term.free]
+        return candidate.term.values([float(v) for v in x[at]], self.scales(candidate.axis))
+
+    def nominal(self, axis: str, x: Array) -> Axis:
+        """An axis with the nominal values that x gives it, a shared readout included."""
+        made = replace(self.device.axis(axis), readout=readout_of(self.device, axis))
+        tables: dict[str, dict[str, object]] = {}
+        for name, value, tolerance in nominal_parameters(self.device, axis):
+            factor = max(1.0 + tolerance * x[self._where[("nominal", axis, name, -1)]], 0.02)
+            stage, key = name.split(".")
+            new = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+            tables.setdefault(stage, {})[key] = new
+        return replace(made, **{stage: replace(getattr(made, stage), **table) for stage, table in tables.items()})
+
+    def added(self, axis: str, r: int, x: Array) -> tuple[Added, ...]:
+        """The candidates of an axis as the simulation takes them."""
+        made = list(self.given[axis])
+        for each in self.candidates:
+            if each.axis == axis:
+                scales = self.scales(axis)
+                hidden = [
+                    size(scales) * x[self._where[("hidden", each.key, str(i), r)]]
+                    for i, size in enumerate(each.term.hidden)
+                ]
+                padded = [*hidden, 0.0, 0.0][:2]
+                made.append(Added(each.term, self.values(each, x), each.channel, (padded[0], padded[1])))
+        return tuple(made)
+
+    def outputs(self, x: Array, stop: float = 1.0) -> list[list[Array]]:
+        """Every compared channel of every run, as far as the fraction ``stop`` of the recording goes."""
+        axes = {name: self.nominal(name, x) for name in self.axes}
+        return [self._run_outputs(run, r, axes, x, stop) for r, run in enumerate(self.runs)]
+
+    def full_signals(self, x: Array, r: int = 0) -> list[Array]:
+        """Every channel of one run on the whole integration grid, shape (n + 1,) each, nothing added under it."""
+        return self._signals(self.runs[r], r, {name: self.nominal(name, x) for name in self.axes}, x, 1.0)
+
+    def _run_outputs(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
+        signals = self._signals(run, r, axes, x, stop)
+        return [self._offset(o, o.sampled(signal), r, x) for o, signal in zip(run.outputs, signals, strict=True)]
+
+    def _signals(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
+        added = {name: self.added(name, r, x) for name in run.inputs}
+        paths = self.paths(run, r, axes, added, x, stop)
+        signals = []
+        for output in run.outputs:
+            inputs = _cut(run.inputs[output.axes[0]], stop)
+            if output.kind == "sense":
+                readout = paths[output.axes[0]].axis.readout
+                assert readout is not None
+                terms = [term for name in output.axes for term in added[name]]
+                signal = sense(readout, terms, [paths[name] for name in output.axes], inputs)
+            else:
+                name = output.axes[0]
+                signal = reference(added[name], paths[name], inputs)
+            signals.append(signal)
+        return signals
+
+    def paths(self, run: Run, r: int, axes: dict[str, Axis], added: dict[str, tuple[Added, ...]], x: Array,
+              stop: float) -> dict[str, Path]:  # fmt: skip
+        """The motion of every axis; coupled axes are relaxed by turns: the weaker the coupling, the fewer."""
+        coupled = len(run.inputs) > 1 and any(
+            each.term.effect == "cross-axis-coupling" for a in added.values() for each in a
+        )
+        paths: dict[str, Path] = {}
+        for turn in range(3 if coupled else 1):
+            previous = dict(paths)
+            for name in run.inputs:
+                inputs = _cut(run.inputs[name], stop)
+                scales = run.scales[name]
+                start = (
+                    scales.amplitude * x[self._where[("start", name, "angle", r)]],
+                    scales.amplitude * scales.rate * x[self._where[("start", name, "rate", r)]],
+                )
+                other = next((p for other, p in previous.items() if other != name), None) if turn else None
+                if other is None:
+                    paths[name] = self._remembered(axes[name], added[name], inputs, start, r)
+                else:
+                    paths[name] = move(axes[name], added[name], inputs, start, _thirds(other, inputs.step))
+        return paths
+
+    def _remembered(self, axis: Axis, added: tuple[Added, ...], inputs, start: tuple[float, float], r: int) -> Path:  # type: ignore[no-untyped-def]
+        """The last two motions are kept: a changed readout needs no new integration."""
+        acting = [each for each in added if _moves(each.term)]
+        key = (
+            r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
+            *[(each.term.effect, each.values, each.hidden) for each in acting],
+        )  # fmt: skip
+        if key not in self._paths:
+            if len(self._paths) > 8 * len(self.runs):
+                self._paths.pop(next(iter(self._paths)))
+            self._paths[key] = move(axis, acting, inputs, start)
+        path = self._paths[key]
+        for each in added:  # constants of the readout do not move the mirror
+            if each.term.constants is not None and each.term.stage in ("readout", "timing", "optics"):
+                axis = each.term.constants(axis, each.values)
+        return replace(path, axis=replace(path.axis, readout=axis.readout))
+
+    def _offset(self, output: Output, signal: Array, r: int, x: Array) -> Array:
+        gain = self.index("gain", output.name, "gain", r)
+        if gain is not None:
+            signal = signal * (1.0 + REFERENCE_GAIN_SD * x[gain])
+        basis = self.basis[(r, output.name)]
+        if not basis:
+            return signal
+        return signal + sum(x[i] * values[: signal.size] for i, values in basis)
+
+    def embed(self, other: Model, x: Array) -> Array:
+        """``x`` of another model in this one's order; what the other lacks is zero."""
+        return np.array(
+            [0.0 if (i := other.index(f.kind, f.owner, f.name, f.run)) is None else x[i] for f in self.free]
+        )
+
+
+def nominal_parameters(device: Device, axis: str) -> list[tuple[str, float | tuple[float, ...], float]]:
+    """What of an axis may lie off its nominal value: (``stage.key``, nominal value, relative tolerance)."""
+    of = device.axis(axis)
+    readout = readout_of(device, axis)
+    shared = device.readout is not None and axis != next(iter(device.axes))
+    found: list[tuple[str, float | tuple[float, ...], float]] = []
+    stages: list[tuple[str, object, tuple[str, ...]]] = [
+        ("mechanics", of.mechanics, ("J", "b", "k")),
+        ("capacitance", of.capacitance, ("C0", "theta0", "theta_th", *(("Cb",) if isinstance(readout, Amdm) else ()))),
+        ("drive", of.drive, ("torque_per_volt",)),
+        ("readout", None if shared else readout, _readout_keys(readout)),
+    ]
+    for stage, table, keys in stages:
+        for key in keys:
+            value = getattr(table, key, None)
+            tolerance = device.tolerance(axis, key)
+            if value and tolerance > 0.0:
+                found.append((f"{stage}.{key}", value, tolerance))
+    return found
+
+
+def _readout_keys(readout: Readout | None) -> tuple[str, ...]:
+    if readout is None:
+        return ()
+    return {"amdm": ("a_cir", "b_cir", "lpf_hz"), "transimpedance": ("R_s",), "position": ("gain", "offset")}[
+        readout.kind
+    ]
+
+
+def _moves(term: Term) -> bool:
+    return term.stage in ("drive", "mechanics", "capacitance")
+
+
+def _cut(inputs, stop: float):  # type: ignore[no-untyped-def]
+    if stop >= 1.0:
+        return inputs
+    return replace(inputs, voltage=inputs.voltage[: max(8, int(stop * len(inputs.voltage)))])
+
+
+def _thirds(path: Path, step: float) -> Array:
+    """Angle at the start, middle and end of every step, by cubic Hermite interpolation, shape (n, 3)."""
+    a, b = path.angle[:-1], path.angle[1:]
+    middle = 0.5 * (a + b) + step / 8.0 * (path.rate[:-1] - path.rate[1:])
+    return np.stack([a, middle, b], axis=1)

@@ -1,0 +1,142 @@
+"""The noise first: its spectrum from what the model leaves, and the whitening that every comparison goes through.
+
+Coloured noise, hum and a wrong stated level are no missing physics. The spectrum is a running median over frequency
+that leaves out the harmonics of motion and drive, where misfit stands, so that it follows the noise and not the misfit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MEDIAN_OF_POWER = float(np.log(2.0))
+"""Median of a periodogram's bin over its mean, for Gaussian noise (an exponential variable)."""
+
+
+LEAST_BINS = 14
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """Turns a residual into samples of unit variance, thinned to the band that is compared.
+
+    Attributes:
+        size: samples of the residual.
+        weights: one over the noise's standard deviation in every bin that is compared, shape (m,).
+        keep: which whitened samples are compared, shape (2 (m - 1),).
+        guard: samples at the start and end of the residual that are not compared.
+        psd: variance of every bin, shape (m,).
+    """
+
+    size: int
+    weights: Array
+    keep: NDArray[np.bool_]
+    guard: tuple[int, int]
+    psd: Array
+
+    @property
+    def samples(self) -> int:
+        """Number of whitened samples, guards included."""
+        return 2 * (self.weights.size - 1)
+
+    @property
+    def time(self) -> Array:
+        """Position of every whitened sample as a fraction of the recording."""
+        return np.arange(self.samples) / self.samples
+
+    def __call__(self, residual: Array) -> Array:
+        """Whitened residual, shape (samples,)."""
+        guarded = residual.copy()
+        guarded[: self.guard[0]] = 0.0
+        guarded[guarded.size - self.guard[1] :] = 0.0
+        spectrum = np.fft.rfft(guarded)[: self.weights.size] * self.weights
+        return np.fft.irfft(spectrum, self.samples) * np.sqrt(self.samples)
+
+
+def whitener(psd: Array, size: int, guard: tuple[int, int]) -> Whitener:
+    """The whitening for a noise of variance ``psd`` in the bins 0 ... m - 1 of a residual of ``size`` samples."""
+    weights = 1.0 / np.sqrt(psd)
+    samples = 2 * (weights.size - 1)
+    time = np.arange(samples) / samples
+    keep = (time >= guard[0] / size) & (time < 1.0 - guard[1] / size)
+    return Whitener(size, weights, keep, guard, psd)
+
+
+def flat_psd(data: Array, bins: int) -> Array:
+    """White noise of the level that the upper third of a signal's spectrum shows, shape (bins,): a first guess."""
+    power = periodogram(data)
+    level = float(np.median(power[int(0.6 * power.size) : int(0.68 * power.size)]) / MEDIAN_OF_POWER)
+    if level <= 0.0:
+        level = 1e-12 * max(float(np.mean(power)), 1e-300)
+    return np.full(bins, level)
+
+
+def periodogram(residual: Array) -> Array:
+    """Power of every bin, as the plain transform of as many samples of noise would have it: behind a Hann window."""
+    window = np.hanning(residual.size)
+    return np.abs(np.fft.rfft(residual * window)) ** 2 * (residual.size / np.sum(window**2))
+
+
+def noise_psd(residual: Array, bins: int, step: float, lines: Sequence[float] | Array, width: float) -> Array:
+    """Variance of every bin of a residual's transform that is noise.
+
+    Args:
+        residual: shape (n,).
+        bins: number of bins wanted, from 0 Hz on.
+        step: between samples [s].
+        lines: frequencies at which motion or drive, not noise, may stand [Hz].
+        width: to either side of a line [Hz].
+
+    Returns:
+        shape (bins,).
+    """
+    power = periodogram(residual)
+    frequency = np.arange(power.size) / (residual.size * step)
+    spoilt = near_lines(frequency, lines, max(width, 3.0 / (residual.size * step)))
+    spoilt[:3] = True  # the slowest wandering is physics to judge, its noise is continued from above
+    good = np.flatnonzero(~spoilt)
+    if good.size < 16:
+        good = np.arange(1, power.size)
+    return _running_median(good.astype(float), power[good], np.arange(bins, dtype=float))
+
+
+def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -> NDArray[np.bool_]:
+    """Which frequencies lie within ``width`` of a line, shape of ``frequency`` (increasing)."""
+    marks = np.zeros(frequency.size + 1)
+    for line in np.asarray(lines, float):
+        low, high = np.searchsorted(frequency, [line - width, line + width])
+        marks[low] += 1
+        marks[high] -= 1
+    return np.cumsum(marks[:-1]) > 0
+
+
+def _running_median(position: Array, power: Array, wanted: Array) -> Array:
+    """Mean power from medians over windows that widen with frequency, at the wanted positions.
+
+    Windows hold at least ``LEAST_BINS`` bins (a relative error of 1.44 / sqrt(bins)) and a quarter of their frequency.
+    Below the first window the spectrum goes on rising as it did between the first two: red noise taken for flat there
+    would pass for a baseline that drifts.
+    """
+    edges = [0]
+    while edges[-1] < power.size:
+        edges.append(min(power.size, edges[-1] + max(LEAST_BINS, int(0.25 * edges[-1]))))
+    if len(edges) > 2 and edges[-1] - edges[-2] < LEAST_BINS:
+        edges.pop(-2)
+    centres, levels = [], []
+    for low, high in pairwise(edges):
+        centres.append(np.mean(position[low:high]))
+        levels.append(np.median(power[low:high]) / MEDIAN_OF_POWER)
+    floor = max(max(levels) * 1e-14, 1e-300)
+    heights = np.log(np.maximum(levels, floor))
+    smooth = np.interp(wanted, centres, heights)
+    if heights.size > 1:
+        slope = np.clip((heights[0] - heights[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
+        below = wanted < centres[0]
+        smooth[below] += slope * np.log(centres[0] / np.maximum(wanted[below], 0.5))
+    return np.exp(smooth)

@@ -1,0 +1,132 @@
+"""The search: nominal model, noise, candidates one after the other, then everything refitted together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.mismatch.experiment import Run
+from estimation.mismatch.fit import Comparison, Fit, solve
+from estimation.mismatch.free import FREE
+from estimation.mismatch.lines import strongest_foreign_line
+from estimation.mismatch.model import Candidate, Model
+from estimation.mismatch.naming import LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
+from estimation.mismatch.screen import all_candidates
+from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
+from scanner.device import Device
+from scanner.terms import Term
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+MOST_EFFECTS = 3
+"""Effects looked for at a time."""
+
+CLOSE = 80.0
+"""Rivals within this of the best in -2 log evidence are refitted when the noise has been measured anew."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One effect found: the fit with it, and the rivals that were tried in its place.
+
+    Attributes:
+        before, after: fits without and with it, under the same noise.
+        rivals: other fits in its place, best first, under the same noise.
+    """
+
+    before: Fit
+    after: Fit
+    rivals: tuple[Fit, ...]
+
+    @property
+    def candidate(self) -> Candidate:
+        """What was added."""
+        return self.after.model.candidates[-1]
+
+
+@dataclass(frozen=True)
+class Search:
+    """What was found.
+
+    Attributes:
+        comparison: under the last noise.
+        nominal: the nominal device under the last noise.
+        final: the device with all that was found.
+        rounds: effect by effect.
+    """
+
+    comparison: Comparison
+    nominal: Fit
+    final: Fit
+    rounds: tuple[Round, ...] = field(default_factory=tuple)
+
+
+def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: Progress = lambda text: None) -> Search:
+    """Locate and name what ``device`` leaves out of ``runs``.
+
+    Args:
+        terms: effects to look for.
+        say: told what is being done.
+    """
+    model = Model(runs, device)
+    say("nominal device")
+    stops = windows(model)
+    comparison = Comparison(runs, first_whiteners(model))
+    early = grown(comparison, model, started(comparison, model, stops[0]).x, stops)
+    comparison = Comparison(runs, measured_whiteners(model, early[-1].x))
+    best = solve(comparison, model, early[-1].x)
+    nominal = best
+    rounds: list[Round] = []
+    for number in range(MOST_EFFECTS):
+        best = with_line(comparison, best)
+        candidates = all_candidates(device, best.model, [*terms.values(), *FREE.values()])
+        taken = {each.key for each in best.model.candidates}
+        candidates = [each for each in candidates if each.key not in taken]
+        say(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
+        if number or best.chi2 < TRACKED * best.rows.sum():
+            fits = near(comparison, best, candidates)
+        else:
+            fits = race(comparison, *_held_on(early, stops), candidates)
+        if not fits or best.evidence - fits[0].evidence < LEAD_OVER_NOTHING:
+            break
+        say(f"refit with {fits[0].model.candidates[-1].key}")
+        comparison = Comparison(runs, measured_whiteners(fits[0].model, fits[0].x))
+        close = [solve(comparison, fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + CLOSE][:6]
+        close = sorted((fit for fit in close if possible(fit)), key=lambda fit: fit.evidence)
+        before = solve(comparison, best.model, best.x, turns=4)
+        nominal = before if not rounds else solve(comparison, nominal.model, nominal.x, turns=4)
+        close = [fit for fit in close if convincing(before, fit)]
+        if not close:
+            best = before
+            break
+        rounds.append(Round(before, close[0], tuple(close[1:])))
+        best = close[0]
+        if best.model.candidates[-1].term.effect in FREE:
+            break
+    return Search(comparison, nominal, best, tuple(rounds))
+
+
+def with_line(comparison: Comparison, fit: Fit) -> Fit:
+    """The same fit, its scales told of the strongest line that neither drive nor motion explains."""
+    line = strongest_foreign_line(fit)
+    if line is None:
+        return fit
+    runs = tuple(
+        replace(run, scales={axis: replace(scales, line=line) for axis, scales in run.scales.items()})
+        for run in fit.model.runs
+    )
+    model = Model(runs, fit.model.device, fit.model.candidates)
+    return replace(fit, model=model)
+
+
+def _held_on(early: Sequence[Fit], stops: Sequence[float]) -> tuple[Fit, Sequence[float]]:
+    """The last window over which the nominal model still followed the motion, and the windows from there on."""
+    levels = [fit.chi2 / fit.rows.sum() for fit in early]
+    last = 0
+    while last + 1 < len(levels) and levels[last + 1] < 2.0 * min(levels[: last + 1]):
+        last += 1
+    return early[last], stops[last:]

@@ -1,0 +1,111 @@
+"""Where to start: the mirror's angle and rate at the first sample, and windows over which the fit may grow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.mismatch.fit import Comparison, Fit, solve
+from estimation.mismatch.model import Model
+from estimation.mismatch.noise import Whitener, flat_psd, noise_psd, whitener
+
+Array = NDArray[np.float64]
+
+FIRST_TURNS = 5
+"""Turns of the mirror in the first window."""
+
+GROWTH = 3.0
+"""Each window is this much longer than the one before."""
+
+HARMONICS = 12
+"""Multiples of the motion's frequency around which no noise is measured."""
+
+
+def windows(model: Model) -> list[float]:
+    """Growing windows as fractions of the recordings, the last one 1."""
+    turns = min(run.duration * scales.rate / (2 * np.pi) for run in model.runs for scales in run.scales.values())
+    stops = [FIRST_TURNS / turns]
+    while stops[-1] * GROWTH < 0.7:
+        stops.append(stops[-1] * GROWTH)
+    return [*stops, 1.0] if stops[0] < 0.7 else [1.0]
+
+
+def first_whiteners(model: Model) -> list[list[Whitener]]:
+    """White noise of the level that each channel's own high frequencies show."""
+    return [[whitener(flat_psd(o.data, o.bins), o.data.size, o.guard) for o in run.outputs] for run in model.runs]
+
+
+def measured_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
+    """The noise that ``x`` leaves, away from the harmonics of motion and drive."""
+    made = []
+    for run, signals in zip(model.runs, model.outputs(x), strict=True):
+        row = []
+        for output, signal in zip(run.outputs, signals, strict=True):
+            lines, width = [0.0], 0.0
+            for axis in output.axes:
+                motion = run.scales[axis].rate / (2 * np.pi)
+                lines = [*lines, *(motion * np.arange(1, HARMONICS + 1)), *run.lines[axis]]
+                # Lines of a multisine lie closer than a decaying motion is wide.
+                width = max(width, 0.06 * motion) if run.lines[axis].size < 200 else width
+            psd = noise_psd(output.data - signal, output.bins, output.step, lines, width)
+            row.append(whitener(psd, output.data.size, output.guard))
+        made.append(row)
+    return made
+
+
+def started(
+    comparison: Comparison, model: Model, stop: float, grid: tuple[int, int] = (9, 12), finalists: int = 3
+) -> Fit:
+    """The nominal model over the first window, from a grid of amplitudes and phases, run by run.
+
+    An even capacitance tells the phase modulo pi only; the grid goes round once, and whichever of two equal starts
+    comes first stays: nothing but a sign that the recording does not hold hangs on it.
+    """
+    x = np.zeros(len(model.free))
+    starts: list[list[Array]] = []
+    for r, run in enumerate(model.runs):
+        for axis in run.inputs:
+            at = _start_of(model, axis, r)
+            scored = []
+            for size in np.geomspace(0.03, 1.5, grid[0]):
+                for phase in 2 * np.pi * np.arange(grid[1]) / grid[1]:
+                    x[at] = size * np.cos(phase), size * np.sin(phase)
+                    scored.append((_misfit(model, r, x, stop), x[at].copy()))
+            scored.sort(key=lambda pair: pair[0])
+            x[at] = scored[0][1]
+            starts.append([values for _, values in scored[:finalists]])
+    fits = []
+    for i in range(finalists):
+        tried = x.copy()
+        place = iter(starts)
+        for r, run in enumerate(model.runs):
+            for axis in run.inputs:
+                tried[_start_of(model, axis, r)] = next(place)[i]
+        fits.append(solve(comparison, model, tried, stop, turns=10))
+    return min(fits, key=lambda fit: fit.chi2 + fit.penalty)
+
+
+def _start_of(model: Model, axis: str, r: int) -> list[int]:
+    return [i for i, f in enumerate(model.free) if (f.kind, f.owner, f.run) == ("start", axis, r)]
+
+
+def _misfit(model: Model, r: int, x: Array, stop: float) -> float:
+    total = 0.0
+    for output, signal in zip(model.runs[r].outputs, model.outputs(x, stop)[r], strict=True):
+        data = output.data[: signal.size]
+        total += float(np.mean((data - signal)[output.guard[0] :] ** 2)) / max(float(output.data.var()), 1e-300)
+    return total
+
+
+def grown(comparison: Comparison, model: Model, x: Array, stops: Sequence[float], turns: int = 6) -> list[Fit]:
+    """Fits over growing windows, one each: what a few turns of the mirror fix first guides the rest."""
+    steps = np.full(x.size, 1e-4)
+    fits: list[Fit] = []
+    for stop in stops:
+        last = stop == stops[-1]
+        fit = solve(comparison, model, x, stop, 2 * turns if last else turns, steps, 0.05 if last else 1.0)
+        fits.append(fit)
+        x = fit.x
+    return fits

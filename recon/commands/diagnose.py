@@ -1,0 +1,42 @@
+"""``lissajous diagnose REC...``: locate, name and model what the nominal device leaves out."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="recordings of one device (.h5)")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
+    parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
+    parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms of your own")
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    from recon.diagnosing import diagnose_files
+
+    return diagnose_files(args.recordings, args.output, device=args.device, terms=args.terms, quiet=args.json)
+
+
+def tell(summary: dict[str, Any]) -> str:
+    lines = [f"{summary['output']}: {summary['verdict']}"]
+    for finding in summary["findings"]:
+        change = finding["heldout"]
+        lines.append(
+            f"  {finding['axis']} {finding['stage']}: {finding['effect']} ({finding['probability']:.1%}), "
+            f"held-out chi-square {change['before']:.3g} -> {change['after']:.3g}"
+        )
+        lines += [
+            f"    {p['name']} = {p['value']:.4g} [{p['ci95'][0]:.4g}, {p['ci95'][1]:.4g}] {p['unit']}"
+            for p in finding["parameters"]
+        ]
+        if finding["rivals"]:
+            lines.append("    or " + ", ".join(f"{r['effect']} ({r['probability']:.1%})" for r in finding["rivals"]))
+        if "advice" in finding:
+            lines.append(f"    to tell them apart: {finding['advice']}")
+    if summary["unexplained"]:
+        lines.append(f"  unexplained: {summary['unexplained']}")
+    lines.append(f"  report {summary['output']}/report.html")
+    return "\n".join(lines)

@@ -1,0 +1,150 @@
+"""The report of a diagnosis: at a glance where, what, how sure and how much better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from estimation.mismatch.diagnosis import Diagnosis, Finding
+from estimation.mismatch.search import Round
+from recon import views
+from recon.report import Figure, Section, Table, render
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BEFORE, AFTER = views.COLOURS[1], views.COLOURS[0]
+
+
+def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
+    """One diagnosis as a page."""
+    lead = f"{', '.join(names)}: {diagnosis.verdict}. {_headline(diagnosis)}"
+    sections = [_overview(diagnosis), *(_finding_section(f, i) for i, f in enumerate(diagnosis.findings))]
+    sections.append(_residuals(diagnosis))
+    if diagnosis.search.rounds:
+        text = "What -2 log evidence gained over doing without; 10 is certain, a lead of 6 names alone."
+        rows = evidence_table(diagnosis.search.rounds)
+        sections.append(Section("Candidates", text, Table(["effect", "gain", "held-out χ²"], rows)))
+    sections.append(_nominal(diagnosis))
+    notes = [diagnosis.unexplained] if diagnosis.unexplained else []
+    return render("Diagnosis", lead, sections, notes)
+
+
+def _headline(diagnosis: Diagnosis) -> str:
+    if not diagnosis.findings:
+        return "No missing physics: what differs lies within the noise and the tolerances of the nominal values."
+    return " ".join(
+        f"{f.axis} {f.stage}: {f.effect} ({f.probability:.1%}), held-out chi-square {f.heldout['before']:.3g} → "
+        f"{f.heldout['after']:.3g}."
+        for f in diagnosis.findings
+    )
+
+
+def _overview(diagnosis: Diagnosis) -> Section:
+    rows = [
+        [
+            f.effect,
+            f"{f.axis} {f.stage}",
+            f"{f.probability:.2%}",
+            f"{f.heldout['before']:.3g} → {f.heldout['after']:.3g}",
+        ]
+        for f in diagnosis.findings
+    ]
+    if not rows:
+        return Section("What was found", "Nothing is missing.")
+    return Section("What was found", "", Table(["effect", "where", "probability", "held-out χ²"], rows))
+
+
+def _finding_section(finding: Finding, index: int) -> Section:
+    text = f"{finding.equation}. {finding.where}. Source: {finding.source}."
+    if finding.advice:
+        text += f" To tell it from its rivals: {finding.advice}."
+    rows = [[p.name, f"{p.value:.5g}", f"{p.ci95[0]:.5g} … {p.ci95[1]:.5g}", p.unit] for p in finding.parameters] + [
+        [f"rival: {r.effect}", f"{r.probability:.2%}", "", ""] for r in finding.rivals
+    ]
+    figures = [_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []
+    table = Table(["", "value", "95 %", "unit"], rows) if rows else None
+    return Section(f"{index + 1}. {finding.effect}", text, table, figures, least="26rem")
+
+
+def _curve_figure(curve: Any) -> Figure:
+    x, y, sd = np.array(curve["points"], float).T
+
+    def draw(axes: Axes) -> None:
+        axes.fill_between(x, y - 2 * sd, y + 2 * sd, alpha=0.25, color=AFTER, lw=0)
+        axes.plot(x, y, color=AFTER)
+        axes.set(xlabel=curve["x"], ylabel=f"{curve['y']} ({curve['unit']})")
+
+    return _figure(draw, f"the law that the free correction measured, with its 95 % band; in short: {curve['formula']}")
+
+
+def _residuals(diagnosis: Diagnosis) -> Section:
+    found = diagnosis.search
+    figures = []
+    first = 0
+    for run, whiteners in zip(found.comparison.runs, found.comparison.whiteners, strict=True):
+        for output, whiten in zip(run.outputs, whiteners, strict=True):
+            part = slice(first, first + whiten.samples)
+            first += whiten.samples
+            pair = [found.nominal.residual[part], found.final.residual[part]]
+            frequency = np.arange(whiten.weights.size) / (output.data.size * output.step)
+            figures.append(_time_figure(f"{run.name}: {output.name}", whiten.time * run.duration, pair))
+            figures.append(_spectrum_figure(f"{run.name}: {output.name}", frequency, pair))
+    text = "Whitened residuals of the nominal device and of the improved one: noise alone has a deviation of 1."
+    return Section("Before and after", text, figures=figures, least="24rem")
+
+
+def _time_figure(name: str, time: np.ndarray, pair: Sequence[np.ndarray]) -> Figure:
+    def draw(axes: Axes) -> None:
+        slots = np.array_split(np.arange(time.size), 120)
+        for values, colour, label in zip(pair, (BEFORE, AFTER), ("nominal", "improved"), strict=True):
+            axes.plot(
+                [1e3 * time[s].mean() for s in slots],
+                [np.sqrt(np.mean(values[s] ** 2)) for s in slots],
+                color=colour, label=label,
+            )  # fmt: skip
+        axes.set(xlabel="time (ms)", ylabel="rms residual / noise", yscale="log")
+        axes.legend(frameon=False)
+
+    return _figure(draw, f"{name}: residual over time")
+
+
+def _spectrum_figure(name: str, frequency: np.ndarray, pair: Sequence[np.ndarray]) -> Figure:
+    def draw(axes: Axes) -> None:
+        for values, colour, label in zip(pair, (BEFORE, AFTER), ("nominal", "improved"), strict=True):
+            power = np.abs(np.fft.rfft(values)) ** 2 / values.size
+            slots = [s for s in np.array_split(np.arange(1, power.size), 400) if s.size]
+            axes.plot(
+                [frequency[s].mean() / 1e3 for s in slots],
+                [power[s].max() for s in slots],
+                color=colour,
+                label=label,
+                lw=1,
+            )
+        axes.set(xlabel="frequency (kHz)", ylabel="power / noise, largest bin", yscale="log")
+        axes.legend(frameon=False)
+
+    return _figure(draw, f"{name}: spectrum of the residual")
+
+
+def _nominal(diagnosis: Diagnosis) -> Section:
+    rows = [[name, f"{value['pull']:+.2f}"] for name, value in diagnosis.nominal.items()]
+    text = "How far every nominal value had to move, in units of its tolerance."
+    return Section("Nominal values", text, Table(["value", "pull"], rows))
+
+
+def evidence_table(rounds: Sequence[Round]) -> list[list[str]]:
+    """Every candidate that was fitted: what its -2 log evidence gained over doing without."""
+    return [
+        [fit.model.candidates[-1].key, f"{each.before.evidence - fit.evidence:.1f}", f"{fit.held_chi2:.3f}"]
+        for each in rounds
+        for fit in (each.after, *each.rivals)
+    ]
+
+
+def _figure(draw: Callable[[Axes], None], caption: str) -> Figure:
+    drawing, axes = views.figure(size=(6.0, 3.2))
+    draw(axes[0, 0])
+    return Figure(views.figure_uri(drawing), caption)

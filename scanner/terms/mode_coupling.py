@@ -1,0 +1,38 @@
+"""One-to-two exchange with another mode: the mirror pumps it with θ², it gives back q θ."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from scanner.terms.term import Parameter, Term
+from scanner.trajectory import TORQUE
+
+
+@njit(TORQUE, cache=True)
+def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
+    w2 = 2.0 * np.pi * p[1]
+    return -nominal[2] * theta * z0, z1, w2 * w2 * (-p[0] * theta * theta - z0) - w2 / p[2] * z1
+
+
+TERM = Term(
+    effect="mode-coupling",
+    stage="mechanics",
+    equation="J θ'' + b θ' + k θ (1 + q) = τ,  q'' + (ω2/Q2) q' + ω2² q = −ω2² g θ²",
+    parameters=(
+        Parameter("g", "1/rad^2", lambda s: 0.02 / s.amplitude**2, sign=1),
+        Parameter(
+            "f2",
+            "Hz",
+            lambda s: s.rate / 3.141592653589793,
+            kind="log",
+            spread=0.3,
+            starts=(-0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4),
+        ),
+        Parameter("Q2", "1", lambda s: 100.0, kind="log"),
+    ),
+    hidden=(lambda s: 0.02, lambda s: 0.04 * s.rate),
+    source="Antonio, Zanette & López, Nat. Commun. 3, 806 (2012)",
+    lookalikes={"cubic-damping": "no sidebands and no threshold there: record above and below the threshold"},
+    torque=torque,
+)

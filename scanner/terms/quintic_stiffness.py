@@ -1,0 +1,24 @@
+"""A spring whose fifth-order term shows at large angles."""
+
+from __future__ import annotations
+
+from numba import njit
+
+from scanner.terms.term import Parameter, Term
+from scanner.trajectory import TORQUE
+
+
+@njit(TORQUE, cache=True)
+def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
+    return -p[0] * theta**5, 0.0, 0.0
+
+
+TERM = Term(
+    effect="quintic-stiffness",
+    stage="mechanics",
+    equation="J θ'' + b θ' + k θ + k5 θ⁵ = τ",
+    parameters=(Parameter("k5", "N m/rad^5", lambda s: 0.03 * s.k / s.amplitude**4),),
+    source="Nayfeh & Mook, Nonlinear Oscillations, 1979, section 4.1",
+    lookalikes={"cubic-stiffness": "frequency follows A² there: record two amplitudes far apart"},
+    torque=torque,
+)
