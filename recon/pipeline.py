@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -186,13 +187,22 @@ def _register(motion: Motion, intensity: Array, grid: Grid) -> list[PhaseError]:
     return phase_error(x.values, y.values, intensity, x.sample_rate, grid, amplitudes[0], amplitudes[1], slices)
 
 
-def seen_by_picture(seen: list[PhaseError], axis: str) -> dict[str, float]:
-    """Phase error [degrees], mean over the slices that tell one, with its standard error; else nan, inf."""
+def seen_by_picture(seen: list[PhaseError], axis: str) -> dict[str, Any]:
+    """Phase error that the picture shows [degrees]: of each time slice, and the mean of those that tell one; else nan.
+
+    Each has its standard error, infinite where the picture tells nothing.
+    """
+    slices = [
+        {"time": each.time, "value": math.degrees(own.value), "sd": math.degrees(own.sd)}
+        for each in seen
+        for own in (getattr(each, axis),)
+    ]
     told = [estimate for each in seen if np.isfinite((estimate := getattr(each, axis)).sd)]
     if not told:
-        return {"value": float("nan"), "sd": float("inf")}
+        return {"value": math.nan, "sd": math.inf, "slices": slices}
     value, sd = (np.array(column) for column in zip(*told, strict=True))
-    return {"value": float(np.degrees(value.mean())), "sd": float(np.degrees(np.sqrt(np.sum(sd**2)) / sd.size))}
+    mean_sd = math.sqrt(float(np.sum(sd**2))) / sd.size
+    return {"value": math.degrees(value.mean()), "sd": math.degrees(mean_sd), "slices": slices}
 
 
 def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:

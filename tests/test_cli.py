@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from worlds import imaging
+from worlds import imaging, separate_electrodes
 
 from recon.cli import main
 from scanner.recording import Recording
@@ -95,6 +95,38 @@ def test_forward_and_backward_sweeps_show_the_true_phase_error(scan: Path, tmp_p
         seen = summary[axis]["picture_phase_error_deg"]
         assert abs(seen["value"] - summary[axis]["phase_bias_deg"]) < 0.05
         assert seen["sd"] < 0.02
+        assert len(seen["slices"]) == 2
+        assert [each["time"] for each in seen["slices"]] == pytest.approx([0.005, 0.015], abs=1e-4)
+
+
+@pytest.mark.parametrize("method", ["ekf", "constant"])
+def test_intensity_of_another_rate_and_start_is_placed_by_its_times(method: str, tmp_path: Path) -> None:
+    recording, truth = imaging()
+    channels = {n: (c.read(), c.unit, c.sample_rate, c.start) for n, c in recording.channels.items()}
+    late = 1501  # samples; every second one from there
+    channels["intensity"] = (recording["intensity"].read()[late::2], "V", 2.5e6, late / 5e6)
+    path = tmp_path / "other.h5"
+    Recording.from_arrays(channels, recording.device).write(path, truth)
+    assert main(["reconstruct", str(path), "-o", str(tmp_path / "out"), "--estimator", method]) == 0
+    with h5py.File(tmp_path / "out" / "motion.h5") as motion:
+        for axis in "xy":
+            angle = motion[axis]["angle"]
+            assert angle.attrs["start"] == late / 5e6
+            true = truth[f"angle_{axis}"][0][late::2]
+            first = slice(0, 2000)
+            off = np.abs(np.abs(np.dot(angle[first], true[first])) / np.dot(true[first], true[first]) - 1)
+            assert off < 0.02
+
+
+def test_each_axis_may_have_its_own_sense_signal(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    recording, truth = separate_electrodes()
+    channels = {n: (c.read(), c.unit, c.sample_rate, c.start) for n, c in recording.channels.items()}
+    channels["intensity"] = (np.sin(np.arange(60_000) / 50.0) + 2.0, "V", 5e6, 0.0)
+    path = tmp_path / "separate.h5"
+    Recording.from_arrays(channels, recording.device).write(path, truth)
+    assert main(["reconstruct", str(path), "-o", str(tmp_path / "out"), "--json", "--estimator", "ukf"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert max(summary["phase_rmse_deg"].values()) < 0.2
 
 
 @pytest.mark.parametrize("keep", ["angles", "position"])
