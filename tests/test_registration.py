@@ -1,0 +1,149 @@
+"""Forward against backward: unbiased, with an honest standard error, and silent where there is nothing to see."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import map_coordinates
+from skimage.data import immunohistochemistry
+
+from recon.mapping import Grid
+from recon.registration import phase_error, quadrature
+from scanner.errors import BadInput
+
+GRID = Grid(400, 400, 0.18, 0.16)
+RATE = 5e6
+A_X, A_Y = 0.18, 0.16
+
+
+@cache
+def tissue():
+    return immunohistochemistry() @ [0.2125, 0.7154, 0.0721] / 255
+
+
+def scan(error_x, error_y, n=300_000, scene=None, photons=100.0, seed=0, a_x=A_X, a_y=A_Y):
+    """Angles as assumed, and the intensities at the true angles, which are ahead by the given phase errors [rad]."""
+    rng = np.random.default_rng(seed)
+    scene = tissue() if scene is None else scene
+    t = np.arange(n) / RATE
+    start_x, start_y = rng.uniform(0, 2 * np.pi, 2)
+    alpha_x, alpha_y = 2 * np.pi * 13_840 * t + start_x, 2 * np.pi * 3_270 * t + start_y
+    true = [a_y * np.sin(alpha_y + error_y) / GRID.half_angle_y, a_x * np.sin(alpha_x + error_x) / GRID.half_angle_x]
+    places = [(s + 1) / 2 * size - 0.5 for s, size in zip(true, scene.shape, strict=True)]
+    intensity = map_coordinates(scene, places, order=1, mode="nearest")
+    return a_x * np.sin(alpha_x), a_y * np.sin(alpha_y), rng.poisson(intensity * photons) / photons
+
+
+def registered(theta_x, theta_y, intensity, slices=1, a_x=A_X, a_y=A_Y):
+    """Values and standard errors [deg], shape (slices, 2)."""
+    found = phase_error(theta_x, theta_y, intensity, RATE, GRID, a_x, a_y, slices)
+    return tuple(np.degrees([[getattr(axis, part) for axis in (e.x, e.y)] for e in found]) for part in ("value", "sd"))
+
+
+@pytest.mark.parametrize("true", [(0.0, 0.0), (0.3, -0.1), (-3.0, 2.0), (1.0, 3.0), (9.0, -9.0)])
+def test_phase_errors_are_found_to_a_hundredth_of_a_pixel(true):
+    (value,), (sd,) = registered(*scan(*np.radians(true)))
+    assert_allclose(value, true, atol=0.012)  # four standard errors; a truth ahead of the assumption is positive
+    assert (np.radians(sd) * 200 < 0.015).all()
+
+
+def test_standard_errors_are_those_of_repeated_scans():
+    pulls = []
+    for seed in range(12):
+        true = np.random.default_rng(seed).uniform(-3, 3, 2)
+        value, sd = registered(*scan(*np.radians(true), n=100_000, photons=30, seed=seed))
+        pulls.append((value[0] - true) / sd[0])
+    assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.4
+    assert np.abs(pulls).max() < 4
+
+
+def test_each_slice_tells_its_own_error_while_the_phase_drifts():
+    t = np.linspace(0, 1, 300_000)
+    drift = np.array([3 * np.sin(3 * t), 2 - 4 * t])
+    value, sd = registered(*scan(*np.radians(drift)), slices=10)
+    true = drift.reshape(2, 10, -1).mean(2).T
+    assert_allclose(value, true, atol=0.15)
+    assert_allclose(value.mean(0), true.mean(0), atol=0.05)
+    assert (sd < 0.1).all()
+
+
+def test_slices_are_placed_in_time():
+    times = [e.time for e in phase_error(*scan(0, 0, n=100_000), RATE, GRID, A_X, A_Y, slices=4)]
+    assert_allclose(times, [0.0025, 0.0075, 0.0125, 0.0175])
+
+
+def test_few_photons_give_large_standard_errors_and_no_bias():
+    (value,), (sd,) = registered(*scan(*np.radians([2.0, -1.0]), photons=1.0))
+    assert (np.abs(value - [2, -1]) < 3 * sd).all()
+    assert ((sd > 0.02) & (sd < 0.2)).all()
+
+
+def test_an_amplitude_that_is_wrong_leaves_the_phase_alone():
+    x, y, intensity = scan(*np.radians([1.0, -2.0]))
+    (value,), (sd,) = registered(1.02 * x, 0.985 * y, intensity, a_x=1.02 * A_X, a_y=0.985 * A_Y)
+    assert_allclose(value, [1, -2], atol=0.02)
+    assert (sd < 0.01).all()
+
+
+def test_a_spiral_of_growing_amplitude():
+    growth = np.linspace(0.2, 1, 300_000)
+    x, y, intensity = scan(*np.radians([0.4, -0.5]), a_x=A_X * growth, a_y=A_Y * growth)
+    (value,), _ = registered(x, y, intensity, a_x=A_X * growth, a_y=A_Y * growth)
+    assert_allclose(value, [0.4, -0.5], atol=0.02)
+
+
+def test_a_sample_without_features_tells_nothing_and_says_so():
+    value, sd = registered(*scan(0.01, 0.01, n=100_000, scene=np.full((8, 8), 0.5)), slices=2)
+    assert np.isnan(value).all()
+    assert (sd == np.inf).all()
+
+
+def test_bars_tell_the_phase_across_them_only():
+    bars = np.tile(np.where(np.arange(512) % 20 < 10, 0.9, 0.1), (512, 1))
+    (value,), (sd,) = registered(*scan(*np.radians([1.0, 1.0]), scene=bars))
+    assert value[0] == pytest.approx(1, abs=0.01)
+    assert np.isnan(value[1])
+    assert sd[1] == np.inf
+
+
+def test_too_short_a_scan_tells_nothing():
+    value, sd = registered(*scan(0, 0, n=200))
+    assert np.isnan(value).all()
+    assert (sd == np.inf).all()
+    assert len(phase_error(np.empty(0), np.empty(0), np.empty(0), RATE, GRID, A_X, A_Y, slices=3)) == 3
+
+
+def test_lost_samples_are_left_out_and_detectors_are_averaged():
+    x, y, intensity = scan(*np.radians([1.0, -2.0]))
+    x[1000:1500], intensity[::7] = np.nan, np.nan
+    both = np.stack([1.5 * intensity, 0.5 * intensity], axis=1)
+    value, _ = registered(x, y, intensity)
+    assert_allclose(value, [[1, -2]], atol=0.02)
+    assert_allclose(registered(x, y, both)[0], value, atol=1e-6)
+
+
+@given(st.floats(0.05, 0.5), st.floats(1000, 30_000), st.floats(0, 6.28), st.floats(0, 0.005))
+def test_quadrature_is_the_cosine_to_the_sine(amplitude, frequency, start, noise):
+    alpha = 2 * np.pi * frequency * np.arange(20_000) / RATE + start
+    theta = amplitude * np.sin(alpha)
+    found = quadrature(theta + amplitude * noise * np.random.default_rng(0).normal(size=theta.size), amplitude)
+    wrong = np.abs(found / amplitude - np.cos(alpha)) > 0.25  # within which noise at the turning points may change sign
+    assert wrong[2000:-2000].mean() == 0  # at its ends the record does not tell the direction of the last sixteenth
+
+
+def test_samples_that_do_not_belong_together_are_refused():
+    with pytest.raises(BadInput, match="one angle of each axis"):
+        phase_error(np.zeros(3), np.zeros(4), np.zeros(3), RATE, GRID, A_X, A_Y)
+    with pytest.raises(BadInput, match="0 slices"):
+        phase_error(np.zeros(3), np.zeros(3), np.zeros(3), RATE, GRID, A_X, A_Y, slices=0)
+
+
+def test_angles_are_not_changed():
+    x, y, intensity = scan(0.01, 0.01, n=50_000)
+    before = x.copy(), y.copy(), intensity.copy()
+    phase_error(x, y, intensity, RATE, GRID, A_X, A_Y)
+    for now, then in zip((x, y, intensity), before, strict=True):
+        assert_array_equal(now, then)
