@@ -12,9 +12,10 @@ import afm_spiral
 
 from phantoms.experiment import Experiment, run
 from recon.output import finite, replacing_folder
-from recon.pipeline import Options, reconstruct, summarise
+from recon.pipeline import Options, reconstruct
 from recon.report import Figure, Section, comparison_report
 from recon.score import truth_of
+from recon.summary import summarise
 from recon.views import save_picture, uri
 from scanner.recording import Recording
 

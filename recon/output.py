@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from scanner.errors import BadInput
 from scanner.motion import Motion
 
+CHUNK = 1 << 20  # samples written at a time
+
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
@@ -59,7 +61,10 @@ def write_motion(path: Path, motion: Motion) -> None:
                 ("phase_sd", "rad"),
             ):
                 group.create_dataset(key, data=getattr(axis, key)).attrs["unit"] = unit
-            angle = group.create_dataset("angle", data=axis.angle.values.astype(np.float32))
+            angle = group.create_dataset("angle", (axis.angle.size,), np.float32)
+            for first in range(0, axis.angle.size, CHUNK):
+                stop = min(first + CHUNK, axis.angle.size)
+                angle[first:stop] = axis.angle.read(first, stop)
             angle.attrs.update({"unit": "rad", "sample_rate": axis.angle.sample_rate, "start": axis.angle.start})
 
 

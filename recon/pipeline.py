@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +16,22 @@ from tqdm import tqdm
 from estimation.estimate import default_estimator, estimate
 from estimation.signals import device_of
 from recon import blur
-from recon.coverage import fill_against_time
-from recon.mapping import Grid, Picture, fill_factor, fill_holes, map_samples
+from recon.mapping import Grid, Picture, accumulate, fill_holes, mean_picture
 from recon.output import finite, replacing_folder, write_json, write_motion, write_tiff
 from recon.registration import PhaseError, phase_error
 from recon.score import AxisError, Truth, axis_error, truth_of
-from scanner.channel import check_signal
+from scanner.channel import Channel, check_signal
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
-from scanner.motion import AxisMotion, Motion
+from scanner.motion import Motion
 from scanner.recording import Recording
 
 Array = NDArray[np.float64]
 
 AXES = ("x", "y")
 SLICE = 0.01  # seconds of scan in which forward and backward sweeps are registered
-MOST_SLICES = 24
-FILLS = (0.25, 0.5, 0.75, 0.9, 0.99)
+REGISTERED = 0.24  # seconds that are registered at the most
+CHUNK = 1 << 20  # samples mapped at a time
 
 
 @dataclass(frozen=True)
@@ -114,16 +112,14 @@ def reconstruct(recording: Recording, options: Options, truth: Truth | None = No
         progress.update()
         progress.set_postfix_str("mapping")
         grid, notes = _grid(device, motion, options)
-        values = intensity.read()
-        x, y = (motion.axes[axis].angle.values for axis in AXES)
-        picture = map_samples(x, y, values, grid)
+        picture = _mapped(motion, intensity, grid)
         if not picture.coverage.any():
             raise DeviceInvalid(
                 "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"
             )
         progress.update()
         progress.set_postfix_str("registration")
-        seen = _register(motion, values, grid)
+        seen = [error for window in _windows(intensity) for error in _register(motion, intensity, grid, *window)]
         progress.update()
         errors = {axis: axis_error(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles} if truth else {}
         progress.update()
@@ -148,6 +144,7 @@ def reconstruct(recording: Recording, options: Options, truth: Truth | None = No
 def reconstruct_file(path: Path, output: Path, options: Options) -> dict[str, Any]:
     """``reconstruct`` a recording's file and write everything into the folder ``output``; returns the summary."""
     from recon.report import reconstruction_report
+    from recon.summary import summarise
     from recon.views import save_picture
 
     with Recording.open(path) as recording, replacing_folder(output) as folder:
@@ -176,114 +173,34 @@ def _grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[
     return Grid(*options.pixels, half["x"], half["y"]), [note]
 
 
-def _register(motion: Motion, intensity: Array, grid: Grid) -> list[PhaseError]:
+def _mapped(motion: Motion, intensity: Channel, grid: Grid) -> Picture:
+    """The picture of all samples, a chunk at a time: memory does not grow with the recording."""
     x, y = (motion.axes[axis].angle for axis in AXES)
-    amplitudes = []
-    for axis in AXES:
-        track, own = motion.axes[axis].angle, motion.axes[axis]
-        sampled = track.start + np.arange(track.values.size) / track.sample_rate
-        amplitudes.append(np.interp(sampled, own.time, own.amplitude))
-    slices = int(np.clip(round(intensity.shape[0] / x.sample_rate / SLICE), 1, MOST_SLICES))
-    return phase_error(x.values, y.values, intensity, x.sample_rate, grid, amplitudes[0], amplitudes[1], slices)
+    sums = counts = None
+    for first in range(0, intensity.size, CHUNK):
+        stop = min(first + CHUNK, intensity.size)
+        sums, counts = accumulate(
+            x.read(first, stop), y.read(first, stop), intensity.read(first, stop), grid, sums, counts
+        )
+    assert sums is not None
+    assert counts is not None
+    return mean_picture(sums, counts, grid)
 
 
-def seen_by_picture(seen: list[PhaseError], axis: str) -> dict[str, Any]:
-    """Phase error that the picture shows [degrees]: of each time slice, and the mean of those that tell one; else nan.
-
-    Each has its standard error, infinite where the picture tells nothing.
-    """
-    slices = [
-        {"time": each.time, "value": math.degrees(own.value), "sd": math.degrees(own.sd)}
-        for each in seen
-        for own in (getattr(each, axis),)
-    ]
-    told = [estimate for each in seen if np.isfinite((estimate := getattr(each, axis)).sd)]
-    if not told:
-        return {"value": math.nan, "sd": math.inf, "slices": slices}
-    value, sd = (np.array(column) for column in zip(*told, strict=True))
-    mean_sd = math.sqrt(float(np.sum(sd**2))) / sd.size
-    return {"value": math.degrees(value.mean()), "sd": math.degrees(mean_sd), "slices": slices}
+def _windows(intensity: Channel) -> list[tuple[int, int]]:
+    """Samples (first, stop) in which sweeps are registered: all of a short recording, three parts of a long one."""
+    whole = round(REGISTERED * intensity.sample_rate)
+    if intensity.size <= whole:
+        return [(0, intensity.size)]
+    part = whole // 3
+    return [(first, first + part) for first in (0, (intensity.size - part) // 2, intensity.size - part)]
 
 
-def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
-    """What the summary says of one axis."""
-    own, bound = result.motion.axes[axis], result.bound(axis)
-    error = result.errors.get(axis)
-    summary: dict[str, Any] = {
-        "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(own.phase_sd**2)))),
-        "bound_deg": float(np.degrees(bound)),
-        "within_bound": blur.within_bound(bound, sd=own.phase_sd)
-        if error is None
-        else blur.within_bound(bound, error=error.phase),
-        "sign": own.sign,
-        "amplitude_rad": float(np.mean(own.amplitude)),
-        "frequency_hz": float(np.mean(own.frequency)),
-        "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
-        "picture_phase_error_deg": seen_by_picture(result.seen, axis),
-        "blur_px": blur_parts(result, own, axis, error),
-    }
-    if error is not None:
-        summary |= {
-            "phase_rmse_deg": float(np.degrees(error.phase_rmse)),
-            "phase_bias_deg": float(np.degrees(np.mean(error.phase))),
-            "amplitude_rmse": float(np.sqrt(np.mean(error.amplitude**2))),
-            "angle_rmse_rad": error.angle_rmse,
-            "mirrored": error.mirrored,
-        }
-    return summary
-
-
-def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisError | None) -> dict[str, float]:
-    """Blur of one axis in pixels, by its causes (see ``recon.blur``)."""
-    grid = result.picture.grid
-    half = grid.half_angle_x if axis == "x" else grid.half_angle_y
-    phase = own.phase_sd if error is None else error.phase
-    amplitude = np.zeros(1) if error is None else error.amplitude - np.mean(error.amplitude)
-    spot = result.truth.spot_sd * result.pixels("x") if result.spot is None and result.truth else result.spot or 0.0
-    return blur.parts(float(np.mean(own.amplitude)), half, result.pixels(axis), phase, amplitude, spot)
-
-
-def summarise(result: Reconstruction) -> dict[str, Any]:
-    """The summary: quantities by axis, and the same grouped by quantity as CONTRACT names them."""
-    axes = {axis: axis_summary(result, axis) for axis in AXES}
-    grouped = {
-        key: {axis: axes[axis][key] for axis in AXES}
-        for key in ("phase_sd_deg", "bound_deg", "within_bound", "sign", "phase_rmse_deg", "angle_rmse_rad")
-        if all(key in own for own in axes.values())
-    }
-    return {
-        "estimator": result.motion.estimator,
-        "name": result.name,
-        "axes": list(AXES),
-        **grouped,
-        **axes,
-        "fill": fill_factor(result.picture.coverage),
-        "seconds_to_fill": seconds_to_fill(result),
-        "samples": int(result.picture.coverage.sum()),
-        "seconds": result.seconds,
-        "recorded_seconds": result.recorded,
-        "picture": _picture_score(result),
-        "notes": result.notes,
-        "info": dict(result.motion.info),
-    }
-
-
-def seconds_to_fill(result: Reconstruction) -> dict[str, float | None]:
-    """Frame time after which each of ``FILLS`` was reached [s]; None where the scan was too short for it."""
-    x, y = (result.motion.axes[axis].angle for axis in AXES)
-    time, fill = fill_against_time(x.values, y.values, x.sample_rate, result.picture.grid)
-    at = np.searchsorted(fill, FILLS)
-    return {f"{wanted:g}": float(time[k]) if k < time.size else None for wanted, k in zip(FILLS, at, strict=True)}
-
-
-def _picture_score(result: Reconstruction) -> dict[str, Any] | None:
-    """Picture against the noiseless scene where a simulation told it: rms, magnification taken out apart."""
-    if result.truth is None or result.truth.scene is None:
-        return None
-    return asdict(blur.picture_error(result.picture, result.truth.scene, *mirrored(result)))
-
-
-def mirrored(result: Reconstruction) -> tuple[bool, bool]:
-    """Whether the picture shows the scene mirrored in x, in y, as far as a truth tells."""
-    x, y = (axis in result.errors and result.errors[axis].mirrored for axis in AXES)
-    return x, y
+def _register(motion: Motion, intensity: Channel, grid: Grid, first: int, stop: int) -> list[PhaseError]:
+    x, y = (motion.axes[axis].angle for axis in AXES)
+    time = x.start + np.arange(first, stop) / x.sample_rate
+    swing_x, swing_y = (np.interp(time, motion.axes[axis].time, motion.axes[axis].amplitude) for axis in AXES)
+    slices = max(1, round((stop - first) / x.sample_rate / SLICE))
+    places, seen = (x.read(first, stop), y.read(first, stop)), intensity.read(first, stop)
+    errors = phase_error(*places, seen, x.sample_rate, grid, swing_x, swing_y, slices)
+    return [replace(error, time=error.time + first / x.sample_rate) for error in errors]

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from recon import views
-from recon.pipeline import AXES, Reconstruction, mirrored
+from recon.pipeline import AXES, Reconstruction
+from recon.summary import mirrored
 
 
 @dataclass(frozen=True)
