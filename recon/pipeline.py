@@ -1,4 +1,4 @@
-"""From a recording to a sharp picture: estimate, map, register, score, report."""
+"""From a recording to a sharp picture: estimate, map, register, compare."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,9 @@ from tqdm import tqdm
 from estimation.estimate import default_estimator, estimate
 from estimation.signals import device_of
 from recon import blur
-from recon.mapping import Grid, Picture, accumulate, fill_holes, mean_picture
-from recon.output import finite, replacing_folder, write_json, write_motion, write_tiff
+from recon.mapping import Grid, Picture, accumulate, mean_picture
 from recon.registration import PhaseError, phase_error
-from recon.score import AxisError, Truth, axis_error, truth_of
+from recon.score import AxisError, Truth, axis_error
 from scanner.channel import Channel, check_signal
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
@@ -139,28 +137,6 @@ def reconstruct(recording: Recording, options: Options, truth: Truth | None = No
         recorded=intensity.size / intensity.sample_rate,
         name=recording.name,
     )
-
-
-def reconstruct_file(path: Path, output: Path, options: Options) -> dict[str, Any]:
-    """``reconstruct`` a recording's file and write everything into the folder ``output``; returns the summary."""
-    from recon.report import reconstruction_report
-    from recon.summary import summarise
-    from recon.views import save_picture
-
-    with Recording.open(path) as recording, replacing_folder(output) as folder:
-        result = reconstruct(recording, options, truth_of(path))
-        summary = finite(summarise(result) | {"output": str(output), "recording": str(path)})
-        write_tiff(folder / "image.tif", result.picture.image)
-        write_tiff(folder / "coverage.tif", result.picture.coverage)
-        if options.fill_radius:
-            image, mask = fill_holes(result.picture, options.fill_radius)
-            write_tiff(folder / "filled.tif", image)
-            write_tiff(folder / "fill.tif", mask.astype(np.uint8))
-        write_motion(folder / "motion.h5", result.motion)
-        write_json(folder / "summary.json", summary)
-        save_picture(folder / "image.png", result.picture)
-        (folder / "report.html").write_text(reconstruction_report(result, summary), encoding="utf-8")
-    return summary
 
 
 def _grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:

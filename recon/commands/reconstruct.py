@@ -9,7 +9,8 @@ from typing import Any
 from recon.commands.simulate import positive
 
 
-def _pixels(text: str) -> tuple[int, int]:
+def size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT, for argparse."""
     width, cross, height = text.lower().partition("x")
     if (
         not cross
@@ -28,11 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
     parser.add_argument(
-        "--estimator", metavar="NAME", help="constant, acm, ekf, ukf or sensor; by what was recorded if not given"
+        "--estimator", metavar="NAME", help="tracker, ukf, ekf, constant, sensor, ...; by what was recorded if not given"
     )
-    parser.add_argument(
-        "--pixels", type=_pixels, default=(400, 400), metavar="WxH", help="size of the picture (400x400)"
-    )
+    parser.add_argument("--pixels", type=size, default=(400, 400), metavar="WxH", help="size of the picture (400x400)")
     parser.add_argument("--p", type=positive, default=1.0, help="pixels of shift that are tolerated (1)")
     parser.add_argument(
         "--flip-x", action="store_true", help="turn the sign of x, which an even capacitance cannot know"
@@ -52,7 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    from recon.pipeline import Options, reconstruct_file
+    from recon.pipeline import Options
+    from recon.reconstructing import reconstruct_file
 
     return reconstruct_file(
         args.recording,

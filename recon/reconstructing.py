@@ -1,0 +1,35 @@
+"""``lissajous reconstruct``: one recording's file to a folder of pictures, motion, summary and report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.mapping import fill_holes
+from recon.output import finite, replacing_folder, write_json, write_motion, write_tiff
+from recon.pipeline import Options, reconstruct
+from recon.report import reconstruction_report
+from recon.score import truth_of
+from recon.summary import summarise
+from recon.views import save_picture
+from scanner.recording import Recording
+
+
+def reconstruct_file(path: Path, output: Path, options: Options) -> dict[str, Any]:
+    """``reconstruct`` a recording's file and write everything into the folder ``output``; returns the summary."""
+    with Recording.open(path) as recording, replacing_folder(output) as folder:
+        result = reconstruct(recording, options, truth_of(path))
+        summary = finite(summarise(result) | {"output": str(output), "recording": str(path)})
+        write_tiff(folder / "image.tif", result.picture.image)
+        write_tiff(folder / "coverage.tif", result.picture.coverage)
+        if options.fill_radius:
+            image, mask = fill_holes(result.picture, options.fill_radius)
+            write_tiff(folder / "filled.tif", image)
+            write_tiff(folder / "fill.tif", mask.astype(np.uint8))
+        write_motion(folder / "motion.h5", result.motion)
+        write_json(folder / "summary.json", summary)
+        save_picture(folder / "image.png", result.picture)
+        (folder / "report.html").write_text(reconstruction_report(result, summary), encoding="utf-8")
+    return summary
