@@ -14,6 +14,7 @@ COMMANDS = {
     "simulate": "make a recording with a known truth",
     "predict": "play a recording's drive through a device and compare",
     "diagnose": "locate, name and model what the nominal device leaves out",
+    "design": "find drive frequencies for a wanted field, resolution, frame rate and fill",
     "convert": "turn an instrument's file into a recording",
 }
 
