@@ -91,14 +91,16 @@ class Reconstruction:
         return blur.bound(self.p, self.pixels(axis) / 2)
 
 
-def reconstruct(recording: Recording, options: Options, truth: Truth | None = None) -> Reconstruction:
+def reconstruct(
+    recording: Recording, options: Options, truth: Truth | None = None, quiet: bool = False
+) -> Reconstruction:
     """Track the motion, map the intensity, register forward against backward, compare with the truth if there is one.
 
     Raises:
         BadInput: the recording or the device does not serve.
     """
     began = time.perf_counter()
-    with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=None) as progress:
+    with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=quiet or None) as progress:
         intensity = recording.require("intensity", "a picture needs it")
         check_signal(intensity)
         device = device_of(recording, Device.load(options.device) if options.device else None)

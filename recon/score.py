@@ -65,10 +65,14 @@ def truth_of(path: Path) -> Truth | None:
     Raises:
         BadInput: a true angle without its sample_rate.
     """
-    told = read_truth(path)
+    return told_truth(read_truth(path) or {}, path)
+
+
+def told_truth(told: Mapping[str, Any], path: Path | None = None) -> Truth | None:
+    """The truth as a simulation tells it; raises and returns as :func:`truth_of`, with ``path`` for the message."""
     angles = {}
     for axis in ("x", "y"):
-        value: Any = (told or {}).get(f"angle_{axis}")
+        value: Any = told.get(f"angle_{axis}")
         if value is None:
             continue
         values, attrs = value if isinstance(value, tuple) else (value, {})
@@ -77,13 +81,11 @@ def truth_of(path: Path) -> Truth | None:
                 "states no sample_rate", file=path, channel=f"/truth/angle_{axis}", hint="store it as attribute"
             )
         angles[axis] = (np.asarray(values, np.float64), float(attrs["sample_rate"]), float(attrs.get("start", 0.0)))
-    scene = (told or {}).get("scene")
+    scene = told.get("scene")
     scene = scene[0] if isinstance(scene, tuple) else scene
     if not angles:
         return None
-    return Truth(
-        angles, None if scene is None else np.asarray(scene, np.float64), float((told or {}).get("spot_sd", 0.0))
-    )
+    return Truth(angles, None if scene is None else np.asarray(scene, np.float64), float(told.get("spot_sd", 0.0)))
 
 
 def axis_error(axis: AxisMotion, angle: Array, rate: float, start: float) -> AxisError:

@@ -48,7 +48,7 @@ def check_values(record: object) -> None:
         must, value = item.metadata.get("must"), getattr(record, item.name)
         if must is None or (value is None and item.metadata.get("optional")):
             continue
-        if item.type == "tuple[float, ...]":
+        if item.type in ("tuple[float, ...]", "tuple[int, ...]"):
             if not isinstance(value, (list, tuple)):
                 raise DeviceInvalid(f"is {value!r} and must be a list of numbers", channel=item.name)
             checked: object = tuple(checked_number(number, must, item.name) for number in value)
