@@ -242,13 +242,14 @@ def follow(recording: Recording, device: Device, method: str) -> Motion:
             }
         for i, name in enumerate(problem.model.axes):
             clock = intensity_clock(recording, problem.sense.channel)
-            axes[name] = _axis_motion(problem, filtered, i, name, clock)
+            axes[name] = axis_motion(problem, filtered, i, name, clock)
     return Motion(axes, method, info)
 
 
-def _axis_motion(
+def axis_motion(
     problem: Problem, filtered: Filtered, i: int, name: str, clock: tuple[float, float, int]
 ) -> AxisMotion:
+    """The motion of axis ``i`` of a problem, its angle brought to ``clock`` (rate [Hz], start [s], samples)."""
     channel, reference = problem.sense.channel, problem.references[name]
     f = reference.frequency
     block = block_length(f, channel.sample_rate, BLOCK_CYCLES)
