@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
 
 from estimation.signals import device_of
 from scanner.device import Device, Position
@@ -20,11 +21,9 @@ def _filter(name: str) -> Callable[[Recording, Device], Motion]:
     return run
 
 
-def _steady(name: str) -> Callable[[Recording, Device], Motion]:
+def _by(module: str, function: str) -> Callable[[Recording, Device], Motion]:
     def run(recording: Recording, device: Device) -> Motion:
-        from estimation import steady
-
-        return getattr(steady, name)(recording, device)
+        return getattr(import_module(f"estimation.{module}"), function)(recording, device)
 
     return run
 
@@ -39,13 +38,15 @@ def _tracker(causal: bool) -> Callable[[Recording, Device], Motion]:
 
 
 ESTIMATORS: dict[str, tuple[str, Callable[[Recording, Device], Motion]]] = {
-    "constant": ("phase and amplitude of the first stretch, held", _steady("constant")),
+    "constant": ("phase and amplitude of the first stretch, held", _by("steady", "constant")),
     "acm": ("process model alone, no measurement (chen2020)", _filter("acm")),
     "ekf": ("extended Kalman filter (chen2020 algorithm 1)", _filter("ekf")),
     "ukf": ("unscented Kalman filter (chen2020 algorithm 2)", _filter("ukf")),
+    "hyb": ("EKF with threshold crossings, transimpedance readouts (chen2019 table I)", _by("hybrid", "hybrid")),
+    "sine-ukf": ("UKF on the phase of a steady sine, position readouts (wang2019)", _by("sine_ukf", "sine_ukf_motion")),
     "tracker": ("block demodulation and a smoother on the slow flow of phase and amplitude", _tracker(False)),
     "tracker-causal": ("the same, each moment from what came before it", _tracker(True)),
-    "sensor": ("angle channels or position readouts as they are", _steady("sensor")),
+    "sensor": ("angle channels or position readouts as they are", _by("steady", "sensor")),
 }
 
 

@@ -62,15 +62,15 @@ def sensor(recording: Recording, device: Device) -> Motion:
     """
     axes = {}
     for name, axis in device.axes.items():
-        channel, scale, zero, noise_sd = _position_channel(recording, axis, name)
+        channel, scale, zero, noise_sd = position_channel(recording, axis, name)
         check_signal(channel)
         angle = (channel.read() - zero) / scale
-        reference = _reference(recording, device, name, channel)
-        axes[name] = _axis(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
+        reference = reference_for(recording, device, name, channel)
+        axes[name] = axis_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
     return Motion(axes, "sensor", {})
 
 
-def _position_channel(recording: Recording, axis: Axis, name: str) -> tuple[Channel, float, float, float | None]:
+def position_channel(recording: Recording, axis: Axis, name: str) -> tuple[Channel, float, float, float | None]:
     """(channel, gain, offset, noise sd in rad or None where not stated) of the best position signal of one axis."""
     if f"angle_{name}" in recording:
         return recording[f"angle_{name}"], 1.0, 0.0, None
@@ -85,7 +85,7 @@ def _position_channel(recording: Recording, axis: Axis, name: str) -> tuple[Chan
     )
 
 
-def _reference(recording: Recording, device: Device, name: str, channel: Channel) -> Reference:
+def reference_for(recording: Recording, device: Device, name: str, channel: Channel) -> Reference:
     if f"drive_{name}" in recording and device.axis(name).drive is not None:
         return reference_of(recording, device, name)
     own = device.axis(name)
@@ -93,7 +93,7 @@ def _reference(recording: Recording, device: Device, name: str, channel: Channel
     return absolute(dominant_frequency(channel, *band), channel.start, channel.end)
 
 
-def _axis(
+def axis_from_angle(
     angle: Array, channel: Channel, reference: Reference, noise_sd: float | None, clock: tuple[float, float, int]
 ) -> AxisMotion:
     rate = channel.sample_rate
