@@ -18,8 +18,9 @@ from grating import Grating, fft_wave, fit_grating
 from numpy.typing import NDArray
 
 from estimation.estimate import estimate
-from recon.convert import convert_file, read_matlab
+from recon.convert import convert_file
 from recon.mapping import Grid, Picture, map_samples
+from recon.readers import read
 from scanner.device import Device
 from scanner.recording import Recording
 
@@ -93,7 +94,8 @@ def spiral_picture(recording: Recording, device: Device) -> tuple[Picture, Array
 
 def raster_picture(file: Path) -> Picture:
     """Height [nm] in the raster scan. Its lines were cut out of a longer record: it has no clock to convert."""
-    raw = read_matlab(file)
+    variables = read(file).variables
+    raw = {name: variables[name].raw[:] for name in ("x", "y", "z")}
     x, y = ((raw[name] - (raw[name].min() + raw[name].max()) / 2) / V_PER_UM for name in ("x", "y"))
     return map_samples(x, y, NM_PER_V * raw["z"], Grid(PIXELS, PIXELS, x.max(), y.max()))
 

@@ -12,9 +12,12 @@ from typing import NoReturn
 COMMANDS = {
     "reconstruct": "track the motion of a recording and map its intensities to a picture",
     "simulate": "make a recording with a known truth",
+    "identify": "find a device's constants from recordings at rest, ringing down and driven",
     "predict": "play a recording's drive through a device and compare",
     "diagnose": "locate, name and model what the nominal device leaves out",
     "design": "find drive frequencies for a wanted field, resolution, frame rate and fill",
+    "blur-study": "phantoms, scans, drifts, noise, estimators, resolutions and p against each other, as one table",
+    "info": "list what a recording or an instrument's file holds, with a mapping to start from",
     "convert": "turn an instrument's file into a recording",
 }
 
@@ -59,9 +62,12 @@ def _run(module: object, args: argparse.Namespace, prog: str) -> int:
 
     try:
         summary = module.run(args)  # type: ignore[attr-defined]
-        print(json.dumps(summary, indent=1) if args.json else module.tell(summary))  # type: ignore[attr-defined]
+        print(json.dumps(summary, indent=1) if args.json else _printable(module.tell(summary)))  # type: ignore[attr-defined]
     except BadInput as error:
         print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print(f"{prog}: needs more memory than there is; cut the recording into shorter ones", file=sys.stderr)
         return 2
     except OSError as error:  # a full disk, a folder that may not be written
         print(f"{prog}: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
@@ -70,6 +76,11 @@ def _run(module: object, args: argparse.Namespace, prog: str) -> int:
         print(f"{prog}: interrupted; nothing was written", file=sys.stderr)
         return 1
     return 0
+
+
+def _printable(text: str) -> str:
+    """Text without what a file's own names could do to a terminal."""
+    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 if __name__ == "__main__":

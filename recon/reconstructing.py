@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.convert import open_any
 from recon.mapping import fill_holes
 from recon.output import finite, replacing_folder, write_json, write_motion, write_tiff
 from recon.pipeline import Options, reconstruct
@@ -14,13 +15,16 @@ from recon.report import reconstruction_report
 from recon.score import truth_of
 from recon.summary import summarise
 from recon.views import save_picture
-from scanner.recording import Recording
 
 
-def reconstruct_file(path: Path, output: Path, options: Options) -> dict[str, Any]:
-    """``reconstruct`` a recording's file and write everything into the folder ``output``; returns the summary."""
-    with Recording.open(path) as recording, replacing_folder(output) as folder:
-        result = reconstruct(recording, options, truth_of(path))
+def reconstruct_file(path: Path, output: Path, options: Options, mapping: Path | None = None) -> dict[str, Any]:
+    """``reconstruct`` a file and write everything into the folder ``output``; returns the summary.
+
+    Args:
+        mapping: what makes an instrument's file a recording, see :func:`recon.convert.open_any`.
+    """
+    with open_any(path, mapping) as recording, replacing_folder(output) as folder:
+        result = reconstruct(recording, options, truth_of(path) if mapping is None else None)
         summary = finite(summarise(result) | {"output": str(output), "recording": str(path)})
         write_tiff(folder / "image.tif", result.picture.image)
         write_tiff(folder / "coverage.tif", result.picture.coverage)

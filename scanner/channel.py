@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from math import isfinite, pi
-from typing import Any
+from typing import Any, Protocol
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import BadInput, UnitUnknown
+from scanner.hdf5 import DAMAGE
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,18 @@ CONVERSIONS = {
 """Units accepted for each unit handed out, and what to multiply by."""
 
 
+class Samples(Protocol):
+    """Where a channel's samples are: numpy's array, HDF5's dataset, or another that reads when it is sliced."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]: ...
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+    @property
+    def ndim(self) -> int: ...
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Channel:
     """Samples ``gain * raw + offset`` on a uniform clock.
@@ -49,7 +62,7 @@ class Channel:
     unit: str
     sample_rate: float
     start: float
-    raw: h5py.Dataset | NDArray[Any]
+    raw: Samples
     first: int
     stop: int
     gain: float = 1.0
@@ -82,7 +95,9 @@ class Channel:
         low, high, _ = slice(first, stop).indices(self.size)
         try:
             values = self.raw[self.first + low : self.first + max(low, high)].astype(np.float64)
-        except OSError as error:
+        except BadInput:
+            raise
+        except DAMAGE as error:
             hint = "the file is damaged or truncated; copy it again"
             raise BadInput(f"samples cannot be read: {error}", file=self.file, channel=self.name, hint=hint) from None
         if self.gain != 1.0:
@@ -98,7 +113,7 @@ class Channel:
 
 def checked_channel(
     name: str,
-    raw: h5py.Dataset | NDArray[Any],
+    raw: Samples,
     *,
     unit: object,
     sample_rate: object,
@@ -165,7 +180,11 @@ def check_signal(signal: Channel, *, constant_ok: bool = False) -> None:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and isfinite(value)
+    if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
+        return False
+    with suppress(OverflowError):  # TOML's integers have no limit, a float has one
+        return isfinite(value)
+    return False
 
 
 def _own_unit(name: str, unit: object, file: str | None) -> tuple[str, float]:

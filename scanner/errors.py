@@ -22,7 +22,9 @@ class BadInput(ValueError):
         line = f"{where}: {self.what}" if where else self.what
         if self.hint:
             line += f"; {self.hint}"
-        return " ".join(line.split())
+        line = " ".join(line.split())
+        # what a damaged or hostile file calls itself must not steer the terminal, nor break its encoding
+        return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
 
 
 class ChannelMissing(BadInput, KeyError):

@@ -11,6 +11,9 @@ from typing import Any
 
 from scanner.errors import BadInput
 
+_DEFLATE_MOST = 1032  # bytes out of one byte: https://zlib.net/zlib_tech.html
+_HARMLESS = 1 << 26
+
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
@@ -30,6 +33,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
         beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def check_claim(claimed: int, stored: int, *, file: object, channel: str | None = None) -> None:
+    """Refuse a size [bytes] that what is ``stored`` [bytes] cannot hold, however well it was compressed.
+
+    Raises:
+        BadInput: the claim is beyond what deflate can shrink, and large enough to do harm.
+    """
+    if claimed > max(_HARMLESS, _DEFLATE_MOST * stored):
+        hint = "the file is damaged or truncated; copy it again"
+        raise BadInput(f"claims {claimed} bytes and stores {stored}", file=file, channel=channel, hint=hint)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -53,3 +67,5 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise BadInput(f"is not TOML: {error}", file=source, hint="correct the place it names") from None
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, brackets in brackets
+        raise BadInput(f"is not TOML that can be read: {error}", file=source, hint="write it simpler") from None

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +12,21 @@ import h5py
 import numpy as np
 
 from scanner.errors import BadInput
+from scanner.files import check_claim
+
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
+"""How h5py says that HDF5 cannot make sense of a file."""
+
+
+@contextmanager
+def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
+    """For reading from a file that is open: what HDF5 cannot make sense of becomes BadInput."""
+    try:
+        yield
+    except BadInput:
+        raise
+    except DAMAGE as error:
+        raise BadInput(f"cannot be read: {error}", file=path, channel=channel, hint="copy the file again") from None
 
 
 def open_hdf5(path: Path) -> h5py.File:
@@ -39,31 +57,40 @@ def child(group: h5py.Group, name: str, kind: type) -> Any:
 
     Raises:
         BadInput: it is a link (whatever a link points to, another program put it there: the recording must be whole
-            without it), its samples are kept in another file, or it is not of the ``kind`` h5py.Group or h5py.Dataset.
+            without it), its samples are kept in another file, it claims more of them than it stores, or it is not of
+            the ``kind`` h5py.Group or h5py.Dataset.
     """
     where = f"{group.name.rstrip('/')}/{name}"
     path = group.file.filename
-    link = group.get(name, getlink=True)
+    with undamaged(path, where):
+        link = group.get(name, getlink=True)
     if link is None:
         return None
     if not isinstance(link, h5py.HardLink):
         raise BadInput("is a link", file=path, channel=where, hint="store the data itself in the file")
-    try:
+    with undamaged(path, where):
         item = group[name]
-    except (KeyError, OSError) as error:
-        raise BadInput(f"cannot be opened: {error}", file=path, channel=where, hint="copy the file again") from None
     if not isinstance(item, kind):
         what = f"is a {type(item).__name__.lower()}, not a {kind.__name__.lower()}"
         raise BadInput(what, file=path, channel=where, hint="see the form of a recording")
-    if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
-        what = "keeps its samples outside this file"
-        raise BadInput(what, file=path, channel=where, hint="store the data itself in the file")
+    if isinstance(item, h5py.Dataset):
+        with undamaged(path, where):
+            _check_samples(item, path, where)
     return item
 
 
+def _check_samples(item: h5py.Dataset, path: str, where: str) -> None:
+    if item.is_virtual or item.external:
+        what = "keeps its samples outside this file"
+        raise BadInput(what, file=path, channel=where, hint="store the data itself in the file")
+    stored = min(item.id.get_storage_size(), Path(path).stat().st_size)
+    check_claim(prod(item.shape or ()) * item.dtype.itemsize, stored, file=path, channel=where)
+
+
 def attributes(item: h5py.HLObject) -> dict[str, Any]:
-    """Attributes as Python values: text as str, arrays of one element as that element."""
-    return {key: _plain(value) for key, value in item.attrs.items()}
+    """Attributes as Python values: text as str, arrays of one element as that element; BadInput where damaged."""
+    with undamaged(item.file.filename, item.name):
+        return {key: _plain(value) for key, value in item.attrs.items()}
 
 
 def _plain(value: Any) -> Any:

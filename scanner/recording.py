@@ -12,7 +12,7 @@ from functools import cached_property
 from math import ceil, isfinite
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
@@ -22,7 +22,7 @@ from scanner.channel import CHUNK, Channel, checked_channel
 from scanner.device import Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.files import replacing
-from scanner.hdf5 import attributes, child, open_hdf5
+from scanner.hdf5 import attributes, child, open_hdf5, undamaged
 from scanner.truth import Truth, write_truth
 
 FORMAT = "lissajous-recording"
@@ -30,6 +30,12 @@ VERSIONS = (1,)
 
 # A sample that rounding has put this fraction of a sample before a cut still belongs behind it.
 _ROUNDING = 1e-6
+
+
+class Closeable(Protocol):
+    """The open file that the channels of a recording read from."""
+
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +53,7 @@ class Recording:
     attrs: Mapping[str, Any] = field(default_factory=dict)
     path: Path | None = None
     device_toml: str | None = None
-    _file: h5py.File | None = None
+    _file: Closeable | None = None
 
     @classmethod
     def open(cls, path: str | Path) -> Recording:
@@ -65,7 +71,8 @@ class Recording:
             group = child(file, "channels", h5py.Group)
             if group is None or not len(group):
                 raise BadInput("holds no channels", file=path, hint="store signals under /channels")
-            channels = {name: _open_channel(group, name, path) for name in group}
+            with undamaged(path):
+                channels = {name: _open_channel(group, name, path) for name in group}
             text = _device_text(file, path)
         except BaseException:
             file.close()
@@ -222,6 +229,8 @@ def _device_text(file: h5py.File, path: Path) -> str | None:
 
 def _open_channel(group: h5py.Group, name: str, path: Path) -> Channel:
     dataset = child(group, name, h5py.Dataset)
+    if dataset is None:
+        raise BadInput("is listed and not there", file=path, channel=name, hint="copy the file again")
     known = attributes(dataset)
     needed = {key: known.get(key) for key in ("unit", "sample_rate")}
     said = {key: known[key] for key in ("start", "gain", "offset") if key in known}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import savemat
 
-from recon.convert import convert, convert_file
+from recon.convert import convert, convert_file, open_any
 from scanner.device import Device
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.recording import Recording
@@ -63,13 +64,20 @@ def test_a_mapping_makes_a_recording(bench: Path) -> None:
     assert summary == {
         "recording": str(bench / "run.h5"),
         "source": str(bench / "run.mat"),
+        "format": "MATLAB 4 to 7.2",
         "duration": pytest.approx(0.254),
         "device": "unnamed",
         "channels": {
-            "sense_x": {"unit": "V", "sample_rate": 1000.0, "start": 0.0, "shape": (5,)},
-            "intensity": {"unit": "nm", "sample_rate": 500.0, "start": 0.25, "shape": (2, 2)},
+            "sense_x": {
+                "unit": "V", "sample_rate": 1000.0, "start": 0.0, "shape": (5,), "variable": "x", "overruled": {},
+                "stated_by": {"unit": "mapping", "sample_rate": "mapping", "start": "nobody: 0"},
+            },
+            "intensity": {
+                "unit": "nm", "sample_rate": 500.0, "start": 0.25, "shape": (2, 2), "variable": "z", "overruled": {},
+                "stated_by": {"unit": "mapping", "sample_rate": "mapping", "start": "mapping"},
+            },
         },
-    }
+    }  # fmt: skip
 
 
 @settings(deadline=None, max_examples=50)
@@ -102,9 +110,14 @@ HOLDS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
     [
         (
             ("sample_rate = 1000.0", ""),
-            f"MAP: channels.sense_x: says no sample_rate of variable 'x'; add sample_rate = ...; {HOLDS}",
+            "MAP: channels.sense_x: says no sample_rate of variable 'x', and the file states none; "
+            f"add sample_rate = ...; {HOLDS}",
         ),
-        (('unit = "nm"', ""), f"MAP: channels.intensity: says no unit of variable 'z'; add unit = ...; {HOLDS}"),
+        (
+            ('unit = "nm"', ""),
+            "MAP: channels.intensity: says no unit of variable 'z', and the file states none; "
+            f"add unit = ...; {HOLDS}",
+        ),
         (('variable = "z"', ""), f"MAP: channels.intensity: says no variable; add variable = ...; {HOLDS}"),
         (('variable = "x"', 'variable = "q"'), f"MAP: channels.sense_x: there is no variable 'q'; {HOLDS}"),
         (('variable = "x"', "variable = 3"), "MAP: channels.sense_x: variable is 3 and must be text; put it in quotes"),
@@ -112,7 +125,7 @@ HOLDS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
         (
             ("start = 0.25", "delay = 0.25"),
             "MAP: channels.intensity: delay is not a known key; "
-            "known: variable, unit, sample_rate, start, scale, offset",
+            "known: variable, unit, sample_rate, start, time, scale, offset",
         ),
         (
             ("scale = 1e4", "scale = 0"),
@@ -132,9 +145,19 @@ HOLDS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
         (("1000.0", "-1"), "BOTH: sense_x: sample_rate is -1 Hz; state a rate greater than 0"),
         (('"x"', '"z"'), "BOTH: sense_x: has shape (2, 2); store it as (n,)"),
         (('"x"', '"cell"'), "BOTH: sense_x: holds object, not real numbers; store integers or floats"),
-        (('"x"', '"label"'), "BOTH: sense_x: holds <U5, not real numbers; store integers or floats"),
-        (('"matlab"', '"labview"'), "MAP: format: format 'labview' is unknown; known formats: matlab"),
-        (('format = "matlab"', ""), "MAP: format: states no format; known formats: matlab"),
+        (('"x"', '"label"'), "BOTH: sense_x: holds <U1, not real numbers; store integers or floats"),
+        (
+            ('"matlab"', '"labview"'),
+            "SOURCE: format: format 'labview' is unknown; "
+            "known formats: matlab, hdf5, tdms, lvm, csv, scope, npz, wav",
+        ),
+        (('"matlab"', "7"), "MAP: format: is 7 and must be text; put it in quotes"),
+        (("sense_x]", '"a/b"]'), "MAP: channels.a/b: is no name for a channel; name it without /"),
+        (("sample_rate = 500", "sample_rate = 1" + "0" * 400), "BOTH: intensity: sample_rate is 1"),
+        (
+            ("start = 0.25", 'time = "x"'),
+            "MAP: channels.intensity: says time and sample_rate or start; the times state both",
+        ),
         (
             ('name = "bench"', "sample_rate = 5"),
             "MAP: sample_rate: is not a known key; known: format, name, notes, acquired, channels, device",
@@ -150,7 +173,9 @@ def test_a_mapping_that_does_not_say_enough(bench: Path, swap: tuple[str, str], 
     mapping.write_text(MAPPING.replace(*swap, 1))
     with pytest.raises(BadInput) as caught:
         convert_file(source, mapping, bench / "run.h5")
-    assert str(caught.value) == line.replace("MAP", str(mapping)).replace("BOTH", f"{source} by {mapping}")
+    places = {"MAP": str(mapping), "BOTH": f"{source} by {mapping}", "SOURCE": str(source)}
+    expected = reduce(lambda text, place: text.replace(*place), places.items(), line)
+    assert str(caught.value).startswith(expected)
     assert not (bench / "run.h5").exists()
 
 
@@ -186,17 +211,18 @@ def test_a_file_that_matlab_did_not_write(bench: Path) -> None:
         "gone.mat": (None, "no such file; name the instrument's file"),
         "csv.mat": (b"t,V\n0,1\n", "is not a whole MATLAB file"),
         "empty.mat": (b"", "is not a whole MATLAB file"),
-        "cut.mat": (whole[: len(whole) - 40], "is not a whole MATLAB file"),
+        "cut.mat": (whole[: len(whole) // 2], "is not a whole MATLAB file"),
         "new.mat": (
             head + bytes(400),
-            "is a MATLAB 7.3 file, which is not read yet; save it with the option -v7 in MATLAB",
+            "is not a whole MATLAB file: Please use HDF reader",
         ),
     }
     for name, (content, what) in files.items():
         if content is not None:
             (bench / name).write_bytes(content)
         with pytest.raises(BadInput) as caught:
-            convert(bench / name, bench / "map.toml")
+            convert_file(bench / name, bench / "map.toml", bench / "run.h5")
+        assert not (bench / "run.h5").exists()
         assert str(caught.value).startswith(f"{bench / name}: {what}")
 
 
@@ -208,3 +234,46 @@ def test_the_shipped_mapping_holds_for_a_file_like_the_measured_one(tmp_path: Pa
     microns = (recording["sense_x"].read() - readout.offset) / readout.gain  # type: ignore[union-attr]
     np.testing.assert_allclose(microns, [0.0, 3.0], atol=1e-12)
     np.testing.assert_allclose(recording["intensity"].read(), 1e4)
+
+
+def test_times_in_a_variable_are_a_clock_until_they_jump(tmp_path: Path) -> None:
+    time = 0.5 + np.arange(1000) / 250.0
+    plan = {"channels": {"sense_x": {"variable": "v", "unit": "mV", "time": "t"}}}
+    savemat(tmp_path / "a.mat", {"v": np.arange(1000.0), "t": time})
+    with convert(tmp_path / "a.mat", plan) as recording:
+        sense = recording["sense_x"]
+        assert (sense.sample_rate, sense.start) == (pytest.approx(250.0), 0.5)
+        np.testing.assert_allclose(sense.read(998), [0.998, 0.999])
+    for at in (1, 400, 998):  # one sample dropped anywhere
+        savemat(tmp_path / "a.mat", {"v": np.arange(999.0), "t": np.delete(time, at)})
+        with pytest.raises(BadInput, match=r"time = 't' is no clock: its times are not uniform"):
+            convert(tmp_path / "a.mat", plan)
+    savemat(tmp_path / "a.mat", {"v": np.arange(9.0), "t": np.zeros(9)})
+    with pytest.raises(BadInput, match="its times do not rise"):
+        convert(tmp_path / "a.mat", plan)
+
+
+def test_the_mapping_may_overrule_what_the_file_states_and_says_so(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x-axis,1\nsecond,Volt\n0.0,1.5\n1e-3,2.5\n2e-3,3.5\n")
+    plan = {"channels": {"sense_x": {"variable": "1", "sample_rate": 2000.0}}}
+    own = convert_file(tmp_path / "a.csv", plan, tmp_path / "a.h5")["channels"]["sense_x"]
+    assert (own["sample_rate"], own["overruled"]) == (2000.0, {"sample_rate": pytest.approx(1000.0)})
+    assert own["stated_by"] == {"unit": "file", "sample_rate": "mapping", "start": "file"}
+
+
+def test_a_scaled_variable_needs_a_unit_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x-axis,1\nsecond,Volt\n0.0,1.5\n1e-3,2.5\n2e-3,3.5\n")
+    plan = {"channels": {"angle_x": {"variable": "1", "scale": 0.1}}}
+    with pytest.raises(BadInput, match="says no unit of variable '1'"):
+        convert(tmp_path / "a.csv", plan)
+
+
+def test_one_door_for_recordings_and_instruments_files(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", v=np.arange(5, dtype=np.int16))
+    plan = {"channels": {"sense_x": {"variable": "v", "unit": "V", "sample_rate": 10.0, "scale": 0.5}}}
+    with open_any(tmp_path / "a.npz", plan) as made:
+        made.write(tmp_path / "a.h5")
+    with open_any(tmp_path / "a.h5") as recording:
+        assert recording["sense_x"].raw.dtype == np.int16  # with gain and offset, as the recording's form has it
+        np.testing.assert_array_equal(recording["sense_x"].read(), [0, 0.5, 1, 1.5, 2])
+        assert recording.attrs["source_format"] == "NumPy archive"

@@ -23,10 +23,11 @@ def size(text: str) -> tuple[int, int]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="the recording (.h5)")
+    parser.add_argument("recording", type=Path, help="the recording (.h5), or an instrument's file with --mapping")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for pictures, motion, report"
     )
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
     parser.add_argument(
         "--estimator", metavar="NAME", help="tracker, ukf, ekf, constant, sensor, ...; by what was recorded if not given"
@@ -66,6 +67,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             fill_radius=args.fill,
             spot=args.spot,
         ),
+        args.mapping,
     )
 
 

@@ -1,0 +1,94 @@
+"""What a file holds, whoever wrote it, and the mapping that would make a recording of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from recon.readers import read
+from recon.readers.contents import Variable
+from scanner.channel import CHANNEL_UNITS
+from scanner.hdf5 import attributes, open_hdf5
+from scanner.recording import FORMAT, Recording
+
+HEADING = f"""\
+# A suggestion to edit, not a guess to trust: name each channel by what it is, drop the others, state what stands
+# behind a #. Channels: {", ".join(CHANNEL_UNITS)}, intensity."""
+
+
+def info(path: Path, format: str | None = None) -> dict[str, Any]:
+    """Variables of a file with size, unit and clock as far as it states them, and a mapping to start from.
+
+    Returns:
+        ``file``, ``format``, ``about`` (name, device, start of the recording, ... as stated), ``variables`` (``shape``,
+        ``dtype``, ``unit``, ``sample_rate`` [Hz], ``start`` [s], ``note``; None where nothing is stated) and
+        ``suggestion`` (TOML; None for a recording, which needs none).
+
+    Raises:
+        BadInput: as :func:`recon.readers.read` or :meth:`Recording.open`.
+    """
+    if format is None and _is_recording(path):
+        return _of_recording(path)
+    contents = read(path, format)
+    try:
+        return {
+            "file": str(path),
+            "format": contents.kind,
+            "about": {key: value for key, value in contents.about.items() if value},
+            "variables": {name: _told(variable) for name, variable in contents.variables.items()},
+            "suggestion": suggestion(contents.variables, format),
+        }
+    finally:
+        contents.close()
+
+
+def suggestion(variables: Any, format: str | None = None) -> str:
+    """A mapping (TOML) of all signals; what the file does not state stands behind a ``#`` to be filled in."""
+    lines = [HEADING, *([f"format = {_quoted(format)}"] if format else [])]
+    for name, variable in variables.items():
+        if not variable.is_signal or variable.raw.shape[0] < 2:
+            continue
+        channel = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name) or "_"
+        lines += ["", f"[channels.{channel}]", f"variable = {_quoted(name)}"]
+        lines.append(f"unit = {_quoted(variable.unit)}" if variable.unit else '# unit = "V"')
+        rate = variable.sample_rate
+        lines.append(f"sample_rate = {float(rate)!r}" if rate else "# sample_rate = 1e6  # Hz")
+        lines += [f"start = {float(variable.start)!r}"] if variable.start is not None else []
+    return "\n".join(lines)
+
+
+def _is_recording(path: Path) -> bool:
+    if not path.is_file() or not h5py.is_hdf5(path):
+        return False
+    with open_hdf5(path) as file:
+        return attributes(file).get("format") == FORMAT
+
+
+def _of_recording(path: Path) -> dict[str, Any]:
+    with Recording.open(path) as recording:
+        device = {} if recording.device is None else {"device": recording.device.name}
+        return {
+            "file": str(path),
+            "format": FORMAT,
+            "about": {key: str(value) for key, value in recording.attrs.items()} | device,
+            "variables": {
+                name: {key: getattr(channel, key) for key in ("shape", "unit", "sample_rate", "start")}
+                | {"dtype": str(channel.raw.dtype), "note": ""}
+                for name, channel in recording.channels.items()
+            },
+            "suggestion": None,
+        }
+
+
+def _told(variable: Variable) -> dict[str, Any]:
+    said = {key: getattr(variable, key) for key in ("unit", "sample_rate", "start", "note")}
+    return {"shape": variable.raw.shape, "dtype": str(variable.raw.dtype)} | said
+
+
+def _quoted(text: str) -> str:
+    """Text as TOML writes it."""
+    import tomli_w
+
+    return tomli_w.dumps({"_": text}).removeprefix("_ = ").rstrip("\n")

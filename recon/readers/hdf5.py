@@ -1,0 +1,67 @@
+"""HDF5 of others, MATLAB 7.3 among them, read slice by slice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.readers.contents import Contents, Lazy, Variable
+from scanner.hdf5 import attributes, child, open_hdf5, undamaged
+
+DEEPEST = 8
+"""Groups within groups that are looked into."""
+
+
+def read_hdf5(path: Path) -> Contents:
+    """Datasets of an HDF5 file, those in groups with dotted names; MATLAB's with their dimensions as MATLAB has them.
+
+    Raises:
+        BadInput: no such file, no HDF5, a damaged one, or data kept outside it.
+    """
+    file = open_hdf5(path)
+    try:
+        with undamaged(path):
+            datasets = dict(_datasets(file))
+            matlab = {name for name, dataset in datasets.items() if "MATLAB_class" in dataset.attrs}
+            variables = {name: Variable(_samples(path, each, name in matlab)) for name, each in datasets.items()}
+    except BaseException:
+        file.close()
+        raise
+    return Contents("MATLAB 7.3" if matlab else "HDF5", variables, close=file.close)
+
+
+def vector(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """MATLAB's vector, a matrix of one row or column, as one dimension; other shapes as they are."""
+    return (prod(shape),) if len(shape) == 2 and 1 in shape else shape
+
+
+def _datasets(group: h5py.Group, depth: int = DEEPEST) -> Iterator[tuple[str, h5py.Dataset]]:
+    for name in group:
+        if name.startswith("#"):  # MATLAB's own bookkeeping
+            continue
+        item = child(group, name, h5py.HLObject)
+        if isinstance(item, h5py.Dataset):
+            yield name, item
+        elif isinstance(item, h5py.Group) and depth:
+            yield from ((f"{name}.{inner}", dataset) for inner, dataset in _datasets(item, depth - 1))
+
+
+def _samples(path: Path, dataset: h5py.Dataset, matlab: bool) -> Lazy:
+    """A dataset; MATLAB counts its dimensions the other way round, and has vectors as matrices."""
+    stored: tuple[int, ...] = dataset.shape or ()
+    shape = vector(stored[::-1]) if matlab else stored
+    text = matlab and attributes(dataset).get("MATLAB_class") == "char"
+
+    def fetch(first: int, stop: int) -> NDArray[Any]:
+        with undamaged(path, dataset.name):
+            if len(shape) == 1 and len(stored) == 2:
+                return dataset[first:stop, 0] if stored[1] == 1 else dataset[0, first:stop]
+            return dataset[..., first:stop].T if matlab else dataset[first:stop]
+
+    return Lazy(shape, np.dtype("U1") if text else dataset.dtype, fetch)

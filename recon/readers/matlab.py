@@ -1,0 +1,81 @@
+"""MATLAB files of version 4 to 7.2 through scipy; those of 7.3 are HDF5."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.readers.contents import Contents, Lazy, Variable
+from recon.readers.hdf5 import read_hdf5, vector
+from scanner.errors import BadInput
+from scanner.files import check_claim
+
+Load = Callable[[str], NDArray[Any]]
+
+CLASSES = {"double": "f8", "single": "f4", "logical": "?", "char": "U1"} | {
+    f"{'u' * (kind == 'u')}int{8 * size}": f"{kind}{size}" for kind in "iu" for size in (1, 2, 4, 8)
+}
+"""MATLAB's classes as numpy's types; what is of another class is an object to us."""
+
+
+def read_matlab(path: Path) -> Contents:
+    """Variables of a MATLAB file; an (n, 1) or (1, n) matrix, MATLAB's vector, as (n,).
+
+    Version 7.3 is read slice by slice; earlier ones a variable at a time, of which none exceeds 2 GB.
+
+    Raises:
+        BadInput: no such file, no MATLAB file, or a damaged one.
+    """
+    if path.is_file() and h5py.is_hdf5(path):
+        return read_hdf5(path)
+    from scipy.io import whosmat
+
+    listed = _through_scipy(path, whosmat)
+    load = lru_cache(maxsize=1)(partial(_load, path))  # channels are read one after the other
+    return Contents("MATLAB 4 to 7.2", {name: Variable(_lazy(path, load, name, *said)) for name, *said in listed})
+
+
+def _through_scipy(path: Path, read: Callable[..., Any], **said: Any) -> Any:
+    if not path.is_file():
+        raise BadInput("no such file", file=path, hint="name the instrument's file")
+    try:
+        return read(path, **said)
+    except Exception as error:  # the parser stumbles in as many ways as a file can be damaged
+        what = f"is not a whole MATLAB file: {error or type(error).__name__}"
+        raise BadInput(what, file=path, hint="copy or save it again") from None
+
+
+def _lazy(path: Path, load: Load, name: str, shape: tuple[int, ...], kind: str) -> Lazy:
+    dtype = np.dtype(CLASSES.get(kind, "O"))
+    if dtype.kind in "iuf":
+        check_claim(dtype.itemsize * prod(shape), path.stat().st_size, file=path, channel=name)
+    shape = vector(shape)
+
+    def fetch(first: int, stop: int) -> NDArray[Any]:
+        values = load(name).reshape(shape)
+        if values.dtype.kind not in "iuf":
+            what = f"holds {values.dtype}, not real numbers"
+            raise BadInput(what, file=path, channel=name, hint="save its real part")
+        return values[first:stop]
+
+    return Lazy(shape, dtype, fetch)
+
+
+def _load(path: Path, name: str) -> NDArray[Any]:
+    from scipy.io import loadmat
+
+    content = _through_scipy(path, loadmat, variable_names=[name], mat_dtype=True)
+    if name not in content:
+        raise BadInput("cannot be read", file=path, channel=name, hint="copy or save the file again")
+    return content[name]
+
+
+def _vector(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (prod(shape),) if len(shape) == 2 and 1 in shape else shape

@@ -1,0 +1,83 @@
+"""NumPy archives: each array through a temporary file, so that memory holds one block of it."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from errno import EINVAL
+from functools import cache, partial
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.readers.contents import Contents, Lazy, Variable, spooled
+from scanner.errors import BadInput
+from scanner.files import check_claim
+
+BLOCK = 1 << 23
+
+
+def read_npz(path: Path) -> Contents:
+    """Arrays of an .npz archive. Pickled objects are never loaded.
+
+    Raises:
+        BadInput: no such file, no archive of arrays, or a damaged one.
+    """
+    variables = {}
+    with _parsing(path), zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if info.filename.endswith(".npy"):
+                name = info.filename.removesuffix(".npy")
+                with archive.open(info) as file:
+                    shape, _, dtype = _header(cast(BinaryIO, file))
+                claimed = prod(shape) * dtype.itemsize
+                check_claim(claimed, min(info.compress_size, path.stat().st_size), file=path, channel=name)
+                load = cache(partial(_load, path, info.filename))
+                variables[name] = Variable(Lazy(shape, dtype, partial(_rows, load)))
+    return Contents("NumPy archive", variables)
+
+
+@contextmanager
+def _parsing(path: Path) -> Iterator[None]:
+    if not path.is_file():
+        raise BadInput("no such file", file=path, hint="name the instrument's file")
+    try:
+        yield
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+        if isinstance(error, BadInput) or (isinstance(error, OSError) and error.errno not in (None, EINVAL)):
+            raise  # as of a full disk; a damaged directory asks for places before the file's beginning
+        what = f"is not a whole NumPy archive: {error or type(error).__name__}"
+        raise BadInput(what, file=path, hint="copy or save it again") from None
+
+
+def _rows(load: Callable[[], NDArray[Any]], first: int, stop: int) -> NDArray[Any]:
+    return load()[first:stop]
+
+
+def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(file)
+
+
+def _load(path: Path, member: str) -> NDArray[Any]:
+    """An array of the archive, mapped from a temporary file."""
+    with _parsing(path), zipfile.ZipFile(path) as archive, archive.open(member) as file:
+        shape, columns_first, dtype = _header(cast(BinaryIO, file))
+        flat = spooled(_values(cast(BinaryIO, file), dtype, prod(shape)), path)
+    return flat.reshape(shape, order="F" if columns_first else "C")
+
+
+def _values(file: BinaryIO, dtype: np.dtype[Any], count: int) -> Iterator[NDArray[Any]]:
+    while count:
+        data = file.read(dtype.itemsize * min(count, BLOCK // dtype.itemsize + 1))
+        if not data:
+            raise EOFError("an array ends early")
+        values = np.frombuffer(data[: len(data) - len(data) % dtype.itemsize], dtype)
+        count -= len(values)
+        yield values
