@@ -54,17 +54,18 @@ def absolute(frequency: float, start: float, end: float) -> Reference:
     return Reference("absolute", frequency, np.array([start, end]), np.zeros(2))
 
 
-def drive_reference(drive: Channel, kind: str) -> Reference:
+def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> Reference:
     """The reference from a recorded drive voltage.
 
     Args:
         drive: its channel.
         kind: ``"half-drive"`` for a parametric drive, ``"drive"`` for a linear one.
+        low: the drive oscillates above this [Hz]; what is below comes from switching it on and off.
 
     Raises:
         BadInput: the drive holds no oscillation.
     """
-    f = dominant_frequency(drive)
+    f = dominant_frequency(drive, low)
     block = block_length(f, drive.sample_rate, _CYCLES)
     if drive.size < 2 * block:
         raise BadInput(

@@ -94,9 +94,10 @@ def reference_of(
     if f"drive_{axis}" in recording:
         drive = recording[f"drive_{axis}"]
         check_signal(drive)
+        low = 0.1 * own.resonance if own.mechanics else 0.0
         if own.require_drive().kind == "linear":
-            return drive_reference(drive, "drive")
-        reference = drive_reference(drive, "half-drive")
+            return drive_reference(drive, "drive", low)
+        reference = drive_reference(drive, "half-drive", low)
         if own.mechanics and not 0.75 < reference.frequency / own.resonance < 1.33:
             raise BadInput(
                 f"oscillates at {2 * reference.frequency:.6g} Hz, and axis {axis} moves at half of that near its resonance "

@@ -32,15 +32,14 @@ class Projections:
 
     Attributes:
         sums: B'y, shape (blocks, m).
-        grams: B'B, shape (geometries, m, m). moments: B'TB, T the samples' times from the block's middle: what a line
-            that changes over the block adds [s]. geometry: which of them is a block's, shape (blocks,).
+        grams: B'T^nB for n = 0, 1, 2, T the samples' times from the block's middle [s], shape (geometries, 3, m, m):
+            what a line, its rate and its rate's rate give. geometry: which of them is a block's, shape (blocks,).
         squares: y'y, shape (blocks,). counts: samples used, shape (blocks,).
         tuned: angular frequency that the table of each block is made for, shape (blocks, references) [rad/s].
     """
 
     sums: Array
     grams: Array
-    moments: Array
     geometry: Index
     squares: Array
     counts: Index
@@ -79,15 +78,13 @@ def project(
     sums, squares, tuned = np.zeros((blocks, m)), np.zeros(blocks), np.empty_like(omega)
     geometry, counts = np.zeros(blocks, np.int64), np.full(blocks, length)
     grams: list[Array] = []
-    moments: list[Array] = []
     offset = _offsets(length, channel.sample_rate)
     highest = np.array([max(lines[lines[:, 0] == i, 1], default=1) for i in range(omega.shape[1])])
     for group in _steady_groups(omega * highest, 2 * np.pi * TABLE_REACH * channel.sample_rate / length):
         tuned[group] = 0.5 * (omega[group].min(axis=0) + omega[group].max(axis=0))
         table = basis(length, channel.sample_rate, lines, tuned[group.start])
         whole = len(grams)
-        grams.append(table @ table.T)
-        moments.append(table * offset @ table.T)
+        grams.append(_moments(table, offset))
         folded = np.ascontiguousarray(table[:, (length + 1) // 2 :])
         for part in _chunks(starts, length, group):
             first = int(starts[part.start])
@@ -103,9 +100,12 @@ def project(
                 own, left = table[:, used], rows[i, used]
                 sums[k], squares[k], counts[k] = own @ left, left @ left, left.size
                 geometry[k] = len(grams)
-                grams.append(own @ own.T)
-                moments.append(own * offset[used] @ own.T)
-    return Projections(sums, np.array(grams), np.array(moments), geometry, squares, counts, tuned)
+                grams.append(_moments(own, offset[used]))
+    return Projections(sums, np.array(grams), geometry, squares, counts, tuned)
+
+
+def _moments(table: Array, offset: Array) -> Array:
+    return np.stack([table * offset**n @ table.T for n in range(3)])
 
 
 def _offsets(length: int, rate: float) -> Array:
@@ -116,7 +116,7 @@ def _offsets(length: int, rate: float) -> Array:
 def solved(projections: Projections) -> Array:
     """Least-squares coefficients of every block, shape (blocks, m); of the smallest norm where samples are missing."""
     out = np.empty_like(projections.sums)
-    for g, gram in enumerate(projections.grams):
+    for g, gram in enumerate(projections.grams[:, 0]):
         mine = projections.geometry == g
         out[mine] = projections.sums[mine] @ np.linalg.pinv(gram, hermitian=True)
     return out

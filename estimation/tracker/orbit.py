@@ -73,6 +73,12 @@ def axis_law(axis: Axis, readout: Readout) -> AxisLaw:
     return AxisLaw(mechanics.J, mechanics.b, mechanics.k, *bell, pull, push, turn, position)
 
 
+@njit(cache=True)
+def law_of(row):  # type: ignore[no-untyped-def]
+    """The ``AxisLaw`` in a row of numbers: compiled code is then the same for one axis and for two."""
+    return AxisLaw(row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], int(row[9]), row[10] > 0.0)
+
+
 class Turn(NamedTuple):
     """What one turn gives.
 

@@ -29,6 +29,8 @@ NYQUIST_SHARE = 0.45  # of the sampling rate: the highest harmonic that is used
 SETTLING = 15.0  # time constants of the readout's sections; at the beginning nobody knows their state
 RUNGS = 400  # of the ladder from line to amplitude
 POSITION_LINES = 3
+MODEL_SHARE = 3e-3  # of the signal's rms: what laws linearised over a block leave unexplained, however quiet the signal
+DISTURBED = 1.5  # times the usual variance about a block's fit: the block holds something else
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Prepared:
     time: Array
     signal: Signal
     clean: float
+
+    @property
+    def rows(self) -> Array:
+        """The laws as numbers, one a row: what compiled code takes."""
+        return np.array(self.laws, dtype=np.float64)
 
 
 def prepare(recording: Recording, device: Device, sense: Sense, references: Mapping[str, Reference]) -> Prepared:
@@ -87,24 +94,22 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
         for i, name in enumerate(sense.axes)
     ]
     passed, passed_by_w = _passed(sense, lines, w)
-    whitened, roots, slants, unroots = _whitened(projections)
+    whitened, roots, unroots = _whitened(projections)
     signal = Signal(
-        psi=psi,
-        w=w,
-        force=np.stack(forces, axis=1),
+        psi=np.ascontiguousarray(psi),
+        w=np.ascontiguousarray(w),
+        force=np.ascontiguousarray(np.stack(forces, axis=1)),
         step=width,
-        width=width,
         lines=lines,
-        passed=passed,
-        passed_by_w=passed_by_w,
+        passed=np.ascontiguousarray(passed),
+        passed_by_w=np.ascontiguousarray(passed_by_w),
         mean_gain=float(readout_response(sense.readout, 0.0).real),
-        tuned=projections.tuned,
+        tuned=np.ascontiguousarray(projections.tuned),
         whitened=whitened,
-        roots=roots,
-        slants=slants,
+        roots=np.ascontiguousarray(roots),
         unroots=unroots,
         geometry=projections.geometry,
-        noise_var=float(np.nanmedian(residual_variance(projections))),
+        noise_var=_noise(projections),
         known=np.zeros(psi.shape),
         known_var=np.full(psi.shape, np.inf),
         ladder=np.stack([_ladder(axis, sense) for axis in axes]),
@@ -153,7 +158,7 @@ def _force(channel: Channel | None, time: Array, width: float, psi: Array, w: Ar
             channel=channel.name,
             hint="record both over the same time",
         )
-    orders = np.arange(1, 2 * DRIVEN + 1)
+    orders = np.arange(1, DRIVEN + 2)  # one or two more than are used, so that they do not pass for these
     orders = orders[orders * law.turn * w.max() < 2 * np.pi * NYQUIST_SHARE * rate]
     lines = np.stack([np.zeros_like(orders), orders * law.turn], axis=1)
     square = np.square if law.pull else None
@@ -174,17 +179,25 @@ def _passed(sense: Sense, lines: Index, w: Array) -> tuple[Complex, Complex]:
     return readout_response(sense.readout, f), (high - low) / (2.0 * step * w[:, lines[:, 0]])
 
 
-def _whitened(projections: Projections) -> tuple[Array, Array, Array, Array]:
-    """(R's, R'G, R'M, R), R'GR = 1, from each geometry's eigenvectors; directions with no samples stay zero."""
-    values, vectors = np.linalg.eigh(projections.grams)
+def _noise(projections: Projections) -> Array:
+    """Variance of each block's samples, shape (blocks,): that of most blocks, more where one holds a disturbance."""
+    own = residual_variance(projections)
+    samples = np.maximum(projections.counts, 1)
+    swing = float(np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2))
+    usual = max(float(np.nanmedian(own)), MODEL_SHARE**2 * swing)
+    return np.where(own > DISTURBED * usual, own, usual)
+
+
+def _whitened(projections: Projections) -> tuple[Array, Array, Array]:
+    """(R's, R'G of all three moments, R), R'GR = 1, by eigenvectors; directions with no samples stay zero."""
+    values, vectors = np.linalg.eigh(projections.grams[:, 0])
     held = values > 1e-9 * np.maximum(values[:, -1:], 1.0)
     unroots = vectors * np.where(held, 1.0 / np.sqrt(np.where(held, values, 1.0)), 0.0)[:, None, :]
-    turned = np.swapaxes(unroots, 1, 2)
     whitened = np.empty_like(projections.sums)
     for g, unroot in enumerate(unroots):
         mine = projections.geometry == g
         whitened[mine] = projections.sums[mine] @ unroot
-    return whitened, turned @ projections.grams, turned @ projections.moments, np.ascontiguousarray(unroots)
+    return whitened, np.swapaxes(unroots, 1, 2)[:, None] @ projections.grams, np.ascontiguousarray(unroots)
 
 
 def _ladder(axis: Axis, sense: Sense) -> Array:

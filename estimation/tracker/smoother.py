@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from estimation.tracker.orbit import turn_of
+from estimation.tracker.orbit import law_of, turn_of
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -25,8 +25,13 @@ STATES = 6  # of an axis
 
 FLOOR = 1e-3  # of theta0: a smaller amplitude is no motion
 LOST = (0.5, 0.3)  # sd of phase [rad] and ln A beyond which the block itself tells where the motion is
+UNKNOWN = (10.0, 3.0)  # the same at which nothing is known: without data an unstable flow would let them run away
 SIGNIFICANT = 6.0  # standard deviations that a line must have to be taken for a motion
-MISFIT = 4.0  # mean squared innovation beyond which a block's noise counts as larger
+MISFIT = 4.0  # mean squared innovation beyond which the motion itself must have jumped
+BROKEN = 100.0  # beyond which it is looked for anew
+NONLINEAR = 2e-3  # step of phase [rad], ln A or anything else after which a block is linearised anew
+TRIES = 5
+OPEN = (0.02, 3.0)  # sd of the stiffness and its trend [1/s] that a jump may at most give them
 
 
 class Signal(NamedTuple):
@@ -36,16 +41,15 @@ class Signal(NamedTuple):
         psi: reference phase at the block's middle, shape (blocks, axes) [rad].
         w: its rate there, shape (blocks, axes) [rad/s].
         force: harmonics of the drive's force, shape (blocks, axes, DRIVEN).
-        step: time to the next block [s]. width: of a block [s].
+        step: time from one block to the next [s].
         lines: (axis, order) of each line, shape (lines, 2).
         passed: readout's response at each line, shape (blocks, lines); passed_by_w: its derivative by the motion's
             angular frequency.
         mean_gain: of the readout at rest, 0 where it does not pass a mean.
         tuned: angular frequency of the projections' tables, shape (blocks, axes).
         whitened: R's with R R' the inverse of the Gram matrix, shape (blocks, m).
-        roots: R'G of each geometry, shape (geometries, m, m). slants: R' times the moments. unroots: R.
-        geometry: of each block.
-        noise_var: of a sample [V^2].
+        roots: R' times the moments of each geometry, shape (geometries, 3, m, m). unroots: R. geometry: of each block.
+        noise_var: of a block's samples, shape (blocks,) [V^2].
         known: phase measured otherwise, shape (blocks, axes) [rad]; known_var: its variance, inf for none [rad^2].
         ladder: amplitudes [rad] and the size of the main line of C or theta there, shape (axes, 2, rungs).
         main: order of the main line: 2 for a capacitance, 1 for a position.
@@ -55,7 +59,6 @@ class Signal(NamedTuple):
     w: Array
     force: Complex
     step: float
-    width: float
     lines: NDArray[np.int64]
     passed: Complex
     passed_by_w: Complex
@@ -63,10 +66,9 @@ class Signal(NamedTuple):
     tuned: Array
     whitened: Array
     roots: Array
-    slants: Array
     unroots: Array
     geometry: NDArray[np.int64]
-    noise_var: float
+    noise_var: Array
     known: Array
     known_var: Array
     ladder: Array
@@ -144,36 +146,46 @@ def _predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untyp
     for half in range(2):
         G, Q = np.eye(n), np.zeros((n, n))
         for a in range(len(laws)):
-            law = laws[a]
+            law = law_of(laws[a])
             at = a * STATES
             w = (signal.psi[k + 1, a] - signal.psi[k, a]) / signal.step
             new, jacobian, added = _flow(
                 law, x[at : at + STATES], w, signal.force[k + half, a], 0.5 * signal.step, walk[a]
             )
-            new[LOG] = max(new[LOG], np.log(FLOOR * law.theta0))
             x[at : at + STATES] = new
             G[at : at + STATES, at : at + STATES] = jacobian
             Q[at : at + STATES, at : at + STATES] = added
+        x[:] = _bounded(laws, signal, x)
         Q[n - 1, n - 1] = offset_walk * 0.5 * signal.step
         P = G @ P @ G.T + Q
         F = G @ F
+    for a in range(len(laws)):
+        for i, most in ((a * STATES + PHASE, UNKNOWN[0]), (a * STATES + LOG, UNKNOWN[1])):
+            if P[i, i] > most * most:
+                scale = most / np.sqrt(P[i, i])
+                P[i, :] *= scale
+                P[:, i] *= scale
     return P, F
 
 
 @njit(cache=True, error_model="numpy")
 def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
-    """Coefficients (m,) that block k's projections should show in the state ``x``, their rates, and their Jacobian."""
-    m = signal.roots.shape[1]
-    values, rates, jacobian = np.zeros(m), np.zeros(m), np.zeros((m, x.size))
-    values[0], jacobian[0, x.size - 1] = x[x.size - 1], 1.0
+    """Coefficients that block k's projections should show in the state ``x``, and their Jacobian (m, states).
+
+    A line changes over the block as exp(rate t): the coefficients (3, m) are its value and its first two derivatives,
+    the last one halved. In a free decay the second is worth half a degree.
+    """
+    m = signal.roots.shape[2]
+    values, jacobian = np.zeros((3, m)), np.zeros((m, x.size))
+    values[0, 0], jacobian[0, x.size - 1] = x[x.size - 1], 1.0
     for a in range(len(laws)):
-        law = laws[a]
+        law = law_of(laws[a])
         at = a * STATES
         stiff, damp = law.k * (1.0 + x[at + STIFFNESS]), law.b * (1.0 + x[at + DAMPING])
         turn = turn_of(law, np.exp(x[at + LOG]), x[at + PHASE], signal.w[k, a], stiff, damp, signal.force[k, a])
-        values[0] += signal.mean_gain * turn.seen[0].real
+        values[0, 0] += signal.mean_gain * turn.seen[0].real
         jacobian[0, at + LOG] = signal.mean_gain * turn.seen_by_log[0].real
-        rates[0] += jacobian[0, at + LOG] * turn.rate.real
+        values[1, 0] += jacobian[0, at + LOG] * turn.rate.real
         slip = signal.w[k, a] + turn.rate.imag - signal.tuned[k, a]
         gain = np.exp(x[at + GAIN])
         for i in range(signal.lines.shape[0]):
@@ -181,27 +193,31 @@ def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
                 order = signal.lines[i, 1]
                 passed = signal.passed[k, i] + signal.passed_by_w[k, i] * turn.rate.imag
                 turned = gain * passed * np.exp(1j * order * (signal.psi[k, a] + x[at + PHASE]))
-                turned *= np.sinc(order * slip * signal.width / (2.0 * np.pi))
                 line, by_log = turned * turn.seen[order], turned * turn.seen_by_log[order]
                 by_phase = 1j * order * line
-                rate = by_log * turn.rate.real + 1j * order * slip * line
+                first = by_log * turn.rate.real + by_phase * slip
+                second = 0.5 * first * first / line if line != 0.0 else 0.0j
                 for j, part in ((1 + 2 * i, 1.0 + 0.0j), (2 + 2 * i, 1.0j)):  # Re with the cosine, -Im with the sine
-                    values[j], rates[j] = (part * line).real, (part * rate).real
+                    values[0, j], values[1, j], values[2, j] = (
+                        (part * line).real,
+                        (part * first).real,
+                        (part * second).real,
+                    )
                     jacobian[j, at + PHASE], jacobian[j, at + LOG] = (part * by_phase).real, (part * by_log).real
-                    jacobian[j, at + GAIN] = values[j]
-    return values, rates, jacobian
+                    jacobian[j, at + GAIN] = values[0, j]
+    return values, jacobian
 
 
 @njit(cache=True, error_model="numpy")
 def _acquire(signal, k, a, x, P):  # type: ignore[no-untyped-def]
     """Set phase and amplitude of axis ``a`` from block k's main line alone; False where it shows none."""
-    root, unroot = signal.roots[signal.geometry[k]], signal.unroots[signal.geometry[k]]
+    root, unroot = signal.roots[signal.geometry[k], 0], signal.unroots[signal.geometry[k]]
     fitted = unroot @ signal.whitened[k]
     at = a * STATES
     for i in range(signal.lines.shape[0]):
         if signal.lines[i, 0] == a and signal.lines[i, 1] == signal.main:
             line = complex(fitted[1 + 2 * i], -fitted[2 + 2 * i])
-            var = signal.noise_var * max((unroot[1 + 2 * i] ** 2).sum(), (unroot[2 + 2 * i] ** 2).sum())
+            var = signal.noise_var[k] * max((unroot[1 + 2 * i] ** 2).sum(), (unroot[2 + 2 * i] ** 2).sum())
             missing = (root[:, 1 + 2 * i] ** 2).sum() <= 0.0
             if missing or abs(line) < SIGNIFICANT * np.sqrt(var):
                 return False
@@ -221,32 +237,29 @@ def _acquire(signal, k, a, x, P):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _update(signal, k, x, P, values, rates, jacobian):  # type: ignore[no-untyped-def]
-    """Bring block k's measurements in, one at a time; returns (log-likelihood, squared innovations, measurements)."""
-    n, root = x.size, signal.roots[signal.geometry[k]]
-    H, r = root @ jacobian, signal.whitened[k] - root @ values - signal.slants[signal.geometry[k]] @ rates
-    before, kept = x.copy(), P.copy()
-    noise = signal.noise_var
-    for attempt in range(2):
-        x[:], P[:] = before, kept
-        chi2, logdet, count = 0.0, 0.0, 0
-        for i in range(r.size):
-            if (root[i] ** 2).sum() <= 0.0:  # a direction in which the block has no samples
-                continue
-            PH = P @ H[i]
-            S = H[i] @ PH + noise
-            e = r[i] - H[i] @ (x - before)
-            for u in range(n):
-                x[u] += PH[u] / S * e
-                for v in range(n):
-                    P[u, v] -= PH[u] * PH[v] / S
-            chi2 += e * e / S
-            logdet += np.log(S)
-            count += 1
-        if attempt == 0 and chi2 > MISFIT * count:
-            noise *= chi2 / count
-        else:
-            break
+def _update(signal, k, x, P, about, values, jacobian):  # type: ignore[no-untyped-def]
+    """Bring block k's measurements, linearised about ``about``, into ``x`` and ``P``, one at a time.
+
+    Returns:
+        (log-likelihood, squared normalised innovations, measurements).
+    """
+    n, roots, noise = x.size, signal.roots[signal.geometry[k]], signal.noise_var[k]
+    root = roots[0]
+    H, r = root @ jacobian, signal.whitened[k] - root @ values[0] - roots[1] @ values[1] - roots[2] @ values[2]
+    chi2, logdet, count = 0.0, 0.0, 0
+    for i in range(r.size):
+        if (root[i] ** 2).sum() <= 0.0:  # a direction in which the block has no samples
+            continue
+        PH = P @ H[i]
+        S = H[i] @ PH + noise
+        e = r[i] - H[i] @ (x - about)
+        for u in range(n):
+            x[u] += PH[u] / S * e
+            for v in range(n):
+                P[u, v] -= PH[u] * PH[v] / S
+        chi2 += e * e / S
+        logdet += np.log(S)
+        count += 1
     for a in range(signal.psi.shape[1]):
         if np.isfinite(signal.known_var[k, a]):
             at = a * STATES + PHASE
@@ -258,11 +271,36 @@ def _update(signal, k, x, P, values, rates, jacobian):  # type: ignore[no-untype
 
 
 @njit(cache=True, error_model="numpy")
+def _reopen(laws, signal, k, x, P, F, misfit):  # type: ignore[no-untyped-def]
+    """Let a jump in: phase, amplitude and stiffness become as uncertain as the misfit says, or are found anew."""
+    scale = min(misfit, BROKEN)
+    for a in range(len(laws)):
+        at = a * STATES
+        if misfit > BROKEN and _acquire(signal, k, a, x, P):
+            F[at : at + 2, :] = 0.0
+        else:
+            P[at + PHASE, at + PHASE] *= scale
+            P[at + LOG, at + LOG] *= scale
+        for i, sd in ((at + STIFFNESS, OPEN[0]), (at + TREND, OPEN[1])):
+            P[i, i] = max(P[i, i], min(P[i, i] * scale, sd * sd))
+
+
+@njit(cache=True, error_model="numpy")
+def _bounded(laws, signal, x):  # type: ignore[no-untyped-def]
+    """The state with each amplitude between no motion and the largest that a line can tell."""
+    out = x.copy()
+    for a in range(len(laws)):
+        floor, top = np.log(FLOOR * law_of(laws[a]).theta0), np.log(signal.ladder[a, 0, -1])
+        out[a * STATES + LOG] = min(max(x[a * STATES + LOG], floor), top)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
 def run_filter(laws, signal, x, P, live, walk, offset_walk, xs, Ps, xp, Pp, Fs):  # type: ignore[no-untyped-def]
     """Filter all blocks.
 
     Args:
-        laws: tuple of ``AxisLaw``. signal: ``Signal``.
+        laws: an ``AxisLaw`` a row. signal: ``Signal``.
         x, P: state before the first block. live: whether the motion of each axis was found, shape (axes,); changed.
         walk: shape (axes, 4), see ``_flow``. offset_walk: [V^2/s].
         xs, Ps: filtered; xp, Pp: predicted; Fs: Jacobian of the step that leads to each block; shape (blocks, ...).
@@ -271,7 +309,6 @@ def run_filter(laws, signal, x, P, live, walk, offset_walk, xs, Ps, xp, Pp, Fs):
         (log-likelihood, sum of squared normalised innovations, measurements).
     """
     total, chi2, count = 0.0, 0.0, 0
-    poor = 0
     for k in range(signal.whitened.shape[0]):
         F = np.eye(x.size)
         if k > 0:
@@ -279,12 +316,25 @@ def run_filter(laws, signal, x, P, live, walk, offset_walk, xs, Ps, xp, Pp, Fs):
         for a in range(len(laws)):
             at = a * STATES
             lost = P[at + PHASE, at + PHASE] > LOST[0] ** 2 or P[at + LOG, at + LOG] > LOST[1] ** 2
-            if (not live[a] or lost or poor >= 3) and _acquire(signal, k, a, x, P):
+            if (not live[a] or lost) and _acquire(signal, k, a, x, P):
                 F[at : at + 2, :] = 0.0
                 live[a] = True
-        xp[k], Pp[k], Fs[k] = x, P, F
-        here = _update(signal, k, x, P, *expected(laws, signal, k, x))
-        poor = poor + 1 if here[1] > 10 * MISFIT * here[2] else 0
+        about, reopened = x.copy(), False
+        for _ in range(TRIES):
+            xp[k], Pp[k], Fs[k] = x, P, F
+            values, jacobian = expected(laws, signal, k, about)
+            here = _update(signal, k, x, P, about, values, jacobian)
+            misfit = here[1] / max(here[2], 1)
+            if misfit > MISFIT and not reopened:  # the block is clean, so the model missed a jump: it is let in
+                x, P, reopened = xp[k].copy(), Pp[k].copy(), True
+                _reopen(laws, signal, k, x, P, F, misfit)
+                about = x.copy()
+            elif np.abs(x - about).max() > NONLINEAR:
+                about = _bounded(laws, signal, x)
+                x, P = xp[k].copy(), Pp[k].copy()
+            else:
+                break
+        x = _bounded(laws, signal, x)
         total, chi2, count = total + here[0], chi2 + here[1], count + here[2]
         xs[k], Ps[k] = x, P
     return total, chi2, count
@@ -305,7 +355,7 @@ def turns(laws, signal, xs, rates, moved):  # type: ignore[no-untyped-def]
     """Rates d(ln A)/dt + i dphi/dt (blocks, axes) and own harmonics (blocks, axes, MOVED + 1) along a track."""
     for k in range(xs.shape[0]):
         for a in range(len(laws)):
-            law, x = laws[a], xs[k, a * STATES : (a + 1) * STATES]
+            law, x = law_of(laws[a]), xs[k, a * STATES : (a + 1) * STATES]
             stiff, damp = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
             turn = turn_of(law, np.exp(x[LOG]), x[PHASE], signal.w[k, a], stiff, damp, signal.force[k, a])
             rates[k, a] = turn.rate

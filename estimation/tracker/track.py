@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 STIFFNESS_SPREAD = 0.003  # relative: how far a resonance may have moved since its calibration, beside its tolerance
 DAMPING_SPREAD = 0.05
 TREND_SD = 0.3  # of the stiffness [1/s]: 0.3 % within 10 ms
+POSITION_GAIN_SD = 1e-4  # relative: what a position sensor says is what the angle is
 OFFSET_SD = 1.0  # of the readout [V]
 START_WALK = (1e-7, 0.1, 1e-5)  # white phase noise [rad2/s], trend [1/s3], damping [1/s]: where the tuning starts
 LEAST_WALK = (1e-9, 1e-4, 1e-8)
@@ -99,11 +100,14 @@ def starting_belief(prepared: Prepared, device: Device) -> Belief:
     readout, signal = prepared.sense.readout, prepared.signal
     n = STATES * len(prepared.laws) + 1
     x, variance = np.zeros(n), np.zeros(n)
-    own_gain = "a_cir" if isinstance(readout, Amdm) else "gain" if isinstance(readout, Position) else "R_s"
     for a, name in enumerate(prepared.sense.axes):
         at = a * STATES
         x[at + LOG] = np.log(FLOOR * prepared.laws[a].theta0)
-        gain = np.hypot(device.tolerance(name, own_gain), device.tolerance(name, "C0"))
+        if isinstance(readout, Position):
+            gain = POSITION_GAIN_SD
+        else:
+            own = "a_cir" if isinstance(readout, Amdm) else "R_s"
+            gain = np.hypot(device.tolerance(name, own), device.tolerance(name, "C0"))
         variance[at : at + STATES] = np.square([
             LOST[0],
             LOST[1],
@@ -126,7 +130,7 @@ def _listen(signal: Signal, a: int, x: Array) -> bool:
     fitted = np.einsum("kij,kj->ki", unroots, signal.whitened[:count])
     back = np.exp(-1j * signal.main * signal.psi[:count, a]) / signal.passed[:count, i]
     lines = (fitted[:, 1 + 2 * i] - 1j * fitted[:, 2 + 2 * i]) * back
-    variances = signal.noise_var * (unroots[:, 1 + 2 * i] ** 2).sum(axis=1) * np.abs(back) ** 2
+    variances = signal.noise_var[:count] * (unroots[:, 1 + 2 * i] ** 2).sum(axis=1) * np.abs(back) ** 2
     told = variances > 0.0
     blocks = 1
     while blocks <= count:
@@ -176,7 +180,19 @@ def _stretches(signal: Signal) -> list[Signal]:
 
 def window(signal: Signal, first: int, stop: int) -> Signal:
     """Blocks ``first`` up to ``stop`` of a signal."""
-    by_block = ("psi", "w", "force", "passed", "passed_by_w", "tuned", "whitened", "geometry", "known", "known_var")
+    by_block = (
+        "psi",
+        "w",
+        "force",
+        "passed",
+        "passed_by_w",
+        "tuned",
+        "whitened",
+        "geometry",
+        "noise_var",
+        "known",
+        "known_var",
+    )
     return signal._replace(**{name: getattr(signal, name)[first:stop] for name in by_block})
 
 
@@ -187,7 +203,7 @@ def _filtered(
     m, n = len(signal.whitened), start.x.size
     kept = (np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n)))
     live = start.live.copy()
-    told = smoother.run_filter(prepared.laws, signal, start.x.copy(), start.P.copy(), live, walk, OFFSET_WALK, *kept)
+    told = smoother.run_filter(prepared.rows, signal, start.x.copy(), start.P.copy(), live, walk, OFFSET_WALK, *kept)
     return *told, live, kept
 
 
@@ -229,8 +245,8 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     agreement, weight = np.zeros(axes), np.zeros(axes)
     for k, state in enumerate(kept[0]):
         unroot = signal.unroots[signal.geometry[k]]
-        fitted, variances = unroot @ signal.whitened[k], signal.noise_var * (unroot**2).sum(axis=1)
-        told = smoother.expected(prepared.laws, signal, k, state)[0]
+        fitted, variances = unroot @ signal.whitened[k], signal.noise_var[k] * (unroot**2).sum(axis=1)
+        told = smoother.expected(prepared.rows, signal, k, state)[0][0]
         for i, (a, order) in enumerate(signal.lines):
             pair = slice(1 + 2 * i, 3 + 2 * i)
             if order % 2 and (variances[pair] > 0.0).all():
@@ -247,7 +263,7 @@ def _axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, f
     axes = len(prepared.laws)
     rates = np.empty((len(prepared.time), axes), np.complex128)
     moved = np.empty((len(prepared.time), axes, MOVED + 1), np.complex128)
-    smoother.turns(prepared.laws, signal, found.states, rates, moved)
+    smoother.turns(prepared.rows, signal, found.states, rates, moved)
     log, phase = found.states[:, at + LOG], found.states[:, at + PHASE]
     lines = moved[:, i] / np.exp(log)[:, None]
     lines[:, 1] = -1j
@@ -272,9 +288,9 @@ def _axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, f
 def _facts(prepared: Prepared, found: Track, walk: Array) -> dict[str, object]:
     names = ("white_phase", "stiffness_trend", "damping")
     return {
-        "block_s": prepared.signal.width,
+        "block_s": prepared.signal.step,
         "used": prepared.clean,
-        "noise_sd": float(np.sqrt(prepared.signal.noise_var)),
+        "noise_sd": float(np.sqrt(np.median(prepared.signal.noise_var))),
         "mean_squared_innovation": found.chi2,
         "log_likelihood": found.log_likelihood,
         "walk": {

@@ -1,0 +1,373 @@
+"""The tracker: demodulation against least squares, slow flow against the averaged one, tracks against the truth."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import DRIVES, own_electrodes, separate_electrodes, shared_electrode
+
+from estimation.estimate import estimate
+from estimation.signals import reference_of, senses
+from estimation.tracker import track
+from estimation.tracker.angle import SEGMENT, SlowAngle
+from estimation.tracker.blocks import CLIPPED_RUN, basis, project, residual_variance, solved
+from estimation.tracker.orbit import axis_law, turn_of
+from estimation.tracker.signal import prepare
+from estimation.tracker.track import follow, signed, starting_belief, tuned_walk
+from phantoms.forward import Plan, Start, quantised, simulate
+from phantoms.waveforms import Constant, Sequence, Sine
+from scanner import devices
+from scanner.channel import Channel
+from scanner.demodulate import block_phasors
+from scanner.device import Amdm, Device, Drive, Position
+from scanner.drift import Drift, settling
+from scanner.errors import BadInput
+from scanner.motion import AxisMotion
+from scanner.parametric import sine_drive, slow_flow, steady_state
+from scanner.recording import Recording
+
+RATE = 5e6
+
+
+def channel(values: np.ndarray) -> Channel:
+    return Channel("sense", "V", RATE, 0.0, values, 0, values.size)
+
+
+def errors(axis: AxisMotion, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Phase error [rad], modulo pi, and error of ln A of each block but those at an end that the truth cuts short."""
+    assert isinstance(axis.angle, SlowAngle)
+    reference = axis.angle.motion.reference
+    block = round((axis.time[1] - axis.time[0]) * axis.angle.sample_rate)
+    time, z = block_phasors(angle.astype(float), axis.angle.sample_rate, 0.0, reference.frequency, block)
+    assert np.allclose(time, axis.time)
+    error = axis.phase - np.angle(z * np.exp(-1j * reference.phase(time)))
+    return (error + np.pi / 2) % np.pi - np.pi / 2, np.log(axis.amplitude / np.abs(z))
+
+
+def with_sense(recording: Recording, change, device: Device | None = None) -> Recording:  # type: ignore[no-untyped-def]
+    channels = {k: (c.read(), c.unit, c.sample_rate, c.start) for k, c in recording.channels.items()}
+    for name in channels:
+        if name.startswith("sense"):
+            channels[name] = (change(channels[name][0].copy()), *channels[name][1:])
+    return Recording.from_arrays(channels, device or recording.device)
+
+
+# --- demodulation
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    length=st.integers(300, 900),
+    orders=st.lists(st.sampled_from([(0, 2), (0, 4), (1, 1), (1, 2), (1, 3)]), min_size=1, max_size=5, unique=True),
+    frequencies=st.tuples(st.floats(9e3, 3e4), st.floats(3e3, 8e3)),
+    seed=st.integers(0, 1000),
+)
+def test_demodulation_is_least_squares(length, orders, frequencies, seed):  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(seed)
+    lines, tuned = np.array(orders), 2 * np.pi * np.array(frequencies)
+    starts = np.arange(4) * length
+    values = rng.normal(size=4 * length + 7)
+    told = project(channel(values), starts, length, lines, np.tile(tuned, (4, 1)))
+    B = basis(length, RATE, lines, tuned)
+    for k in range(4):
+        y = values[starts[k] : starts[k] + length]
+        assert np.allclose(told.sums[k], B @ y, atol=1e-10)
+        assert told.squares[k] == pytest.approx(y @ y)
+        if np.linalg.cond(B) < 1e4:
+            fit = np.linalg.lstsq(B.T, y, rcond=None)[0]
+            assert np.allclose(solved(told)[k], fit, atol=1e-6 * max(1.0, np.abs(fit).max()))
+
+
+def test_demodulation_leaves_out_what_is_missing_or_clipped() -> None:
+    rng = np.random.default_rng(1)
+    lines, tuned = np.array([(0, 2), (0, 4)]), np.array([2 * np.pi * 13840.0])
+    length = 1000
+    turn = tuned[0] * np.arange(2 * length) / RATE
+    values = 1.0 + np.sin(2 * turn) + rng.normal(0.0, 0.01, turn.size)
+    values[300:500] = np.nan
+    values[length:] = np.minimum(values[length:], 1.7)
+    told = project(channel(values), np.array([0, length]), length, lines, np.tile(tuned, (2, 1)))
+    clipped = int(np.sum(values[length:] == 1.7))
+    assert told.counts[0] == 800
+    assert length - clipped <= told.counts[1] <= length - clipped + 3 * CLIPPED_RUN  # a noisy run's ends stay
+    amplitude = np.hypot(*solved(told)[:, 1:3].T)
+    assert np.allclose(amplitude, 1.0, atol=0.005)
+    assert np.allclose(residual_variance(told), 1e-4, rtol=0.2)
+
+
+def test_demodulation_follows_a_sweep_with_tables_of_its_own() -> None:
+    lines, length, blocks = np.array([(0, 2)]), 1500, 60
+    f = 13840.0 + 1e3 * (np.arange(blocks) + 0.5) / blocks
+    turn = 2 * np.pi * np.cumsum(np.repeat(f, length)) / RATE
+    told = project(channel(np.sin(2 * turn)), np.arange(blocks) * length, length, lines, 2 * np.pi * f[:, None])
+    assert 5 < len(told.grams) < blocks
+    assert np.allclose(np.hypot(*solved(told)[:, 1:3].T), 1.0, atol=0.01)
+
+
+# --- the slow flow
+
+
+@pytest.mark.parametrize("name", ["x", "y"])
+@settings(max_examples=20, deadline=None)
+@given(amplitude=st.floats(0.02, 0.3), phase=st.floats(-3.0, 3.0))
+def test_turn_agrees_with_the_averaged_equations(name: str, amplitude: float, phase: float) -> None:
+    device = devices.load("imaging")
+    axis, drive = device.axis(name), DRIVES[name]
+    assert device.readout is not None
+    m, w = axis.require_mechanics(), np.pi * drive.frequency
+    force = np.array([1350.0, -1800j, -450.0, 0.0])  # of (30 + 30 sin)^2
+    law = axis_law(axis, device.readout)
+    turn = turn_of(law, amplitude, phase, w, m.k, m.b, force)
+    rate_a, rate_p = slow_flow(axis, sine_drive(drive.frequency, 30.0, 30.0), amplitude, phase)
+    scale = 0.01 * w / axis.quality  # the averaged equations leave the motion's own harmonics out
+    assert abs(turn.rate - (rate_a / amplitude + 1j * rate_p)) < scale
+    step = 1e-5
+    by_phase = (
+        turn_of(law, amplitude, phase + step, w, m.k, m.b, force).rate
+        - turn_of(law, amplitude, phase - step, w, m.k, m.b, force).rate
+    ) / (2 * step)
+    by_log = (
+        turn_of(law, amplitude * np.exp(step), phase, w, m.k, m.b, force).rate
+        - turn_of(law, amplitude * np.exp(-step), phase, w, m.k, m.b, force).rate
+    ) / (2 * step)
+    assert abs(turn.by_phase - by_phase) < 0.02 * scale / 0.01
+    assert abs(turn.by_log - by_log) < 0.02 * scale / 0.01
+
+
+def test_harmonics_of_the_motion_are_those_of_the_integrated_one() -> None:
+    _, truth = shared_electrode(0.012, 0.0)
+    device = devices.load("imaging")
+    for name in "xy":
+        axis, f = device.axis(name), 0.5 * DRIVES[name].frequency
+        found = steady_state(axis, sine_drive(2 * f, 30.0, 30.0))
+        assert found is not None
+        assert device.readout is not None
+        m = axis.require_mechanics()
+        force = np.array([1350.0, -1800j, -450.0, 0.0])
+        turn = turn_of(axis_law(axis, device.readout), found[0], found[1], 2 * np.pi * f, m.k, m.b, force)
+        angle = truth[f"angle_{name}"][0].astype(float)[: round(0.01 * RATE)]
+        psi = 2 * np.pi * f * np.arange(angle.size) / RATE
+        columns = [part(n * psi) for n in (1, 3, 5) for part in (np.cos, np.sin)]
+        fitted = np.linalg.lstsq(np.array(columns).T, angle, rcond=None)[0]
+        third = (fitted[2] - 1j * fitted[3]) * np.exp(-3j * (np.angle(fitted[0] - 1j * fitted[1]) + np.pi / 2))
+        assert abs(third - turn.moved[3]) < 0.02 * abs(turn.moved[3])
+
+
+# --- tracks
+
+
+@cache
+def quiet() -> tuple[Recording, dict]:
+    device = devices.load("imaging")
+    assert isinstance(device.readout, Amdm)
+    silent = replace(device, readout=replace(device.readout, noise_var=0.0, bits=None))
+    plan = Plan(DRIVES, 0.03, drift={axis: Drift(settling(-0.002, 0.025)) for axis in "xy"})
+    return simulate(silent, plan)
+
+
+def noisy(seed: int, sd: float = 0.01386) -> Recording:
+    """The quiet recording with a seed's noise: a simulation for each seed would cost a hundred times more."""
+    rng = np.random.default_rng(seed)
+    return with_sense(
+        quiet()[0], lambda y: quantised(y + rng.normal(0.0, sd, y.size), 12, 10.0), devices.load("imaging")
+    )
+
+
+def test_model_is_right_to_two_thousandths_of_a_degree() -> None:
+    rng = np.random.default_rng(0)
+    recording = with_sense(quiet()[0], lambda y: y + rng.normal(0.0, 1e-3, y.size), devices.load("imaging"))
+    motion = estimate(recording, None, "tracker")
+    assert motion.info["sense"]["mean_squared_innovation"] < 1.3  # type: ignore[index]
+    for name, axis in motion.axes.items():
+        phase, log = errors(axis, quiet()[1][f"angle_{name}"][0])
+        assert np.rad2deg(np.sqrt(np.mean(phase[1:-1] ** 2))) < 2e-3
+        assert np.abs(log[1:-1]).max() < 1e-3
+
+
+def test_both_axes_on_one_electrode_to_three_hundredths_of_a_degree() -> None:
+    motion = estimate(noisy(1), None, "tracker")
+    for name, axis in motion.axes.items():
+        phase, log = errors(axis, quiet()[1][f"angle_{name}"][0])
+        assert np.rad2deg(np.sqrt(np.mean(phase**2))) < 0.03
+        assert np.std(log) < 5e-4
+        angle = quiet()[1][f"angle_{name}"][0]
+        miss = np.minimum(np.abs(axis.angle.values - angle).max(), np.abs(axis.angle.values + angle).max())
+        assert miss < 3e-3 * axis.amplitude.mean()
+        assert axis.sign == "ambiguous"
+
+
+def test_intervals_hold_the_truth() -> None:
+    device, held = devices.load("imaging"), []
+    for seed in range(12):
+        motion = track(noisy(seed), device)
+        for name, axis in motion.axes.items():
+            phase, _ = errors(axis, quiet()[1][f"angle_{name}"][0])
+            held.append(np.abs(phase) < 1.96 * axis.phase_sd)
+    assert 0.92 < np.mean(held) < 0.985
+
+
+def test_smoother_is_better_than_the_filter_that_it_starts_from() -> None:
+    device = devices.load("imaging")
+    later, causal = track(noisy(3), device), track(noisy(3), device, causal=True)
+    assert causal.estimator == "tracker-causal"
+    for name in "xy":
+        angle = quiet()[1][f"angle_{name}"][0]
+        rms = [np.sqrt(np.mean(errors(m.axes[name], angle)[0] ** 2)) for m in (later, causal)]
+        assert rms[0] < rms[1] < np.deg2rad(0.08)
+    # at the last block both have seen everything
+    assert later.axes["x"].phase[-1] == pytest.approx(causal.axes["x"].phase[-1], abs=1e-12)
+
+
+def test_calibration_errors_do_not_matter() -> None:
+    device = devices.load("imaging")
+    off = {
+        n: replace(a, mechanics=replace(a.require_mechanics(), k=1.001 * a.mechanics.k, b=1.05 * a.mechanics.b))
+        for n, a in device.axes.items()
+        if a.mechanics
+    }
+    motion = track(noisy(4), replace(device, axes=off))
+    for name, axis in motion.axes.items():
+        phase, _ = errors(axis, quiet()[1][f"angle_{name}"][0])
+        assert np.rad2deg(np.sqrt(np.mean(phase**2))) < 0.03
+
+
+def test_gap_is_bridged_and_its_uncertainty_grows() -> None:
+    def gap(y: np.ndarray) -> np.ndarray:
+        y[60_000:90_000] = np.nan
+        return y
+
+    motion = track(with_sense(noisy(5), gap), devices.load("imaging"))
+    for name, axis in motion.axes.items():
+        phase, _ = errors(axis, quiet()[1][f"angle_{name}"][0])
+        inside = (axis.time > 0.012) & (axis.time < 0.018)
+        assert np.abs(phase[inside]).max() < np.deg2rad(0.15)
+        assert axis.phase_sd[inside].max() > 1.5 * np.median(axis.phase_sd[~inside])
+        assert np.mean(np.abs(phase) < 3 * axis.phase_sd) > 0.97
+
+
+def test_clipped_tops_are_bridged() -> None:
+    motion = track(with_sense(noisy(6), lambda y: np.clip(y, *np.quantile(y, [0.15, 0.85]))), devices.load("imaging"))
+    assert motion.info["sense"]["used"] < 0.85  # type: ignore[index]
+    for name, axis in motion.axes.items():
+        phase, _ = errors(axis, quiet()[1][f"angle_{name}"][0])
+        assert np.rad2deg(np.sqrt(np.mean(phase**2))) < 0.05
+
+
+def test_axes_with_their_own_electrodes() -> None:
+    recording, truth = separate_electrodes()
+    motion = estimate(recording, own_electrodes(), "tracker")
+    for name, axis in motion.axes.items():
+        phase, _ = errors(axis, truth[f"angle_{name}"][0])
+        assert np.rad2deg(np.sqrt(np.mean(phase**2))) < 0.03
+
+
+def test_sign_is_known_where_the_combs_are_off_centre() -> None:
+    device = devices.load("imaging")
+    axes = {n: replace(a, capacitance=replace(a.require_capacitance(), theta_th=0.004)) for n, a in device.axes.items()}
+    device = replace(device, axes=axes)
+    recording, truth = simulate(device, Plan(DRIVES, 0.01))
+    motion = track(recording, device)
+    for name, axis in motion.axes.items():
+        assert axis.sign == "known: the combs' offset theta_th"
+        angle = truth[f"angle_{name}"][0]
+        assert np.corrcoef(axis.angle.values, angle)[0, 1] > 0.999
+        assert np.allclose(axis.angle.turned().values, -axis.angle.values, atol=1e-12)
+
+
+def test_drive_that_stops_and_starts() -> None:
+    device = own_electrodes()
+    device = replace(device, axes={"x": device.axis("x")}, scan=None)
+    drive = Sequence(((DRIVES["x"], 0.01), (Constant(0.0), 0.004), (DRIVES["x"], 0.016)))
+    recording, truth = simulate(device, Plan({"x": drive}, 0.03))
+    axis = track(recording, device).axes["x"]
+    angle = truth["angle_x"][0]
+    miss = axis.angle.values - angle
+    if np.abs(miss).max() > np.abs(angle).max():
+        miss = axis.angle.values + angle
+    assert np.abs(miss).max() < 0.1 * np.abs(angle).max()  # in the block that the drive stops in
+    on = np.arange(angle.size) / RATE < 0.009
+    assert np.abs(miss[on]).max() < 2e-3 * np.abs(angle).max()
+
+
+def test_free_decay_seen_by_a_transimpedance_readout() -> None:
+    device = devices.load("chen2019")
+    plan = Plan({"x": Constant(10.0)}, 0.06, sample_rate=5e5, sense_range=20.0)
+    recording, truth = simulate(device, plan, start={"x": Start(0.15, 0.0)})
+    channels = {
+        "sense_x": (recording["sense_x"].read(), "V", 5e5, 0.0),
+        "bias_x": (np.full(recording["sense_x"].size, 10.0), "V", 5e5, 0.0),
+    }
+    axis = track(Recording.from_arrays(channels, device), device).axes["x"]
+    assert axis.reference == "absolute"
+    angle = truth["angle_x"][0]
+    assert np.sqrt(np.mean((axis.angle.values - angle) ** 2)) < 5e-3 * np.sqrt(np.mean(angle**2))
+
+
+def test_position_readout_and_linear_drive() -> None:
+    axis = devices.load("chen2020-driven").axis("x")
+    axis = replace(axis, drive=Drive("linear", 1e-9), readout=Position(gain=10.0, noise_sd=0.01), capacitance=None)
+    device = Device("linear", {"x": axis})
+    plan = Plan({"x": Sine(15500.0, 10.0)}, 0.02, 1e6, settle=0.02, drift={"x": Drift(settling(-0.002, 0.025))})
+    recording, truth = simulate(device, plan)
+    found = track(recording, device).axes["x"]
+    assert found.sign == "known: position readout"
+    angle = truth["angle_x"][0]
+    assert np.sqrt(np.mean((found.angle.values - angle) ** 2)) < 2e-3 * np.abs(angle).max()
+
+
+# --- the angle
+
+
+def test_angle_of_any_part_equals_the_whole() -> None:
+    axis = track(noisy(7), devices.load("imaging")).axes["x"]
+    whole = axis.angle.values
+    assert whole.size == axis.angle.size == 150_000
+    for first, stop in ((0, 1), (3, 3 + SEGMENT), (1_234, 77_777), (149_990, 150_000)):
+        assert np.allclose(axis.angle.read(first, stop), whole[first:stop], rtol=0.0, atol=5e-8)
+
+
+def test_angle_equals_the_sine_that_it_stands_for() -> None:
+    axis = track(noisy(7), devices.load("imaging")).axes["y"]
+    assert isinstance(axis.angle, SlowAngle)
+    time = np.arange(axis.angle.size) / RATE
+    phase, lines = axis.angle.motion.at(time)
+    direct = (lines * np.exp(1j * phase[:, None] * np.array([1, 3, 5]))).real.sum(axis=1)
+    assert np.abs(axis.angle.values - direct).max() < 1e-8
+
+
+# --- input that cannot be used
+
+
+def test_no_motion_is_refused_in_one_line() -> None:
+    rng = np.random.default_rng(0)
+    still = with_sense(shared_electrode()[0], lambda y: rng.normal(0.0, 0.014, y.size))
+    with pytest.raises(BadInput, match="shows no motion of axis x"):
+        track(still, devices.load("imaging"))
+
+
+def test_no_samples_are_refused() -> None:
+    empty = with_sense(shared_electrode()[0], lambda y: np.full(y.size, np.nan))
+    with pytest.raises(BadInput, match="no sample that can be used"):
+        track(empty, devices.load("imaging"))
+
+
+def test_windows_give_what_one_pass_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = devices.load("imaging")
+    recording = noisy(8)
+    (sense,) = senses(recording, device)
+    references = {n: reference_of(recording, device, n, sense.channel, True) for n in sense.axes}
+    prepared = prepare(recording, device, sense, references)
+    start, _ = signed(prepared, starting_belief(prepared, device))
+    walk = tuned_walk(prepared, start)
+    whole = follow(prepared, start, walk)
+    module = sys.modules["estimation.tracker.track"]
+    monkeypatch.setattr(module, "WINDOW", 10)
+    monkeypatch.setattr(module, "LAG", 35)
+    pieces = follow(prepared, start, walk)
+    assert (np.abs(pieces.states - whole.states) < 0.1 * whole.sds)[:, [0, 6]].all()
