@@ -24,9 +24,9 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     sections = [_overview(diagnosis), *(_finding_section(f, i) for i, f in enumerate(diagnosis.findings))]
     sections.append(_residuals(diagnosis))
     if diagnosis.search.rounds:
-        text = "What -2 log evidence gained over doing without; 10 is certain, a lead of 6 names alone."
+        text = "Distances in -2 log evidence: 10 over nothing is certain, a lead of 6 over the next names alone."
         rows = evidence_table(diagnosis.search.rounds)
-        sections.append(Section("Candidates", text, Table(["effect", "gain", "held-out χ²"], rows)))
+        sections.append(Section("Candidates", text, Table(["effect", "behind", "over nothing"], rows)))
     sections.append(_nominal(diagnosis))
     notes = [diagnosis.unexplained] if diagnosis.unexplained else []
     return render("Diagnosis", lead, sections, notes)
@@ -136,12 +136,12 @@ def _nominal(diagnosis: Diagnosis) -> Section:
 
 
 def evidence_table(rounds: Sequence[Round]) -> list[list[str]]:
-    """Every candidate that was fitted: what its -2 log evidence gained over doing without."""
-    return [
-        [fit.model.candidates[-1].key, f"{each.before.evidence - fit.evidence:.1f}", f"{fit.held_chi2:.3f}"]
-        for each in rounds
-        for fit in (each.after, *each.rivals)
-    ]
+    """Every effect found and its rivals: how far each lies behind in -2 log evidence."""
+    rows = []
+    for each in rounds:
+        rows.append([each.candidate.key, "0", f"{each.before.evidence - each.after.evidence:.1f}"])
+        rows += [[other.key, f"{lead:.1f}", ""] for lead, other in each.leads]
+    return rows
 
 
 def _figure(draw: Callable[[Axes], None], caption: str) -> Figure:

@@ -15,7 +15,7 @@ from scanner.device import Amdm, Axis, Position, Readout
 from scanner.errors import BadInput
 from scanner.laws import amdm_voltage, capacitance, capacitance_slope, position_voltage, transimpedance_voltage
 from scanner.lowpass import lowpass, step_coefficients
-from scanner.terms import STAGES, Term, View, catalogue
+from scanner.terms import STAGES, Term, View, catalogue, shifted
 from scanner.trajectory import Bell, Torque, integrate
 
 Array = NDArray[np.float64]
@@ -140,9 +140,7 @@ def sense(readout: Readout, added: Sequence[Added], paths: Sequence[Path], input
             for each in added:
                 if each.term.modulate is not None:
                     signal = each.term.modulate(signal, each.values, _view(paths[0], inputs, readout))
-            for corner in readout.lpf_hz:
-                lowpass(signal, *step_coefficients(corner, inputs.step), signal[0], signal[0])
-            signal = amdm_voltage(signal, readout.a_cir, readout.b_cir)
+            signal = amdm_voltage(_demodulated(signal, readout, inputs.step), readout.a_cir, readout.b_cir)
         case Position():
             signal = position_voltage(paths[0].angle, readout.gain, readout.offset)
         case _:
@@ -150,6 +148,16 @@ def sense(readout: Readout, added: Sequence[Added], paths: Sequence[Path], input
             path = paths[0]
             signal = transimpedance_voltage(_comb_slope(path, added), path.rate, readout.R_s, path.voltage)
     return output("sense", signal, added, paths[0], inputs, readout)
+
+
+def _demodulated(signal: Array, readout: Amdm, step: float) -> Array:
+    """The capacitance behind the sections, stepped twice a sample: their step takes its input for linear in between."""
+    dense = np.empty(2 * signal.size - 1)
+    dense[::2] = signal
+    dense[1::2] = shifted(signal, 0.5)[:-1]
+    for corner in readout.lpf_hz:
+        lowpass(dense, *step_coefficients(corner, 0.5 * step), dense[0], dense[0])
+    return dense[::2].copy()
 
 
 def reference(added: Sequence[Added], path: Path, inputs: Inputs) -> Array:

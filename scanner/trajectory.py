@@ -10,10 +10,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numba import NumbaExperimentalFeatureWarning, njit, types
+from numba.experimental.function_type import _get_wrapper_address
 from numpy.typing import NDArray
 
 from scanner.device import Axis
@@ -136,7 +138,7 @@ class Bell:
     def along(self, angle: Array, axis: Axis) -> Array:
         """Extra capacitance [F] and slope [F/rad] at every angle (n,), shape (2, n)."""
         out = np.empty((2, angle.size))
-        _fill_bell(self.law, angle, np.asarray(self.parameters, float), nominal_values(axis), out)
+        _fill_bell(_address(self.law), angle, np.asarray(self.parameters, float), nominal_values(axis), out)
         return out
 
 
@@ -189,10 +191,29 @@ def integrate(
     return angle, rate
 
 
-def _filled(laws: list[Callable[..., Any]], nothing: Callable[..., Any]) -> tuple[Callable[..., Any], ...]:
+class _Address(types.WrapperAddressProtocol):  # type: ignore[misc]
+    """A compiled law by its address: asking numba for it anew at every call would cost more than the integration."""
+
+    def __init__(self, law: Callable[..., Any]):
+        self._signature = law.nopython_signatures[0]  # type: ignore[attr-defined]
+        self._address = _get_wrapper_address(law, self._signature)
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+    def signature(self) -> Any:
+        return self._signature
+
+
+@cache
+def _address(law: Callable[..., Any]) -> _Address:
+    return _Address(law)
+
+
+def _filled(laws: list[Callable[..., Any]], nothing: Callable[..., Any]) -> tuple[_Address, ...]:
     if len(laws) > SLOTS:
         raise ValueError(f"{len(laws)} terms of one stage, the trajectory has room for {SLOTS}")
-    return (*laws, *[nothing] * (SLOTS - len(laws)))
+    return tuple(_address(law) for law in (*laws, *[nothing] * (SLOTS - len(laws))))
 
 
 def _table(rows: Sequence[Sequence[float]]) -> Array:

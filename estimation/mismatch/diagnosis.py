@@ -149,24 +149,19 @@ def judged(found: Search) -> Diagnosis:
 def _finding(found: Search, each: Round) -> Finding:
     candidate = each.candidate
     unknown = candidate.term.effect in FREE
-    best = each.after.evidence
-    options: dict[str, float] = {}
-    for fit in (each.after, *each.rivals):
-        name = _name(fit.model.candidates[-1])
-        options[name] = max(options.get(name, 0.0), float(np.exp(-0.5 * min(fit.evidence - best, 1400.0))))
-    nothing = float(np.exp(-0.5 * min(each.before.evidence - best, 1400.0)))
-    total = sum(options.values()) + nothing
     effect = _name(candidate)
+    options = {effect: 1.0}
+    for lead, other in each.leads:
+        name = _name(other)
+        options[name] = max(options.get(name, 0.0), float(np.exp(-0.5 * np.clip(lead, 0.0, 1400.0))))
+    nothing = float(np.exp(-0.5 * np.clip(each.before.evidence - each.after.evidence, 0.0, 1400.0)))
+    total = sum(options.values()) + nothing
     rivals = tuple(
         Rival(name, weight / total)
         for name, weight in sorted(options.items(), key=lambda item: -item[1])
         if name != effect and weight / total > 1e-4
     )
-    close = [
-        fit.model.candidates[-1]
-        for fit in each.rivals
-        if fit.evidence - best < LEAD_OVER_NEXT and _name(fit.model.candidates[-1]) != effect
-    ]
+    close = [other for lead, other in each.leads if lead < LEAD_OVER_NEXT and _name(other) != effect]
     advice = "; ".join(
         f"{other.term.effect}: {text}"
         for other in close
@@ -180,7 +175,7 @@ def _finding(found: Search, each: Round) -> Finding:
         effect=effect,
         equation=candidate.term.equation,
         parameters=() if unknown else estimates(found.final, candidate),
-        where=where(found.comparison, each.before, each.after),
+        where=where(found.comparison, candidate, each.before, each.after),
         probability=options[effect] / total,
         rivals=rivals,
         heldout={"metric": METRIC, "before": each.before.held_chi2, "after": found.final.held_chi2},

@@ -98,7 +98,7 @@ class Comparison:
         first = 0
         for r, (run, whiteners) in enumerate(zip(self.runs, self.whiteners, strict=True)):
             for output, whiten in zip(run.outputs, whiteners, strict=True):
-                for i, values in model.basis[(r, output.name)]:
+                for i, values in zip(*model.basis[(r, output.name)], strict=True):
                     key = (r, output.name, model.free[i].name, stop)
                     if key not in self._whitened:
                         shown = -values.copy()
@@ -133,6 +133,7 @@ def solve(
     turns: int = 12,
     steps: Array | None = None,
     tolerance: float = 0.05,
+    hopeless: float = np.inf,
 ) -> Fit:
     """Levenberg-Marquardt on the fitted samples up to the fraction ``stop`` of the recordings.
 
@@ -141,6 +142,7 @@ def solve(
         turns: Jacobians at most.
         steps: difference steps, adapted in place.
         tolerance: stop when a step lowers chi-square by less.
+        hopeless: stop when chi-square is still above and no longer comes down towards it.
     """
     steps = np.full(x.size, 1e-4) if steps is None else steps
     rows = comparison.rows & (comparison.time < stop - (0.02 * stop if stop < 1.0 else -1.0))
@@ -165,7 +167,7 @@ def solve(
             if gradient @ -step < 0.1 * tolerance:
                 break
             damping *= 6.0
-        last = gain < tolerance or turn == turns - 1
+        last = gain < tolerance or turn == turns - 1 or (turn >= 4 and gain < 0.2 * (value - hopeless))
         if gain > 0.0 or turn == 0:
             jacobian = comparison.jacobian(model, x, residual, steps, stop)
         if last:

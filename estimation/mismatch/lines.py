@@ -34,7 +34,7 @@ def strongest_foreign_line(fit: Fit) -> float | None:
             duration = rest.size * output.step
             frequency = np.arange(power.size) / duration
             motion = run.scales[output.axes[0]].rate / (2 * np.pi)
-            lines = [0.0, *(motion * np.arange(1, 20)), *run.lines[output.axes[0]]]
+            lines = [*(motion * np.arange(1, 20)), *run.lines[output.axes[0]]]
             width = 0.06 * motion if run.lines[output.axes[0]].size < 200 else 4.0 / duration
             ratio = power / noise_psd(rest, power.size, output.step, lines, width)
             ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,20 +79,18 @@ class Model:
         free: what x holds, in order.
     """
 
-    def __init__(self, runs: Sequence[Run], device: Device, candidates: Sequence[Candidate] = ()):
+    def __init__(
+        self, runs: Sequence[Run], device: Device, candidates: Sequence[Candidate] = (), mains: Sequence[float] = MAINS
+    ):
         self.runs, self.device, self.candidates = tuple(runs), device, tuple(candidates)
+        self.mains = tuple(mains)
         self.given = {name: added_terms(axis) for name, axis in device.axes.items()}
         self.axes = tuple(name for name in device.axes if any(name in run.inputs for run in runs))
         self.free = tuple(self._free())
         self.precision = np.array([each.precision for each in self.free])
         self._where = {(f.kind, f.owner, f.name, f.run): i for i, f in enumerate(self.free)}
         self.basis = {
-            (r, output.name): [
-                (self._where[("additive", output.name, name, r)], values)
-                for name, values in self.additives(output).items()
-            ]
-            for r, run in enumerate(self.runs)
-            for output in run.outputs
+            (r, output.name): self._basis(r, output) for r, run in enumerate(self.runs) for output in run.outputs
         }
         self._paths: dict[tuple[object, ...], Path] = {}
 
@@ -120,12 +119,17 @@ class Model:
             found["offset"] = np.full(output.data.size, OFFSET_SD * output.data.std())
         if output.kind == "sense":
             noise = output.noise_sd or 0.0
-            turn = 2 * np.pi * output.step * np.arange(output.data.size)
-            for mains in MAINS:
-                for multiple in range(1, HUM_MULTIPLES + 1):
-                    size, f = HUM_SD * noise / multiple, mains * multiple
-                    found[f"cos {f:g} Hz"], found[f"sin {f:g} Hz"] = size * np.cos(f * turn), size * np.sin(f * turn)
+            for mains in self.mains:
+                found |= {
+                    name: HUM_SD * noise * values for name, values in _hum(mains, output.data.size, output.step).items()
+                }
         return found
+
+    def _basis(self, r: int, output: Output) -> tuple[list[int], Array]:
+        """Where the additives of a channel stand in x, and their shapes, (q, n)."""
+        shapes = self.additives(output)
+        at = [self._where[("additive", output.name, name, r)] for name in shapes]
+        return at, np.stack(list(shapes.values())) if shapes else np.zeros((0, output.data.size))
 
     def index(self, kind: str, owner: str, name: str, run: int = -1) -> int | None:
         """Place in x of one free number, None where the model has no such."""
@@ -239,16 +243,27 @@ class Model:
         gain = self.index("gain", output.name, "gain", r)
         if gain is not None:
             signal = signal * (1.0 + REFERENCE_GAIN_SD * x[gain])
-        basis = self.basis[(r, output.name)]
-        if not basis:
+        at, shapes = self.basis[(r, output.name)]
+        if not np.any(x[at]):
             return signal
-        return signal + sum(x[i] * values[: signal.size] for i, values in basis)
+        return signal + x[at] @ shapes[:, : signal.size]
 
     def embed(self, other: Model, x: Array) -> Array:
         """``x`` of another model in this one's order; what the other lacks is zero."""
         return np.array(
             [0.0 if (i := other.index(f.kind, f.owner, f.name, f.run)) is None else x[i] for f in self.free]
         )
+
+
+@lru_cache(maxsize=16)
+def _hum(mains: float, n: int, step: float) -> dict[str, Array]:
+    """Quadratures of the mains' first multiples, the higher the weaker."""
+    turn = 2 * np.pi * step * np.arange(n)
+    return {
+        f"{name} {mains * multiple:g} Hz": wave(mains * multiple * turn) / multiple
+        for multiple in range(1, HUM_MULTIPLES + 1)
+        for name, wave in (("cos", np.cos), ("sin", np.sin))
+    }
 
 
 def nominal_parameters(device: Device, axis: str) -> list[tuple[str, float | tuple[float, ...], float]]:

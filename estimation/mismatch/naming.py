@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Comparison, Fit, solve
-from estimation.mismatch.model import Candidate
-from estimation.mismatch.screen import Screened, screen
+from estimation.mismatch.model import Candidate, Model
+from estimation.mismatch.screen import screen
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,14 @@ TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
 
 FINALISTS = 6
+STARTERS = 12
+
+MANY_SAMPLES = 1500
+"""From here on only ``STARTERS`` start: over a window so short that it has fewer, all may, and cost little."""
+
+HOPELESS = 2000.0
+"""A fit that is this far behind another's evidence after a few turns is not polished."""
+
 Progress = Callable[[str], None]
 
 
@@ -61,23 +69,29 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], thr
     return sorted((fit for fit in fits if possible(fit)), key=lambda fit: fit.evidence)
 
 
-def race(comparison: Comparison, early: Fit, stops: Sequence[float], candidates: Sequence[Candidate]) -> list[Fit]:
-    """Fits of candidates that grow window by window from where the nominal model could still follow; laggards drop out.
+def race(
+    comparison: Comparison, nominal: Model, early: Fit, stops: Sequence[float], candidates: Sequence[Candidate]
+) -> list[Fit]:
+    """Fits of candidates that grow window by window from where the nominal model begins to fail; laggards drop out.
 
-    A nominal model that has lost the motion's phase is nothing to linearise around: the candidates start where it held.
+    A nominal model that has lost the motion's phase is nothing to linearise around, the one that is about to is: first
+    order there says who may start.
     """
-    base = solve(comparison, early.model, early.x, stops[0], 8)
-    field: list[Screened] = [screen(comparison, base, each, stops[0]) for each in candidates]
-    running = [(each.model, each.x, np.full(each.x.size, 1e-4)) for each in field]
+    base = solve(comparison, nominal, nominal.embed(early.model, early.x), stops[0], 8)
+    field = sorted((screen(comparison, base, each, stops[0]) for each in candidates), key=lambda each: -each.gain)
+    few = base.rows.sum() > MANY_SAMPLES
+    starters = [each for i, each in enumerate(field) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
+    running = [(each.model, each.x) for each in starters]
     fits: list[Fit] = []
     for stop in stops:
         turns, tolerance = (14, 0.05) if stop == stops[-1] else (6, 1.0)
-        fits = [solve(comparison, model, x, stop, turns, steps, tolerance) for model, x, steps in running]
+        fits = []
+        for model, x in running:
+            best = min((fit.evidence for fit in fits if possible(fit)), default=np.inf)
+            fits.append(solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS))
         fits.sort(key=lambda fit: fit.evidence if possible(fit) else np.inf)
         best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
         margin = max(60.0, 0.5 * (worst - best))
         kept = [fit for fit in fits if fit.evidence < best + margin]
-        if stop * 4 > stops[-1]:
-            kept = kept[:FINALISTS]
-        running = [(fit.model, fit.x, np.full(fit.x.size, 1e-4)) for fit in kept]
+        running = [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
     return [fit for fit in fits if possible(fit)]

@@ -60,7 +60,7 @@ def starts(candidate: Candidate) -> list[tuple[float, ...]]:
 
 def screen(comparison: Comparison, base: Fit, candidate: Candidate, stop: float = 1.0) -> Screened:
     """The best start of a candidate by first order around ``base``."""
-    model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate))
+    model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
     rows = base.rows & (comparison.time < stop)
     best: Screened | None = None
     for grid in starts(candidate):
@@ -89,6 +89,8 @@ def _first_order(comparison: Comparison, base: Fit, candidate: Candidate, model:
             moved[i] += delta
             columns[:, j] = (comparison.residual(model, moved, stop) - base.residual) / delta
             size = np.linalg.norm(columns[rows, j])
+            if 0.05 < size * delta < 20.0:
+                break
             delta = float(np.clip(1.0 / size if size else 1e-2, 1e-6, 0.1))
     gain, estimate = _gain(base, columns, rows)
     x = x.copy()

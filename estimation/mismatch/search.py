@@ -31,21 +31,18 @@ CLOSE = 80.0
 
 @dataclass(frozen=True)
 class Round:
-    """One effect found: the fit with it, and the rivals that were tried in its place.
+    """One effect found: the fits without and with it, and the rivals that were tried in its place.
 
     Attributes:
-        before, after: fits without and with it, under the same noise.
-        rivals: other fits in its place, best first, under the same noise.
+        candidate: what was added.
+        before, after: fits without and with it, all else that was found in both, under the same noise.
+        leads: its rivals when it was found, each with its distance behind in -2 log evidence.
     """
 
+    candidate: Candidate
     before: Fit
     after: Fit
-    rivals: tuple[Fit, ...]
-
-    @property
-    def candidate(self) -> Candidate:
-        """What was added."""
-        return self.after.model.candidates[-1]
+    leads: tuple[tuple[float, Candidate], ...]
 
 
 @dataclass(frozen=True)
@@ -78,9 +75,9 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     comparison = Comparison(runs, first_whiteners(model))
     early = grown(comparison, model, started(comparison, model, stops[0]).x, stops)
     comparison = Comparison(runs, measured_whiteners(model, early[-1].x))
-    best = solve(comparison, model, early[-1].x)
+    best = with_hum(comparison, solve(comparison, model, early[-1].x))
     nominal = best
-    rounds: list[Round] = []
+    rivals: dict[str, tuple[tuple[float, Candidate], ...]] = {}
     for number in range(MOST_EFFECTS):
         best = with_line(comparison, best)
         candidates = all_candidates(device, best.model, [*terms.values(), *FREE.values()])
@@ -90,7 +87,7 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
         if number or best.chi2 < TRACKED * best.rows.sum():
             fits = near(comparison, best, candidates)
         else:
-            fits = race(comparison, *_held_on(early, stops), candidates)
+            fits = race(comparison, best.model, *_failed(early, stops), candidates)
         if not fits or best.evidence - fits[0].evidence < LEAD_OVER_NOTHING:
             break
         say(f"refit with {fits[0].model.candidates[-1].key}")
@@ -98,16 +95,59 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
         close = [solve(comparison, fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + CLOSE][:6]
         close = sorted((fit for fit in close if possible(fit)), key=lambda fit: fit.evidence)
         before = solve(comparison, best.model, best.x, turns=4)
-        nominal = before if not rounds else solve(comparison, nominal.model, nominal.x, turns=4)
+        nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
         close = [fit for fit in close if convincing(before, fit)]
         if not close:
             best = before
             break
-        rounds.append(Round(before, close[0], tuple(close[1:])))
-        best = close[0]
+        rivals[close[0].model.candidates[-1].key] = tuple(
+            (fit.evidence - close[0].evidence, fit.model.candidates[-1]) for fit in close[1:]
+        )
+        best = needed_only(comparison, close[0])
         if best.model.candidates[-1].term.effect in FREE:
             break
-    return Search(comparison, nominal, best, tuple(rounds))
+    rounds = tuple(_round(comparison, nominal, best, each, rivals.get(each.key, ())) for each in best.model.candidates)
+    return Search(comparison, nominal, best, rounds)
+
+
+def needed_only(comparison: Comparison, fit: Fit) -> Fit:
+    """The fit without the terms that a later one has made superfluous.
+
+    A near relative may stand in for the true effect until that one is there to be chosen beside it.
+    """
+    for each in fit.model.candidates[:-1]:
+        less = without(comparison, fit, each)
+        if less.evidence - fit.evidence < LEAD_OVER_NOTHING:
+            return needed_only(comparison, less)
+    return fit
+
+
+def without(comparison: Comparison, fit: Fit, candidate: Candidate) -> Fit:
+    """The fit refitted with one of its terms taken out."""
+    kept = [each for each in fit.model.candidates if each is not candidate]
+    model = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
+    return solve(comparison, model, model.embed(fit.model, fit.x))
+
+
+def _round(
+    comparison: Comparison,
+    nominal: Fit,
+    best: Fit,
+    candidate: Candidate,
+    leads: tuple[tuple[float, Candidate], ...],
+) -> Round:
+    """What one term of the final fit does there."""
+    alone = len(best.model.candidates) == 1
+    return Round(candidate, nominal if alone else without(comparison, best, candidate), best, leads)
+
+
+def with_hum(comparison: Comparison, fit: Fit) -> Fit:
+    """The fit with hum of the one mains frequency that the recordings show, or of none."""
+    fits = []
+    for mains in ((), *((each,) for each in fit.model.mains)):
+        model = Model(fit.model.runs, fit.model.device, fit.model.candidates, mains)
+        fits.append(solve(comparison, model, model.embed(fit.model, fit.x), turns=3))
+    return min(fits, key=lambda each: each.evidence)
 
 
 def with_line(comparison: Comparison, fit: Fit) -> Fit:
@@ -119,14 +159,14 @@ def with_line(comparison: Comparison, fit: Fit) -> Fit:
         replace(run, scales={axis: replace(scales, line=line) for axis, scales in run.scales.items()})
         for run in fit.model.runs
     )
-    model = Model(runs, fit.model.device, fit.model.candidates)
+    model = Model(runs, fit.model.device, fit.model.candidates, fit.model.mains)
     return replace(fit, model=model)
 
 
-def _held_on(early: Sequence[Fit], stops: Sequence[float]) -> tuple[Fit, Sequence[float]]:
-    """The last window over which the nominal model still followed the motion, and the windows from there on."""
+def _failed(early: Sequence[Fit], stops: Sequence[float]) -> tuple[Fit, Sequence[float]]:
+    """The first window over which the nominal model follows the motion worse than before, and those from there on."""
     levels = [fit.chi2 / fit.rows.sum() for fit in early]
-    last = 0
-    while last + 1 < len(levels) and levels[last + 1] < 2.0 * min(levels[: last + 1]):
-        last += 1
-    return early[last], stops[last:]
+    first = 0
+    while first + 1 < len(levels) and levels[first] < 2.0 * min([TRACKED, *levels[:first]]):
+        first += 1
+    return early[first], stops[first:]

@@ -43,7 +43,8 @@ def measured_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
     for run, signals in zip(model.runs, model.outputs(x), strict=True):
         row = []
         for output, signal in zip(run.outputs, signals, strict=True):
-            lines, width = [0.0], 0.0
+            lines: list[float] = []
+            width = 0.0
             for axis in output.axes:
                 motion = run.scales[axis].rate / (2 * np.pi)
                 lines = [*lines, *(motion * np.arange(1, HARMONICS + 1)), *run.lines[axis]]

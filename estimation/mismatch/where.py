@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Comparison, Fit
 from estimation.mismatch.free import POWERS
+from estimation.mismatch.model import Candidate
 
 Array = NDArray[np.float64]
 
@@ -50,9 +51,8 @@ def excess_by_harmonic(comparison: Comparison, before: Fit, after: Fit, count: i
     return {n: max(v, 0.0) / total for n, v in found.items()}
 
 
-def where(comparison: Comparison, before: Fit, after: Fit) -> str:
+def where(comparison: Comparison, candidate: Candidate, before: Fit, after: Fit) -> str:
     """In words and numbers: stage, channels, time and harmonics that carried the misfit."""
-    candidate = after.model.candidates[-1]
     place = f"{candidate.term.stage} of axis {candidate.axis}"
     channels = excess_by_channel(comparison, before, after)
     total = sum(max(v, 0.0) for v in channels.values())
