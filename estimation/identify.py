@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.demodulate import block_length, block_phasors
-from scanner.device import Axis, Capacitance, Mechanics
+from scanner.device import Amdm, Axis, Capacitance, Mechanics, Position, Transimpedance
 from scanner.errors import BadInput
 from scanner.integrate import rk4
 from scanner.laws import capacitance, capacitance_slope, electrostatic_torque
@@ -249,13 +249,88 @@ def readout_from_driven(
 
 @dataclass(frozen=True)
 class Profile:
-    """The capacitance's Gaussian profile from a sense signal and a reference angle.
+    """The capacitance's bell from a sense signal and a reference angle (chen2020 fig 7b, chen2019 fig 4b).
 
     Attributes:
-        values: ``theta0``, ``theta_th`` [rad], ``delay`` of the sense signal against the angle [s], and the linear
-            ones: ``C0`` [F] of a transimpedance readout, ``a_cir`` [V/F] and ``b_cir`` [V] of an AMDM one.
+        values: ``theta0``, ``theta_th`` [rad], ``delay`` of the sense signal against the angle [s]; ``C0`` [F] behind a
+            transimpedance readout, ``a_cir`` [V/F] and ``b_cir`` [V] behind an AMDM one, which sees C0 only times
+            a_cir.
         residual_sd: of the fit [V].
     """
 
     values: Mapping[str, Value]
     residual_sd: float
+
+
+def profile(axis: Axis, angle: Array, sense: Array, rate: float, frequency: float) -> Profile:
+    """Fit the bell, the readout's linear constants and the delay between the two channels.
+
+    The angle is smoothed over a twelfth of a cycle first; its noise would otherwise flatten the bell.
+
+    Args:
+        axis: nominal, with an AMDM or a transimpedance readout. angle: [rad], sense: [V], at the same samples, shape
+        (n,). rate: [Hz]. frequency: of the motion [Hz].
+
+    Raises:
+        BadInput: a position readout, which has no bell.
+    """
+    from scipy.optimize import least_squares
+    from scipy.signal import savgol_filter
+
+    comb, readout = axis.require_capacitance(), axis.require_readout()
+    if isinstance(readout, Position):
+        raise BadInput("a position readout does not see the capacitance", channel=f"sense_{axis.name}")
+    window = max(7, 2 * round(rate / frequency / 24) + 1)
+    theta = savgol_filter(angle, window, min(4, window - 2))
+    omega = savgol_filter(angle, window, min(4, window - 2), deriv=1, delta=1 / rate)
+    quarter = round(0.25 * rate / frequency)
+    edge = slice(window + quarter + round(1e-4 * rate), -window - quarter)
+    sections = readout.lpf_hz if isinstance(readout, Amdm) else ()
+    samples = np.arange(theta.size)
+    y = sense[edge]
+
+    def fitted(x: Array) -> tuple[Array, Array, Array]:
+        theta0, theta_th, late = x * scale
+        at = samples - late * rate
+        u = (np.interp(at, samples, theta) - theta_th) / theta0
+        bell = np.exp(-u * u)
+        if isinstance(readout, Transimpedance):
+            slope = -2.0 * u / theta0 * bell * np.interp(at, samples, omega)
+            basis = -readout.R_s * readout.V_bias * slope[edge, None]
+        else:
+            for cutoff in sections:
+                lowpass(bell, *step_coefficients(cutoff, 1 / rate), bell[0], bell[0])
+            basis = np.stack([bell, np.ones_like(bell)], axis=1)[edge]
+        linear, covariance = linear_fit(basis, y)
+        return basis @ linear - y, linear, covariance
+
+    scale = np.array([comb.theta0, comb.theta0, 0.01 / frequency])
+    delays = (
+        np.arange(-quarter, quarter + 1, max(1, quarter // 12)) / rate
+    )  # a wrong half cycle would be a local minimum
+    starts = [np.array([1.0, comb.theta_th / comb.theta0, late / scale[2]]) for late in delays]
+    start = min(starts, key=lambda x: float(np.square(fitted(x)[0]).sum()))
+    solution = least_squares(lambda x: fitted(x)[0], start, diff_step=1e-5, xtol=1e-12, ftol=1e-14)
+    residual, linear, covariance = fitted(solution.x)
+    # The linear constants are eliminated inside the residual: its Jacobian is the one of the nonlinear three
+    # alone, and a linear constant's spread is its own plus what the three pass on.
+    variance = float(residual @ residual) / (residual.size - 3 - linear.size)
+    spread = np.linalg.inv(solution.jac.T @ solution.jac) * variance
+    step = 1e-4
+    passed = np.column_stack(
+        [(fitted(solution.x + step * e)[1] - fitted(solution.x - step * e)[1]) / (2 * step) for e in np.eye(3)]
+    )
+    sd = scale * np.sqrt(np.diag(spread))
+    total = covariance + passed @ spread @ passed.T
+    linear_sd = np.sqrt(np.diag(total))
+    found = solution.x * scale
+    values = {
+        key: Value(float(v), float(d)) for key, v, d in zip(("theta0", "theta_th", "delay"), found, sd, strict=True)
+    }
+    if isinstance(readout, Transimpedance):
+        values["C0"] = Value(float(linear[0]), float(linear_sd[0]))
+    else:  # y = a_cir (C0 bell + Cb) + b_cir
+        values["a_cir"] = Value(float(linear[0]) / comb.C0, float(linear_sd[0]) / comb.C0)
+        weight = np.array([-comb.Cb / comb.C0, 1.0])
+        values["b_cir"] = Value(float(weight @ linear), float(np.sqrt(weight @ total @ weight)))
+    return Profile(values, float(np.sqrt(variance)))

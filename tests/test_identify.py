@@ -1,0 +1,168 @@
+"""Identification: values within their intervals as often as these say, and the files that the command writes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.papers.threshold import sensing_axis
+from estimation.calibration import identify, kind_of
+from estimation.identify import Driven, mechanics_from_driven, profile, ringdown
+from phantoms.forward import Plan, Start, sense_voltage, settled, simulate, trajectory
+from phantoms.waveforms import Constant, Sine
+from recon.cli import main
+from scanner.device import Device
+from scanner.devices import load
+from scanner.errors import BadInput
+from scanner.recording import Recording
+
+DRIVEN = load("chen2020-driven")
+AXIS = DRIVEN.axis("x")
+RATE, PSD = 5e6, 2e-4
+
+
+@pytest.fixture(scope="module")
+def moving() -> list[Driven]:
+    """Noiseless driven motion at three frequencies."""
+    records = []
+    for f in (31400.0, 31480.0, 31560.0):
+        plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.004, RATE, substeps=4)
+        angle, _ = trajectory(AXIS, plan, settled(AXIS, replace(plan, settle=0.04)), 0.0, 0.004)
+        records.append(Driven(angle[:-1:4], plan.drives["x"](np.arange(20000) / RATE), f / 2, RATE))
+    return records
+
+
+@pytest.fixture(scope="module")
+def decay() -> tuple[np.ndarray, np.ndarray]:
+    """Noiseless decay of the chen2019 device under its bias: angle and sense."""
+    axis = sensing_axis()
+    plan = Plan({"x": Constant(10.0)}, 0.08, 500e3, substeps=4)
+    angle, rate = (v[:-1:4] for v in trajectory(axis, plan, Start(0.15, 0.0), 0.0, 0.08))
+    return angle, sense_voltage(axis.require_readout(), {"x": axis}, {"x": angle}, {"x": rate}, 2e-6, {})
+
+
+def coverage(draws: list[dict], truth: dict[str, float]) -> dict[str, float]:
+    return {key: np.mean([d[key].ci95[0] < value < d[key].ci95[1] for d in draws]) for key, value in truth.items()}
+
+
+def test_driven_motion_tells_the_torques_scale(moving):
+    """J, k and b scaled alike ring down alike; driven, they differ, and the intervals hold the truth."""
+    m = AXIS.require_mechanics()
+    draws = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        noisy = [replace(r, angle=r.angle + PSD * rng.standard_normal(r.angle.size)) for r in moving]
+        draws.append(mechanics_from_driven(AXIS.require_capacitance(), noisy))
+    truth = {"J": m.J, "b": m.b, "k": m.k}
+    for key, value in truth.items():
+        assert np.mean([d[key].value for d in draws]) == pytest.approx(value, rel=2e-3)
+    assert min(coverage(draws, truth).values()) >= 0.8
+
+
+def test_one_drive_frequency_is_not_enough(moving):
+    with pytest.raises(BadInput, match="two or more drive frequencies"):
+        mechanics_from_driven(AXIS.require_capacitance(), moving[:1])
+
+
+def test_a_ringdown_tells_frequency_and_damping(decay):
+    axis = sensing_axis()
+    m = axis.require_mechanics()
+    off = replace(axis, mechanics=replace(m, k=m.k * 1.004, b=m.b * 0.9))
+    draws = []
+    for seed in range(25):
+        angle = decay[0] + PSD * np.random.default_rng(seed).standard_normal(decay[0].size)
+        draws.append(ringdown(angle, 500e3, off, 10.0)[0])
+    truth = {"k_over_J": m.k / m.J, "b_over_J": m.b / m.J, "J": m.J}
+    assert min(coverage(draws, truth).values()) >= 0.8
+    assert np.mean([d["b_over_J"].value for d in draws]) == pytest.approx(m.b / m.J, rel=1e-3)
+    assert draws[0]["J"].sd > 20 * draws[0]["k_over_J"].sd / draws[0]["k_over_J"].value * m.J
+
+
+def test_the_bell_and_the_delay_between_the_channels(decay):
+    axis = sensing_axis()
+    comb = axis.require_capacitance()
+    off = replace(axis, capacitance=replace(comb, C0=1.1 * comb.C0, theta0=0.9 * comb.theta0, theta_th=0.0))
+    draws = []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        angle = decay[0][57:] + PSD * rng.standard_normal(decay[0].size - 57)  # the angle channel is 0.114 ms early
+        sense = decay[1][:-57] + 0.0435 * rng.standard_normal(decay[1].size - 57)
+        draws.append(profile(off, angle, sense, 500e3, axis.resonance).values)
+    truth = {"theta0": comb.theta0, "theta_th": comb.theta_th, "C0": comb.C0, "delay": 57 / 500e3}
+    for key, value in truth.items():
+        assert np.mean([d[key].value for d in draws]) == pytest.approx(value, rel=0.01)
+    assert min(coverage(draws, truth).values()) >= 0.8
+
+
+def calibration(folder) -> list:
+    """Files of a rest and of two driven recordings whose device differs from the one they state."""
+    m, readout = AXIS.require_mechanics(), AXIS.require_readout()
+    true = replace(
+        DRIVEN,
+        axes={
+            "x": replace(
+                AXIS,
+                mechanics=replace(m, J=m.J * 1.06, b=m.b * 1.1, k=m.k * 1.06),
+                readout=replace(readout, a_cir=-3.7e11, b_cir=6.6),
+            )
+        },
+    )
+    paths = []
+    for f in (31450.0, 31530.0):
+        plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.01, RATE, settle=0.04, angles=True)
+        recording, _ = simulate(true, plan, seed=int(f), nominal=DRIVEN)
+        paths.append(folder / f"{f:.0f}.h5")
+        recording.write(paths[-1])
+    rng = np.random.default_rng(0)
+    quiet = {"sense_x": (0.9 + 0.0139 * rng.standard_normal(50000), "V", RATE, 0.0)}
+    paths.append(folder / "rest.h5")
+    Recording.from_arrays(quiet, DRIVEN).write(paths[-1])
+    return paths
+
+
+def test_the_command_writes_a_device_nearer_the_truth(tmp_path, capsys):
+    paths = calibration(tmp_path)
+    assert main(["identify", *map(str, paths), "-o", str(tmp_path / "out"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["axes"] == summary["axes"]
+    values = summary["axes"]["x"]["values"]
+    device = Device.load(tmp_path / "out" / "device.toml")
+    axis, m = device.axis("x"), AXIS.require_mechanics()
+    assert pytest.approx(1.06 * m.J, rel=0.01) == axis.mechanics.J
+    assert axis.mechanics.b == pytest.approx(1.1 * m.b, rel=0.01)
+    assert axis.mechanics.resonance == pytest.approx(AXIS.resonance, rel=1e-4)
+    assert axis.readout.a_cir == pytest.approx(-3.7e11, rel=0.01)
+    assert axis.readout.b_cir == pytest.approx(6.6, rel=0.01)
+    assert values["noise_var"]["ci95"][0] < 0.0139**2 < values["noise_var"]["ci95"][1]
+    assert device.tolerance("x", "k") < 0.01
+    assert "95 % interval" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_recording_says_what_it_is(decay):
+    n = 2000
+    still, swinging = np.random.default_rng(1).standard_normal(n), np.sin(np.arange(n) / 50.0)
+    rate = 1e5
+
+    def made(**channels):
+        units = {"drive": "V", "angle": "rad", "sense": "V"}
+        return Recording.from_arrays({f"{k}_x": (v, units[k], rate, 0.0) for k, v in channels.items()})
+
+    assert kind_of(made(sense=still), "x") == "rest"
+    assert kind_of(made(angle=swinging, sense=swinging), "x") == "free decay"
+    assert kind_of(made(angle=swinging, drive=swinging), "x") == "driven"
+    assert kind_of(made(sense=swinging), "x") is None
+    assert kind_of(made(sense=still), "y") is None
+
+
+def test_recordings_that_tell_nothing_are_refused(tmp_path, capsys):
+    path = tmp_path / "no.h5"
+    swinging = np.sin(np.arange(3000) / 50.0)
+    Recording.from_arrays({"sense_x": (swinging, "V", RATE, 0.0)}, DRIVEN).write(path)
+    assert main(["identify", str(path), "-o", str(tmp_path / "out")]) == 2
+    assert "reference angle" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(BadInput, match="no recording"):
+        identify([], DRIVEN)
