@@ -115,11 +115,6 @@ def _beside_harmonics(omega: float, u: float) -> float:
     return omega * (np.floor(ratio) + 0.15 + 0.7 * (ratio % 1.0))
 
 
-def _filter_lag(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
-    first = {"section_1": p.section_1 * (1 + r)}
-    return first if u[0] < 0.5 else first | {"section_2": p.section_2 * (1 + r)}
-
-
 def _square_law(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
     at = p.Cb + 0.6 * p.C0
     return {"square_Cp": 1e-12 / r - at, "square_at": at}
@@ -155,8 +150,6 @@ def _offset_drift(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
 IN_HERTZ = {
     "drive_corner": ("f_c", 1 / (2 * pi)),
     "readout_corner": ("f_c", 1 / (2 * pi)),
-    "section_1": ("f_c", 1 / (2 * pi)),
-    "section_2": ("f_c2", 1 / (2 * pi)),
     "tone_frequency": ("f", 1 / (2 * pi)),
     "mode_frequency": ("f2", 1 / (2 * pi)),
 }
@@ -201,7 +194,7 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect("readout-lag", "readout", everywhere(0.02, 0.2), needs_angle=frozenset({"ring"}),
            parameters=IN_HERTZ, law=lambda s, p, r, u: {"readout_corner": s.omega / r}),
     Effect("filter-lag", "readout", {"drive": (0.05, 0.25)}, signed=True,
-           parameters=IN_HERTZ, law=_filter_lag),
+           parameters={"sections": ("s", 1)}, law=lambda s, p, r, u: {"sections": 1 + r}),
     Effect("square-law", "readout", {"drive": (0.055, 0.070)}, law=_square_law, parameters={"square_Cp": ("C_p", 1)}),
     Effect("feedthrough", "readout", {"drive": (0.02, 0.15), "tf": (0.02, 0.15)},
            law=lambda s, p, r, u: {"feedthrough": r * s.height / (30.0 if p.drive_mean else 2.0)}),

@@ -168,8 +168,8 @@ def slope(t: float, s: Array, command: float, sliding: float, p: Truth, out: Arr
     out[MODE_RATE] = p.mode_coupling * theta - p.mode_damping * s[MODE_RATE] - stiffness * s[MODE]
     out[MEMORY] = (theta * theta - s[MEMORY]) / p.memory
     if p.a_cir != 0.0:
-        out[SECTION_1] = p.section_1 * (detected(capacitance(theta, p), p) - s[SECTION_1])
-        out[SECTION_2] = p.section_2 * (s[SECTION_1] - s[SECTION_2])
+        out[SECTION_1] = p.sections * p.section_1 * (detected(capacitance(theta, p), p) - s[SECTION_1])
+        out[SECTION_2] = p.sections * p.section_2 * (s[SECTION_1] - s[SECTION_2])
     else:
         out[SECTION_1] = out[SECTION_2] = 0.0
     out[READOUT] = 0.0

@@ -70,6 +70,7 @@ class Truth(NamedTuple):
     carrier: float = 0.0  # added to V^2 [V^2]
 
     # Readout.
+    sections: float = 1.0  # both of the demodulator's corners lie at this multiple of what is stated
     readout_corner: float = inf  # [rad/s]
     square_Cp: float = inf  # [F]
     square_at: float = 0.0  # capacitance at which the square law keeps gain and value [F]
