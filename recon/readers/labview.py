@@ -45,7 +45,7 @@ def read_lvm(path: Path) -> Contents:
     line = used + used_too + 3
     table = spooled(number_blocks(_one_segment(lines, path), path, separator, wanted, line, decimal), path)
     at = {column: index for index, column in enumerate(wanted)}
-    starts = _starts(segment, file_head, count)
+    starts = _starts(segment, file_head, count, decimal)
     variables = {}
     for index, name in enumerate(unique(names[column] for _, column in columns)):
         x, column = columns[index]
@@ -115,9 +115,9 @@ def _numbers(texts: Iterable[str], decimal: str) -> list[float]:
     return [number if number is not None and 0 < number < np.inf else 0.0 for number in numbers]
 
 
-def _starts(segment: Head, file_head: Head, count: int) -> list[float]:
+def _starts(segment: Head, file_head: Head, count: int, decimal: str) -> list[float]:
     """X0 of each channel plus its time of day after the earliest one [s]."""
-    zeros = [number_of(text) or 0.0 for text in segment.get("X0", [])][:count]
+    zeros = [number_of(text, decimal) or 0.0 for text in segment.get("X0", [])][:count]
     zeros = [zero if np.isfinite(zero) else 0.0 for zero in zeros] + [0.0] * (count - len(zeros))
     begun: list[Decimal] = []
     if _first(file_head, "Time_Pref") == "Absolute":
