@@ -78,6 +78,14 @@ class _Comparison(NamedTuple):
     information: Array
 
 
+class _Fit(NamedTuple):
+    """Phase errors, standard errors (inf: untold) and whether noise leaves a picture to see; each (slices, 2)."""
+
+    value: Array
+    sd: Array
+    clear: NDArray[np.bool_]
+
+
 def phase_error(
     theta_x: NDArray[Any],
     theta_y: NDArray[Any],
@@ -154,16 +162,18 @@ def _register(samples: _Samples, grid: Grid, slices: int) -> tuple[Array, Array]
     start = np.array([_search(_Samples(*(column[part == s] for column in samples))) for s in range(slices)])
     best, limit = start, np.full_like(start, RESOLUTION)
     finest = max(1.0, math.sqrt(SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size))
+    clear = np.full_like(start, True, bool)
     for cell in (4 * finest, 2 * finest, finest):  # noise asks for large cells, fine detail for small ones
-        value, sd = _solve(samples, best, grid, cell)
-        better = (sd < limit) & (np.abs(value - start) < 2 * RESOLUTION)  # further off is another minimum
-        best, limit = np.where(better, value, best), np.where(better, sd, limit)
+        fit = _solve(samples, best, grid, cell)
+        clear &= fit.clear  # noise that hides the coarse detail hides the fine
+        better = clear & (fit.sd < limit) & (np.abs(fit.value - start) < 2 * RESOLUTION)  # further is another minimum
+        best, limit = np.where(better, fit.value, best), np.where(better, fit.sd, limit)
     told = limit < RESOLUTION
     return np.where(told, best, np.nan), np.where(told, limit, np.inf)
 
 
-def _solve(samples: _Samples, error: Array, grid: Grid, cell: float) -> tuple[Array, Array]:
-    """Gauss-Newton from ``error`` on over cells of one size [px]: values and standard errors, shape (slices, 2)."""
+def _solve(samples: _Samples, error: Array, grid: Grid, cell: float) -> _Fit:
+    """Gauss-Newton from ``error`` on, over cells of one size [px]."""
     to_cells = 0.5 * np.array([grid.width, grid.height]) / cell
     for _ in range(10):
         here = _compare(samples, error, grid, cell)
@@ -181,32 +191,32 @@ def _solve(samples: _Samples, error: Array, grid: Grid, cell: float) -> tuple[Ar
     slope_of, expected = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (slope, here.information))
     # Noise in the gradient shows as a slope too small, detail lost in the smoothing as one too large, and what the
     # scan's pattern makes of the other axis's features as little information.
-    told = (slope_of > 0.5 * expected) & (slope_of < 2 * expected) & (expected > 0.05 * expected.max(1, keepdims=True))
+    clear = slope_of > 0.5 * expected
+    told = clear & (slope_of < 2 * expected) & (expected > 0.05 * expected.max(1, keepdims=True))
     value, sd = error.copy(), np.full_like(error, np.inf)
     for s, axes in enumerate(told):
         if axes.any():
             shares = here.score[s][:, axes] @ np.linalg.pinv(slope[s][np.ix_(axes, axes)]).T
             value[s, axes] += shares.sum(0)
             sd[s, axes] = np.linalg.norm(shares, axis=0)
-    return value, sd
+    return _Fit(value, sd, clear)
 
 
 def _compare(samples: _Samples, error: Array, grid: Grid, cell: float) -> _Comparison:
     """Remap with the phase errors given, smooth over cells of one size [px], and compare each sample with its place."""
     import cv2
 
-    slices = len(error)
     shape = (math.ceil(grid.height / cell) + 1, math.ceil(grid.width / cell) + 1)
-    sums = np.zeros((6, *shape))
+    fields = np.zeros((*shape, 8))  # sums of count, intensity, x, y, dx, dy; then the picture's gradient
     cos, sin = np.cos(error), np.sin(error)
-    _splat(samples, cos, sin, cell, sums)
+    _splat(samples, cos, sin, cell, fields)
     size = 2 * math.ceil(3 * SIGMA) + 1
-    for field in sums:
-        cv2.GaussianBlur(field, (size, size), SIGMA, dst=field, borderType=cv2.BORDER_CONSTANT)
-    picture = np.divide(sums[1], sums[0], out=np.full(shape, np.nan), where=sums[0] > 1e-9)
-    gradient = np.nan_to_num(np.gradient(picture)) / cell
-    score, information = np.zeros((slices, BLOCKS, 2)), np.zeros((slices, 2, 2))
-    _accumulate_normal(samples, cos, sin, cell, sums, gradient, score, information)
+    cv2.GaussianBlur(fields, (size, size), SIGMA, dst=fields, borderType=cv2.BORDER_CONSTANT)
+    counts, sums = fields[..., 0], fields[..., 1]
+    picture = np.divide(sums, counts, out=np.full(shape, np.nan), where=counts > 1e-9)
+    fields[..., 7], fields[..., 6] = np.nan_to_num(np.gradient(picture)) / cell
+    score, information = np.zeros((len(error), BLOCKS, 2)), np.zeros((len(error), 2, 2))
+    _accumulate_normal(samples, cos, sin, cell, fields, score, information)
     return _Comparison(score, information)
 
 
@@ -221,9 +231,9 @@ def _locate(place, motion, cos, sin, cell, n):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _splat(samples, cos, sin, cell, sums):  # type: ignore[no-untyped-def]
+def _splat(samples, cos, sin, cell, fields):  # type: ignore[no-untyped-def]
     """Spread count, intensity, place and motion of each sample over the four cells around its corrected place."""
-    _, height, width = sums.shape
+    height, width, _ = fields.shape
     for i in range(samples.x.size):
         s = samples.block[i] // BLOCKS
         x, dx, column, right = _locate(samples.x[i], samples.dx[i], cos[s, 0], sin[s, 0], cell, width)
@@ -233,38 +243,35 @@ def _splat(samples, cos, sin, cell, sums):  # type: ignore[no-untyped-def]
         for r in range(2):
             for c in range(2):
                 weight = (down if r else 1.0 - down) * (right if c else 1.0 - right)
-                sums[0, row + r, column + c] += weight
-                sums[1, row + r, column + c] += weight * samples.intensity[i]
-                sums[2, row + r, column + c] += weight * x
-                sums[3, row + r, column + c] += weight * y
-                sums[4, row + r, column + c] += weight * dx
-                sums[5, row + r, column + c] += weight * dy
+                place = fields[row + r, column + c]
+                place[0] += weight
+                place[1] += weight * samples.intensity[i]
+                place[2] += weight * x
+                place[3] += weight * y
+                place[4] += weight * dx
+                place[5] += weight * dy
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate_normal(samples, cos, sin, cell, sums, gradient, score, information):  # type: ignore[no-untyped-def]
-    _, height, width = sums.shape
-    mean, along = np.empty(6), np.empty(2)
+def _accumulate_normal(samples, cos, sin, cell, fields, score, information):  # type: ignore[no-untyped-def]
+    height, width, _ = fields.shape
+    mean = np.empty(8)
     for i in range(samples.x.size):
-        s = samples.block[i] // BLOCKS
+        s, block = divmod(samples.block[i], BLOCKS)
         x, dx, column, right = _locate(samples.x[i], samples.dx[i], cos[s, 0], sin[s, 0], cell, width)
         y, dy, row, down = _locate(samples.y[i], samples.dy[i], cos[s, 1], sin[s, 1], cell, height)
         if column < 0 or row < 0:
             continue
-        mean[:] = 0.0
-        along[:] = 0.0
-        for r in range(2):
-            for c in range(2):
-                weight = (down if r else 1.0 - down) * (right if c else 1.0 - right)
-                for k in range(6):
-                    mean[k] += weight * sums[k, row + r, column + c]
-                along[0] += weight * gradient[1, row + r, column + c]
-                along[1] += weight * gradient[0, row + r, column + c]
-        mean /= mean[0]
-        residual = samples.intensity[i] - mean[1] - along[0] * (x - mean[2]) - along[1] * (y - mean[3])
-        z_x, z_y = along[0] * (dx - mean[4]), along[1] * (dy - mean[5])
-        score[s, samples.block[i] % BLOCKS, 0] += z_x * residual
-        score[s, samples.block[i] % BLOCKS, 1] += z_y * residual
+        for k in range(8):
+            above = (1.0 - right) * fields[row, column, k] + right * fields[row, column + 1, k]
+            below = (1.0 - right) * fields[row + 1, column, k] + right * fields[row + 1, column + 1, k]
+            mean[k] = (1.0 - down) * above + down * below
+        count, slope_x, slope_y = mean[0], mean[6], mean[7]
+        residual = samples.intensity[i] - mean[1] / count
+        residual -= slope_x * (x - mean[2] / count) + slope_y * (y - mean[3] / count)
+        z_x, z_y = slope_x * (dx - mean[4] / count), slope_y * (dy - mean[5] / count)
+        score[s, block, 0] += z_x * residual
+        score[s, block, 1] += z_y * residual
         information[s, 0, 0] += z_x * z_x
         information[s, 0, 1] += z_x * z_y
         information[s, 1, 0] += z_x * z_y
