@@ -9,8 +9,10 @@ import numpy as np
 
 from estimation.mismatch.diagnosis import Diagnosis, Finding
 from estimation.mismatch.search import Round
+from estimation.mismatch.sensitivity import APART, visibility
 from recon import views
 from recon.report import Figure, Section, Table, render
+from scanner.terms import catalogue
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,7 +29,7 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
         text = "Distances in -2 log evidence: 10 over nothing is certain, a lead of 6 over the next names alone."
         rows = evidence_table(diagnosis.search.rounds)
         sections.append(Section("Candidates", text, Table(["effect", "behind", "over nothing"], rows)))
-    sections.append(_nominal(diagnosis))
+    sections += [_visible(diagnosis), _nominal(diagnosis)]
     notes = [diagnosis.unexplained] if diagnosis.unexplained else []
     return render("Diagnosis", lead, sections, notes)
 
@@ -135,6 +137,30 @@ def _nominal(diagnosis: Diagnosis) -> Section:
     return Section("Nominal values", text, Table(["value", "pull"], rows))
 
 
+def _visible(diagnosis: Diagnosis) -> Section:
+    """The map of what these recordings can tell, as a picture."""
+    found = visibility(diagnosis.search.comparison, diagnosis.search.final, catalogue().values())
+
+    def draw(axes: Axes) -> None:
+        place = np.arange(len(found))
+        axes.barh(place, [max(each.sigma, 0.1) for each in found], color=AFTER, alpha=0.35, label="size")
+        axes.barh(place, [max(each.distance, 0.1) for each in found], color=AFTER, height=0.4, label="distance")
+        axes.axvline(APART, color=BEFORE, lw=1)
+        axes.set_yticks(place, [f"{each.key} | {each.nearest}" for each in found], fontsize=7)
+        axes.invert_yaxis()
+        axes.set(xscale="log", xlabel="σ, for an effect of its natural size")
+        axes.legend(frameon=False)
+
+    text = (
+        "Every effect of its natural size, and what is left of it when its nearest look-alike (named behind it) "
+        f"imitates it as well as it can. Beyond {APART} σ it is named alone; below, record what the look-alikes' entry advises."
+    )
+    figure = _figure(
+        draw, "size of every effect, and distance to its nearest look-alike", height=1.0 + 0.18 * len(found)
+    )
+    return Section("What these recordings can tell", text, figures=[figure], least="34rem")
+
+
 def evidence_table(rounds: Sequence[Round]) -> list[list[str]]:
     """Every effect found and its rivals: how far each lies behind in -2 log evidence."""
     rows = []
@@ -144,7 +170,7 @@ def evidence_table(rounds: Sequence[Round]) -> list[list[str]]:
     return rows
 
 
-def _figure(draw: Callable[[Axes], None], caption: str) -> Figure:
-    drawing, axes = views.figure(size=(6.0, 3.2))
+def _figure(draw: Callable[[Axes], None], caption: str, height: float = 3.2) -> Figure:
+    drawing, axes = views.figure(size=(6.0, height))
     draw(axes[0, 0])
     return Figure(views.figure_uri(drawing), caption)

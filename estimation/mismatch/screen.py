@@ -117,32 +117,3 @@ def _gain(base: Fit, columns: Array, rows: NDArray[np.bool_]) -> tuple[float, Ar
     inner = kept + np.eye(new.shape[1])
     estimate = np.asarray(-np.linalg.solve(inner, push))
     return float(-push @ estimate - np.linalg.slogdet(inner)[1]), estimate
-
-
-def distances(
-    base: Fit, screened: Sequence[Screened], sizes: Sequence[Array], rows: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """What the recording can tell: detectability [sigma] of each effect of a given size, and distance to every other.
-
-    The distance of effect i to effect j is the size, in sigma, of what is left of i's signal after j's amplitudes and
-    all nominal parameters have done their best to imitate it.
-
-    Returns:
-        (detectability, shape (n,); distance, shape (n, n)).
-    """
-    old = base.jacobian[rows]
-    normal = np.linalg.cholesky(old.T @ old + np.diag(base.model.precision))
-
-    def residue(signal: Array, extra: Array | None) -> float:
-        basis = old if extra is None else np.column_stack([old, extra])
-        precision = base.model.precision if extra is None else np.append(base.model.precision, np.ones(extra.shape[1]))
-        full = normal if extra is None else np.linalg.cholesky(basis.T @ basis + np.diag(precision))
-        inner = np.linalg.solve(full, basis.T @ signal)
-        return float(np.sqrt(max(signal @ signal - inner @ inner, 0.0)))
-
-    signals = [each.columns[rows] @ size for each, size in zip(screened, sizes, strict=True)]
-    seen = np.array([residue(signal, None) for signal in signals])
-    apart = np.array([[residue(s, other.columns[rows]) for other in screened] for s in signals]).reshape(
-        len(signals), -1
-    )
-    return seen, apart

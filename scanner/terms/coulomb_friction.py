@@ -1,4 +1,4 @@
-"""Dry friction: a torque against the motion, whatever its speed."""
+"""Dry friction: a torque against the motion, whatever its speed above that at which the contact begins to slide."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from scanner.trajectory import TORQUE
 
 @njit(TORQUE, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    # The sign is smoothed within the speed of a motion of 0.3 mrad, far below any that matters.
-    rest = 3e-4 * np.sqrt(nominal[2] / nominal[0])
-    return -p[0] * omega / np.sqrt(omega * omega + rest * rest), 0.0, 0.0
+    return -p[0] * omega / np.sqrt(omega * omega + p[1] * p[1]), 0.0, 0.0
 
 
 TERM = Term(
     effect="coulomb-friction",
     stage="mechanics",
-    equation="J θ'' + b θ' + τ_c sign θ' + k θ = τ",
-    parameters=(Parameter("tau_c", "N m", lambda s: 0.08 * s.b * s.amplitude * s.rate, sign=1),),
+    equation="J θ'' + b θ' + τ_c θ'/√(θ'² + ω_s²) + k θ = τ",
+    parameters=(
+        Parameter("tau_c", "N m", lambda s: 0.08 * s.b * s.amplitude * s.rate, sign=1),
+        Parameter("omega_s", "rad/s", lambda s: 0.01 * s.amplitude * s.rate, kind="log"),
+    ),
     source="Feeny & Liang, J. Sound Vib. 195, 149 (1996)",
     lookalikes={
         "quadratic-drag": "decay rate follows A there, 1/A here: record the end of the decay",

@@ -1,0 +1,201 @@
+"""The diagnosis on small recordings made by another integrator (scipy's), and the commands around it."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from estimation.mismatch.diagnosis import diagnose
+from estimation.mismatch.experiment import between, experiment
+from estimation.mismatch.fit import Comparison
+from estimation.mismatch.model import Model
+from estimation.mismatch.noise import noise_psd, whitener
+from estimation.mismatch.start import first_whiteners, grown, started, windows
+from recon.cli import main
+from scanner.device import Axis, Device, Drive, Mechanics, Position
+from scanner.recording import Recording
+
+F0, RATE, N = 500.0, 40e3, 8000
+K = 1e-12 * (2 * np.pi * F0) ** 2
+DEVICE = Device(
+    "bench",
+    {
+        "x": Axis(
+            Mechanics(1e-12, 1e-12 * 2 * np.pi * F0 / 40, K),
+            drive=Drive("linear", 1e-9),
+            readout=Position(20.0, 2e-3),
+            tolerance={"k": 0.01, "b": 0.1, "torque_per_volt": 0.05, "gain": 0.03},
+            name="x",
+        )
+    },
+)
+
+
+@cache
+def signals(k3: float, b2: float) -> tuple[np.ndarray, np.ndarray]:
+    """Drive voltage and angle of a device a little off its nominal values, driven by a multisine."""
+    rng = np.random.default_rng(5)
+    lines, phases = 30.0 + 62.5 * np.arange(14), rng.uniform(0, 2 * np.pi, 14)
+
+    def voltage(t):  # type: ignore[no-untyped-def]
+        return 1.5 * np.sin(2 * np.pi * np.multiply.outer(t, lines) + phases).sum(-1)
+
+    J, b, k = 1e-12, 1.05 * DEVICE.axis("x").mechanics.b, 1.004 * K
+
+    def rates(t, s):  # type: ignore[no-untyped-def]
+        return [s[1], (1e-9 * voltage(t) - b * s[1] - k * s[0] - k3 * s[0] ** 3 - b2 * abs(s[1]) * s[1]) / J]
+
+    time = np.arange(N) / RATE
+    done = solve_ivp(rates, (0, time[-1]), [1e-4, 0.5], "DOP853", time, rtol=1e-9, atol=1e-12, max_step=1e-4)
+    return voltage(time), done.y[0]
+
+
+def recording(k3: float = 0.0, b2: float = 0.0, seed: int = 0, coloured: bool = False, **change: float) -> Recording:
+    drive, angle = signals(k3, b2)
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0, 2e-3, N)
+    if coloured:
+        from scipy.signal import lfilter
+
+        slow = lfilter([1.0], [1.0, -0.95], rng.normal(0, 1e-3, N))
+        noise = noise + slow + 1e-3 * np.cos(2 * np.pi * 50 * np.arange(N) / RATE + 1.0)
+    sense = 20.0 * angle * (1 + change.get("gain", 0.0) * np.arange(N) / N) + noise
+    channels = {"drive_x": (drive, "V", RATE, 0.0), "sense_x": (sense, "V", RATE, 0.0)}
+    return Recording.from_arrays(channels, device=DEVICE, name="bench <b>")
+
+
+@pytest.mark.parametrize(("seed", "coloured"), [(1, False), (2, False), (3, True), (4, True)])
+def test_nothing_is_found_where_nothing_is_missing(seed: int, coloured: bool) -> None:
+    found = diagnose([recording(seed=seed, coloured=coloured)])
+    assert (found.verdict, found.findings, found.unexplained) == ("consistent", (), None)
+    assert found.search.final.held_chi2 == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_cubic_spring_is_named_with_an_interval_that_holds_it() -> None:
+    size = np.abs(signals(0.0, 0.0)[1]).max()
+    k3 = 0.06 * K / size**2
+    found = diagnose([recording(k3=k3, seed=6)])
+    (finding,) = found.findings
+    assert (finding.effect, finding.stage, finding.axis) == ("cubic-stiffness", "mechanics", "x")
+    low, high = finding.parameters[0].ci95
+    assert low < k3 < high
+    assert high - low < 0.4 * k3
+    assert finding.heldout["after"] < 1.1 < finding.heldout["before"]
+    assert found.device.axis("x").terms["cubic-stiffness"]["k3"] == finding.parameters[0].value
+
+
+def test_the_improved_device_is_consistent_with_its_own_recording() -> None:
+    size = np.abs(signals(0.0, 0.0)[1]).max()
+    made = recording(k3=0.06 * K / size**2, seed=7)
+    improved = diagnose([made]).device
+    again = diagnose([made], Device.from_toml(improved.to_toml()))
+    assert again.verdict == "consistent"
+
+
+def test_a_readout_gain_that_drifts_is_placed_in_the_readout() -> None:
+    found = diagnose([recording(gain=0.1, seed=8)])
+    assert [(f.effect, f.stage) for f in found.findings] == [("gain-drift", "readout")]
+    assert found.findings[0].parameters[0].value == pytest.approx(0.1, rel=0.15)
+
+
+def test_the_nominal_fit_finds_the_values_within_their_errors() -> None:
+    made = recording(seed=9)
+    run = experiment(made, DEVICE)
+    model = Model([run], DEVICE)
+    comparison = Comparison([run], first_whiteners(model))
+    stops = windows(model)
+    fit = grown(comparison, model, started(comparison, model, stops[0]).x, stops)[-1]
+    axis = model.nominal("x", fit.x)
+    assert axis.resonance / F0 == pytest.approx(np.sqrt(1.004), abs=2e-4)
+    assert axis.quality == pytest.approx(40 / 1.05 * np.sqrt(1.004), rel=0.01)
+
+
+def test_half_the_step_changes_less_than_a_tenth_of_the_noise() -> None:
+    made = recording(seed=10)
+    values = []
+    for finer in (1, 2):
+        run = experiment(made, DEVICE, finer=finer)
+        model = Model([run], DEVICE)
+        x = np.zeros(len(model.free))
+        x[[i for i, f in enumerate(model.free) if f.kind == "start"]] = 0.1
+        values.append(model.outputs(x)[0][0])
+    n = min(v.size for v in values)
+    assert np.abs(values[0][:n] - values[1][:n]).max() < 0.1 * 2e-3
+
+
+def test_whitened_noise_is_white_and_of_unit_size() -> None:
+    from scipy.signal import lfilter
+
+    rng = np.random.default_rng(11)
+    noise = lfilter([1.0], [1.0, -0.9], rng.normal(0, 0.1, 20000))
+    psd = noise_psd(noise, 8001, 1e-4, [100.0], 5.0)
+    white = whitener(psd, noise.size, (20, 20))(noise)
+    assert white.std() == pytest.approx(1.0, abs=0.03)
+    assert abs(np.corrcoef(white[:-1], white[1:])[0, 1]) < 0.05
+
+
+def test_a_jump_stays_sharp_and_a_sine_is_exact_between_samples() -> None:
+    at = np.arange(0.0, 900.0, 0.5)
+    step = np.repeat([1.0, 3.0], 500)
+    assert set(between(step, at)) == {1.0, 3.0}
+    sine = np.sin(0.9 * np.arange(1000))
+    np.testing.assert_allclose(between(sine, at)[100:], np.sin(0.9 * at)[100:], atol=2e-3)
+
+
+def test_the_commands_write_what_the_contract_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    size = np.abs(signals(0.0, 0.0)[1]).max()
+    file = tmp_path / "bench.h5"
+    recording(k3=0.06 * K / size**2, seed=12).write(file)
+    assert main(["diagnose", str(file), "-o", str(tmp_path / "out"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert written["schema"] == "lissajous-diagnosis/1"
+    assert written["verdict"] == told["verdict"] == "mismatch"
+    (finding,) = written["findings"]
+    assert set(finding) >= {
+        "axis",
+        "stage",
+        "effect",
+        "equation",
+        "parameters",
+        "where",
+        "probability",
+        "rivals",
+        "heldout",
+    }
+    assert set(finding["parameters"][0]) == {"name", "value", "ci95", "unit"}
+    assert written["unexplained"] is None
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "bench &lt;b&gt;" in report
+    assert "bench <b>" not in report
+
+    errors = {}
+    for name, device in (("nominal", []), ("improved", ["--device", str(tmp_path / "out" / "device.toml")])):
+        assert main(["predict", str(file), "-o", str(tmp_path / name), *device, "--json"]) == 0
+        errors[name] = json.loads(capsys.readouterr().out)["channels"]["sense_x"]["rmse"]
+        with Recording.open(tmp_path / name / "predicted.h5") as predicted:
+            assert predicted["sense_x"].size == N
+    assert errors["improved"] < 1.1 * 2e-3 < 2 * errors["improved"] < errors["nominal"]
+
+
+@pytest.mark.parametrize(
+    ("drop", "complaint"),
+    [("drive_x", "linear drive"), ("sense_x", "no channel that the device could be held against")],
+)
+def test_what_is_missing_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], drop: str, complaint: str
+) -> None:
+    whole = recording(seed=13)
+    channels = {n: (c.read(), c.unit, c.sample_rate, c.start) for n, c in whole.channels.items() if n != drop}
+    file = tmp_path / "part.h5"
+    Recording.from_arrays(channels, device=DEVICE).write(file)
+    assert main(["diagnose", str(file), "-o", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert complaint in error
+    assert str(file) in error
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,210 @@
+"""Each term's physics by its analytic fingerprint, and the term files as such."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scanner.device import Axis, Capacitance, Drive, Mechanics, Position
+from scanner.errors import BadInput
+from scanner.response import Added, Inputs, added_terms, move, sense
+from scanner.terms import STAGES, Scales, catalogue, load_terms, section, shifted
+from scanner.trajectory import integrate
+
+F0 = 600.0
+W = 2 * np.pi * F0
+LINEAR = Axis(
+    Mechanics(1e-12, 1e-12 * W / 1e5, 1e-12 * W**2), drive=Drive("linear", 1e-9), readout=Position(10.0, 1e-3), name="x"
+)
+STEP = 1 / (F0 * 100)
+
+
+def free_motion(axis: Axis, effect: str, values: tuple[float, ...], amplitude: float, turns: int = 40) -> np.ndarray:
+    inputs = Inputs(np.zeros((100 * turns, 3)), STEP)
+    return move(axis, [Added(catalogue()[effect], values)], inputs, (amplitude, 0.0)).angle
+
+
+def frequency(angle: np.ndarray) -> float:
+    """From the first to the last upward crossing of zero."""
+    up = np.flatnonzero((angle[:-1] < 0) & (angle[1:] >= 0))
+    times = up - angle[up] / (angle[up + 1] - angle[up])
+    return (up.size - 1) / ((times[-1] - times[0]) * STEP)
+
+
+def decay(angle: np.ndarray) -> np.ndarray:
+    """Peaks of every turn, by the parabola through three samples."""
+    i = np.flatnonzero((angle[1:-1] > angle[:-2]) & (angle[1:-1] >= angle[2:])) + 1
+    a, b, c = angle[i - 1], angle[i], angle[i + 1]
+    return b - (a - c) ** 2 / (8 * (a - 2 * b + c))
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_cubic_stiffness_shifts_the_frequency_by_three_eighths(sign: float) -> None:
+    amplitude, ratio = 0.1, 0.02 * sign
+    angle = free_motion(LINEAR, "cubic-stiffness", (ratio * LINEAR.mechanics.k / amplitude**2,), amplitude)
+    assert frequency(angle) / F0 - 1 == pytest.approx(3 / 8 * ratio, rel=0.02)
+
+
+def test_quintic_stiffness_shifts_the_frequency_by_five_sixteenths() -> None:
+    angle = free_motion(LINEAR, "quintic-stiffness", (0.02 * LINEAR.mechanics.k / 0.1**4,), 0.1)
+    assert frequency(angle) / F0 - 1 == pytest.approx(5 / 16 * 0.02, rel=0.03)
+
+
+def test_quadratic_stiffness_moves_the_mean_and_lowers_the_frequency() -> None:
+    angle = free_motion(LINEAR, "quadratic-stiffness", (0.05 * LINEAR.mechanics.k / 0.1,), 0.1)
+    assert angle[: 100 * 39].mean() == pytest.approx(-0.05 * 0.1 / 2, rel=0.1)
+    assert frequency(angle - angle.mean()) / F0 - 1 == pytest.approx(-5 / 12 * 0.05**2, rel=0.2)
+
+
+def test_quadratic_drag_decays_hyperbolically() -> None:
+    b2 = 1e-14
+    peaks = decay(free_motion(LINEAR, "quadratic-drag", (b2,), 0.1))
+    rate = 8 * b2 * W / (3 * np.pi * 2 * LINEAR.mechanics.J) / F0  # of 1/A, a turn
+    np.testing.assert_allclose(np.diff(1 / peaks), rate, rtol=0.05)
+
+
+def test_cubic_damping_lets_the_inverse_square_of_amplitude_grow_linearly() -> None:
+    b3 = 1e-9
+    peaks = decay(free_motion(LINEAR, "cubic-damping", (b3,), 0.1))
+    rate = 2 * b3 / (8 * LINEAR.mechanics.J) / F0
+    np.testing.assert_allclose(np.diff(1 / peaks**2), rate, rtol=0.05)
+
+
+def test_coulomb_friction_decays_linearly_and_stops() -> None:
+    tau = 0.002 * LINEAR.mechanics.k * 0.1
+    peaks = decay(free_motion(LINEAR, "coulomb-friction", (tau, 1e-3), 0.1))
+    np.testing.assert_allclose(np.diff(peaks[:25]), -4 * 0.002 * 0.1, rtol=0.05)
+    assert peaks[0] > 0.08 > 50 * np.abs(free_motion(LINEAR, "coulomb-friction", (10 * tau, 1e-3), 0.1)[-100:]).max()
+
+
+def test_drifts_settle_to_their_share() -> None:
+    angle = free_motion(LINEAR, "resonance-drift", (0.02, 1e-4), 0.1)
+    assert frequency(angle[1000:]) / F0 - 1 == pytest.approx(0.01, rel=0.02)
+    lossy = replace(LINEAR, mechanics=replace(LINEAR.mechanics, b=1e-12 * W / 100))
+    plain, drifted = (
+        decay(free_motion(lossy, "damping-drift", (0.0, 1e-4), 0.1)),
+        decay(free_motion(lossy, "damping-drift", (0.5, 1e-4), 0.1)),
+    )
+    assert np.log(drifted[-1] / drifted[5]) / np.log(plain[-1] / plain[5]) == pytest.approx(1.5, rel=0.01)
+
+
+def test_inertia_scale_leaves_a_ringdown_alone_and_divides_the_torque() -> None:
+    inertia = catalogue()["inertia-scale"]
+    scaled = inertia.constants(LINEAR, (2.0,))  # type: ignore[misc]
+    assert (scaled.resonance, scaled.quality) == pytest.approx((LINEAR.resonance, LINEAR.quality))
+    push = np.full((100, 3), 1.0)
+    once = integrate(LINEAR, (0.0, 0.0), push, STEP)[0]
+    np.testing.assert_allclose(integrate(scaled, (0.0, 0.0), push, STEP)[0], once / 2, rtol=1e-9, atol=1e-18)
+
+
+def test_profile_shape_s_slope_is_the_derivative_of_its_capacitance() -> None:
+    from scanner.trajectory import Bell
+
+    axis = replace(LINEAR, capacitance=Capacitance(5e-12, 1e-11, 0.2, 0.01))
+    angle = np.linspace(-0.4, 0.4, 4001)
+    value, slope = Bell(catalogue()["profile-shape"].bell, (0.3,)).along(angle, axis)
+    np.testing.assert_allclose(np.gradient(value, angle)[1:-1], slope[1:-1], atol=2e-4 * np.abs(slope).max())
+
+
+def test_second_mode_splits_a_resonance_by_its_coupling() -> None:
+    c = 0.01
+    angle = free_motion(LINEAR, "second-mode", (c, F0, 1e5), 0.1, turns=200)
+    envelope = np.abs(decay(angle))
+    # equal modes exchange everything at a beat of f0 sqrt(c)
+    assert envelope.min() < 0.2 * envelope.max()
+    spectrum = np.abs(np.fft.rfft(angle[:20000] * np.hanning(20000)))
+    half = np.fft.rfftfreq(20000, STEP)
+    low, high = half[np.argmax(spectrum * (half < F0))], half[np.argmax(spectrum * (half > F0))]
+    assert high - low == pytest.approx(F0 * np.sqrt(c), rel=0.1)
+
+
+def test_viscoelastic_stiffness_depends_on_frequency() -> None:
+    stiff = frequency(free_motion(LINEAR, "viscoelastic", (0.05 * LINEAR.mechanics.k, 1.0), 0.1))
+    assert stiff / F0 - 1 == pytest.approx(0.025, rel=0.03)
+    soft = free_motion(LINEAR, "viscoelastic", (0.05 * LINEAR.mechanics.k, 2e-5), 0.1)
+    assert frequency(soft) / F0 - 1 == pytest.approx(0.0, abs=3e-4)
+
+
+def test_array_laws_do_what_they_say() -> None:
+    time = np.arange(2000) * 1e-5
+    tone = np.sin(2 * np.pi * 500 * time)
+    np.testing.assert_allclose(
+        shifted(tone, -3.5)[10:-10], np.sin(2 * np.pi * 500 * (time - 3.5e-5))[10:-10], atol=1e-6
+    )
+    slow = section(tone, 500.0, 1e-5)[1000:]
+    assert slow.std() / tone[1000:].std() == pytest.approx(1 / np.sqrt(2), rel=0.01)
+    assert section(tone, np.inf, 1e-5) is tone
+    np.testing.assert_allclose(section(tone, -500.0, 1e-5) - tone, tone - section(tone, 500.0, 1e-5))
+
+
+def test_a_readout_gain_drifts_from_the_recording_s_start() -> None:
+    inputs = Inputs(np.zeros((1000, 3)), STEP, t0=0.5)
+    path = move(LINEAR, [], inputs, (0.1, 0.0))
+    plain = sense(LINEAR.readout, [], [path], inputs)
+    drifted = sense(LINEAR.readout, [Added(catalogue()["gain-drift"], (0.1, 1.0))], [path], inputs)
+    np.testing.assert_allclose(drifted, plain * (1 + 0.1 * inputs.time))
+
+
+def test_every_term_does_nothing_at_zero_and_says_what_it_is() -> None:
+    scales = Scales(0.1, W, 1e-12, 1e-14, 1e-5, 0.1, 10.0, 5.0, W, 1.0, 1.0, LINEAR.readout, 100.0)
+    for effect, term in catalogue().items():
+        assert term.stage in STAGES
+        assert all((term.equation, term.source, term.parameters)), effect
+        if term.effect != "filter-lag":
+            assert all(np.isfinite(p.value(1.0, scales)) and p.value(1.0, scales) != 0.0 for p in term.parameters), (
+                effect
+            )
+        assert set(term.lookalikes) <= set(catalogue()), effect
+
+
+USER_TERM = """
+from numba import njit
+from scanner.terms import Parameter, Term
+from scanner.trajectory import TORQUE
+
+@njit(TORQUE)
+def torque(t, theta, omega, other, volt, z0, z1, p, nominal):
+    return -p[0] * theta**7, 0.0, 0.0
+
+K7 = Parameter("k7", "N m", lambda s: s.k / s.amplitude**6)
+TERM = Term("septic-stiffness", "mechanics", "+ k7 θ⁷", (K7,), "mine", torque=torque)
+"""
+
+
+def test_a_user_s_own_term_file_moves_the_mirror(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    file = tmp_path / "mine.py"
+    file.write_text(USER_TERM)
+    term = load_terms(file)["septic-stiffness"]
+    inputs = Inputs(np.zeros((4000, 3)), STEP)
+    angle = move(LINEAR, [Added(term, (0.02 * LINEAR.mechanics.k / 0.1**6,))], inputs, (0.1, 0.0)).angle
+    assert frequency(angle) / F0 - 1 == pytest.approx(35 / 128 * 0.02, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("x = 1", "holds no term"),
+        ("1 / 0", "ZeroDivisionError"),
+        ("import nothing_of_this_name", "ModuleNotFoundError"),
+    ],
+)
+def test_a_bad_term_file_is_one_clear_line(tmp_path, text: str, complaint: str) -> None:  # type: ignore[no-untyped-def]
+    file = tmp_path / "bad.py"
+    file.write_text(text)
+    with pytest.raises(BadInput, match=complaint) as caught:
+        load_terms(file)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(BadInput, match="no such file"):
+        load_terms(tmp_path / "none.py")
+
+
+def test_a_device_s_terms_are_checked() -> None:
+    assert added_terms(replace(LINEAR, terms={"cubic-stiffness": {"k3": 2.0}}))[0].values == (2.0,)
+    with pytest.raises(BadInput, match="nobody knows"):
+        added_terms(replace(LINEAR, terms={"no-such-effect": {}}))
+    with pytest.raises(BadInput, match="lacks k3"):
+        added_terms(replace(LINEAR, terms={"cubic-stiffness": {}}))
+    with pytest.raises(BadInput, match="variant"):
+        added_terms(replace(LINEAR, terms={"channel-delay": {"delay": 1e-6, "variant": 7.0}}))
