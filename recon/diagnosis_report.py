@@ -153,7 +153,7 @@ def _visible(diagnosis: Diagnosis) -> Section:
 
     text = (
         "Every effect of its natural size, and what is left of it when its nearest look-alike (named behind it) "
-        f"imitates it as well as it can. Beyond {APART} σ it is named alone; below, record what the look-alikes' entry advises."
+        f"imitates it as well as it can. Beyond {APART} σ it is named alone; below, it needs a further measurement."
     )
     figure = _figure(
         draw, "size of every effect, and distance to its nearest look-alike", height=1.0 + 0.18 * len(found)

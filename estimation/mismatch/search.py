@@ -25,6 +25,10 @@ Progress = Callable[[str], None]
 MOST_EFFECTS = 3
 """Effects looked for at a time."""
 
+ADEQUATE = 1.08
+"""Held-out reduced chi-square up to which named terms suffice: what a free correction finds beside them is how their
+laws were written down (how a contact begins to slide), not another effect."""
+
 CLOSE = 80.0
 """Rivals within this of the best in -2 log evidence are refitted when the noise has been measured anew."""
 
@@ -97,6 +101,8 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
         close = [fit for fit in close if convincing(before, fit)]
+        if rivals and before.held_chi2 < ADEQUATE:
+            close = [fit for fit in close if not _is_free(fit)]
         if not close:
             best = before
             break
@@ -104,10 +110,14 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
             (fit.evidence - close[0].evidence, fit.model.candidates[-1]) for fit in close[1:]
         )
         best = needed_only(comparison, close[0])
-        if best.model.candidates[-1].term.effect in FREE:
+        if _is_free(best):
             break
     rounds = tuple(_round(comparison, nominal, best, each, rivals.get(each.key, ())) for each in best.model.candidates)
     return Search(comparison, nominal, best, rounds)
+
+
+def _is_free(fit: Fit) -> bool:
+    return fit.model.candidates[-1].term.effect in FREE
 
 
 def needed_only(comparison: Comparison, fit: Fit) -> Fit:
