@@ -147,8 +147,12 @@ def _correlation(a: Array, b: Array) -> float:
 
 def _averaged(scene: Array, shape: tuple[int, ...] | Array) -> Array:
     """What a picture of the given shape can show of a scene: smoothed to the variance of a mean over its pixels."""
+    import cv2
     from scipy.ndimage import gaussian_filter
 
+    # What is far finer than the picture is averaged in blocks first: a filter as wide as a coarse pixel takes seconds.
+    height, width = np.minimum(scene.shape, np.ceil(4.0 * np.asarray(shape))).astype(int)
+    scene = cv2.resize(np.asarray(scene, np.float64), (int(width), int(height)), interpolation=cv2.INTER_AREA)
     # A box of k points has the variance (k² - 1) / 12; itself it would have no middle where k is even.
     finer = np.array(scene.shape) / np.asarray(shape)
     return np.asarray(gaussian_filter(scene, np.sqrt(np.maximum(finer**2 - 1.0, 0.0) / 12.0), mode="nearest"))
