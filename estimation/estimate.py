@@ -51,15 +51,15 @@ ESTIMATORS: dict[str, tuple[str, Callable[[Recording, Device], Motion]]] = {
 
 
 def default_estimator(recording: Recording, device: Device) -> str:
-    """``"sensor"`` where no capacitive readout was recorded, ``"ukf"`` where one was."""
+    """``"sensor"`` where no capacitive readout was recorded, ``"tracker"`` where one was."""
     if "sense" in recording:
-        return "ukf"
+        return "tracker"
     capacitive = [
         name
         for name, axis in device.axes.items()
         if f"sense_{name}" in recording and axis.readout is not None and not isinstance(axis.readout, Position)
     ]
-    return "ukf" if capacitive else "sensor"
+    return "tracker" if capacitive else "sensor"
 
 
 def estimate(

@@ -1,7 +1,7 @@
 """The angle at any sample from slow phase, amplitude and harmonics, without a sine for each sample.
 
 Time is cut into segments of SEGMENT samples. At a segment's ends phase, amplitude and harmonics are interpolated from
-the blocks; inside, the phase runs straight, so that LANES phasors side by side turn by one fixed complex number a step.
+the blocks; inside, the phase runs straight, so that a segment's phasors follow from its first by doubling.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from scanner.motion import AngleTrack
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-SEGMENT = 64
-LANES = 8
+SEGMENT = 128  # a power of two
+RAMP = np.arange(SEGMENT, dtype=np.float64)
 PIECE = 1 << 20  # samples made at a time
 
 
@@ -89,43 +89,53 @@ def segments(motion: SlowMotion, rate: float, start: float, count: int) -> Segme
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def segment_angles(first, turn, lines, line_steps, out):  # type: ignore[no-untyped-def]
-    """Angles of one segment into ``out`` (SEGMENT,) [rad]; ``lines`` are harmonics 0, 1, 2, ...; three are 1, 3, 5."""
-    re, im = np.empty(LANES), np.empty(LANES)
-    z = first
-    for lane in range(LANES):
-        re[lane], im[lane] = z.real, z.imag
-        z *= turn
-    far = turn * turn
-    far *= far
-    far *= far
-    far_re, far_im = far.real, far.imag
-    odd = lines.size == 3
-    for j in range(0, SEGMENT, LANES):
-        for lane in range(LANES):
-            x, y = re[lane], im[lane]
-            re[lane], im[lane] = x * far_re - y * far_im, x * far_im + y * far_re
-            i = j + lane
-            if odd:
-                px, py = x * x - y * y, 2.0 * x * y
-            else:
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def segment_angles(first, turn, lines, line_steps, re, im, out):  # type: ignore[no-untyped-def]
+    """Angles of one segment into ``out`` (SEGMENT,) [rad]; ``re``, ``im`` (SEGMENT,) are room for its phasors.
+
+    ``lines`` are harmonics 0, 1, 2, ...; three are 1, 3, 5. The amplitude runs straight over the segment, the small
+    harmonics keep the value of its middle.
+    """
+    re[0], im[0] = first.real, first.imag
+    done, far = 1, turn
+    while done < SEGMENT:  # each step turns all phasors there are at once, and so doubles them
+        a, b = far.real, far.imag
+        next_re, next_im = re[done : 2 * done], im[done : 2 * done]
+        for i in range(done):
+            x, y = re[i], im[i]
+            next_re[i], next_im[i] = x * a - y * b, x * b + y * a
+        far *= far
+        done *= 2
+    if lines.size == 3:
+        swing, swing_step = lines[0].imag, line_steps[0].imag
+        third, fifth = lines[1] + 0.5 * SEGMENT * line_steps[1], lines[2] + 0.5 * SEGMENT * line_steps[2]
+        r3, i3, r5, i5 = third.real, third.imag, fifth.real, fifth.imag
+        for i in range(SEGMENT):
+            x, y = re[i], im[i]
+            px, py = x * x - y * y, 2.0 * x * y
+            sx, sy = r3 + r5 * px - i5 * py, i3 + r5 * py + i5 * px
+            tx, ty = sx * px - sy * py, swing + RAMP[i] * swing_step + sx * py + sy * px
+            out[i] = x * tx - y * ty
+    else:
+        for i in range(SEGMENT):
+            out[i] = lines[0].real - (lines[1].imag + RAMP[i] * line_steps[1].imag) * im[i]
+        for n in range(2, lines.size):
+            line = lines[n] + 0.5 * SEGMENT * line_steps[n]
+            a, b = line.real, line.imag
+            for i in range(SEGMENT):
+                x, y = re[i], im[i]
                 px, py = x, y
-            last = lines.size - 1
-            sx = lines[last].real + i * line_steps[last].real
-            sy = lines[last].imag + i * line_steps[last].imag
-            for n in range(last - 1, -1, -1):
-                cx, cy = lines[n].real + i * line_steps[n].real, lines[n].imag + i * line_steps[n].imag
-                sx, sy = cx + sx * px - sy * py, cy + sx * py + sy * px
-            out[i] = x * sx - y * sy if odd else sx
+                for _ in range(n - 1):
+                    px, py = px * x - py * y, px * y + py * x
+                out[i] += a * px - b * py
 
 
 @njit(cache=True, error_model="numpy")
 def _angles(first, turn, lines, line_steps, out):  # type: ignore[no-untyped-def]
-    buffer = np.empty(SEGMENT)
+    re, im, buffer = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(SEGMENT)
     for s in range(first.size):
         at = s * SEGMENT
-        segment_angles(first[s], turn[s], lines[s], line_steps[s], buffer)
+        segment_angles(first[s], turn[s], lines[s], line_steps[s], re, im, buffer)
         for i in range(min(SEGMENT, out.size - at)):
             out[at + i] = buffer[i]
 

@@ -139,7 +139,7 @@ def _flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untyped-def]
+def predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untyped-def]
     """State and covariance of block k + 1 from those of block k, and the Jacobian of the step."""
     n = x.size
     F = np.eye(n)
@@ -312,7 +312,7 @@ def run_filter(laws, signal, x, P, live, walk, offset_walk, xs, Ps, xp, Pp, Fs):
     for k in range(signal.whitened.shape[0]):
         F = np.eye(x.size)
         if k > 0:
-            P, F = _predict(laws, signal, k - 1, x, P, walk, offset_walk)
+            P, F = predict(laws, signal, k - 1, x, P, walk, offset_walk)
         for a in range(len(laws)):
             at = a * STATES
             lost = P[at + PHASE, at + PHASE] > LOST[0] ** 2 or P[at + LOG, at + LOG] > LOST[1] ** 2

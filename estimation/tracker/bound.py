@@ -1,0 +1,73 @@
+"""The posterior Cramer-Rao bound of the slow motion: what no estimator can beat (derived in docs/bound.md).
+
+The information of every single sample about phase, amplitude, gain and offset is gathered along the true trajectory,
+with no demodulation and no block model, and carried through the process by the recursion of Tichavsky, Muravchik and
+Nehorai (IEEE Trans. Signal Process. 46, 1386, 1998); a smoother's bound is the backward pass of that recursion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.tracker.orbit import SENSED, law_of, turn_of
+from estimation.tracker.signal import Prepared
+from estimation.tracker.smoother import GAIN, LOG, PHASE, STATES, predict, run_smoother
+from scanner.harmonics import readout_response
+
+Array = NDArray[np.float64]
+
+
+def phase_bound(prepared: Prepared, states: Array, P: Array, walk: Array, noise_var: float) -> tuple[Array, Array]:
+    """Least standard deviations of phi that a filter and a smoother can have, each of shape (blocks, axes) [rad].
+
+    Args:
+        states: the true states at the blocks' middles, shape (blocks, states), see ``smoother``.
+        P: covariance before the first block.
+        walk: the true process's spectral densities, shape (axes, 4); the offset stands still.
+        noise_var: of a sample [V^2].
+    """
+    blocks, n = states.shape
+    rows, signal = prepared.rows, prepared.signal
+    xs, xp = np.zeros((blocks, n)), np.zeros((blocks, n))
+    Ps, Pp, Fs = np.empty((blocks, n, n)), np.empty((blocks, n, n)), np.empty((blocks, n, n))
+    Fs[0] = np.eye(n)
+    for k in range(blocks):
+        if k > 0:
+            P, Fs[k] = predict(rows, signal, k - 1, states[k - 1].copy(), P, walk, 0.0)
+        Pp[k] = P
+        Ps[k] = np.linalg.inv(np.linalg.inv(P) + _information(prepared, k, states[k]) / noise_var)
+        P = Ps[k].copy()
+    phases = [a * STATES + PHASE for a in range(len(prepared.laws))]
+    filtered = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2)[:, phases])
+    run_smoother(xs, Ps, xp, Pp, Fs)
+    return filtered, np.sqrt(np.diagonal(Ps, axis1=1, axis2=2)[:, phases])
+
+
+def _information(prepared: Prepared, k: int, x: Array) -> Array:
+    """Fisher information of all samples of block ``k`` for noise of variance 1, shape (states, states)."""
+    signal, channel = prepared.signal, prepared.sense.channel
+    length = round(signal.step * channel.sample_rate)
+    offset = (np.arange(length) - 0.5 * (length - 1)) / channel.sample_rate
+    gradient = np.zeros((x.size, length))
+    gradient[-1] = 1.0
+    orders = np.arange(SENSED + 1)
+    for a, law in enumerate(prepared.laws):
+        at = a * STATES
+        turn = turn_of(
+            law_of(prepared.rows[a]),
+            np.exp(x[at + LOG]),
+            x[at + PHASE],
+            signal.w[k, a],
+            law.k,
+            law.b,
+            signal.force[k, a],
+        )
+        w = signal.w[k, a] + turn.rate.imag
+        u = signal.psi[k, a] + x[at + PHASE] + w * offset
+        passed = readout_response(prepared.sense.readout, orders * w / (2 * np.pi))
+        turned = passed[:, None] * np.exp(1j * orders[:, None] * u)
+        gradient[at + PHASE] = np.real((1j * orders * turn.seen) @ turned)
+        gradient[at + LOG] = np.real(turn.seen_by_log @ turned)
+        gradient[at + GAIN] = np.real(turn.seen[1:] @ turned[1:])
+    return gradient @ gradient.T

@@ -1,0 +1,85 @@
+"""From slow phase and amplitude straight to the picture: no angle is stored and no sine taken for a sample.
+
+Each segment's angles come from turning phasors (``estimation.tracker.angle``), are turned into pixels side by side, and
+only the adding up is done one at a time. Counts equal those of ``mapping.accumulate`` on the same angles to the sample.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.tracker.angle import SEGMENT, SlowAngle, segment_angles
+from recon.mapping import Grid
+from scanner.errors import BadInput
+
+OUTSIDE = -1
+
+
+@numba.njit(cache=True, inline="always")
+def _pixels(angles, half_angle, n, out):  # type: ignore[no-untyped-def]
+    """Pixels of one segment: ``mapping.pixel_of`` without a branch, OUTSIDE outside the field."""
+    for i in range(SEGMENT):
+        position = angles[i] / half_angle
+        pixel = max(math.ceil(0.5 * n * (position + 1.0)) - 1.0, 0.0)
+        out[i] = np.int32(pixel) if abs(position) <= 1.0 else np.int32(OUTSIDE)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _accumulate(x, y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
+    height, width = counts.shape
+    angles, re, im = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(SEGMENT)
+    columns, rows = np.empty(SEGMENT, np.int32), np.empty(SEGMENT, np.int32)
+    flat_sums, flat_counts = sums.reshape(-1), counts.reshape(-1)
+    for s in range(x[0].size):
+        segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, angles)
+        _pixels(angles, half_x, width, columns)
+        segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, angles)
+        _pixels(angles, half_y, height, rows)
+        for i in range(SEGMENT):
+            rows[i] = rows[i] * width + columns[i] if min(rows[i], columns[i]) >= 0 else OUTSIDE
+        at = s * SEGMENT
+        for i in range(min(SEGMENT, intensity.size - at)):
+            value = intensity[at + i]
+            if rows[i] >= 0 and value == value:
+                pixel = np.uint32(rows[i])
+                flat_counts[pixel] += np.uint32(1)
+                flat_sums[pixel] += value
+
+
+def accumulate_slow(
+    x: SlowAngle,
+    y: SlowAngle,
+    first: int,
+    intensity: NDArray[Any],
+    grid: Grid,
+    sums: NDArray[np.float64] | None = None,
+    counts: NDArray[np.uint32] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+    """Add samples ``first`` on to the sums and counts of their pixels; otherwise as ``mapping.accumulate``.
+
+    Args:
+        x, y: angles on the intensity's clock.
+        intensity: shape (n,); NaN is left out.
+
+    Raises:
+        BadInput: an intensity that is not one-dimensional, or goes on beyond the angles.
+    """
+    intensity = np.asarray(intensity)
+    size = min(x.size, y.size)
+    if intensity.ndim != 1 or first + intensity.size > size:
+        raise BadInput(
+            f"an intensity of shape {intensity.shape} from sample {first} on, for angles of {size} samples",
+            hint="give one intensity for each angle",
+        )
+    sums = np.zeros((grid.height, grid.width)) if sums is None else sums
+    counts = np.zeros((grid.height, grid.width), np.uint32) if counts is None else counts
+    if intensity.size:
+        part = first, first + intensity.size
+        a, b = ((s.first, s.turn, s.lines, s.line_steps) for s in (x.segments(*part), y.segments(*part)))
+        _accumulate(a, b, intensity, grid.half_angle_x, grid.half_angle_y, sums, counts)
+    return sums, counts
