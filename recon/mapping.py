@@ -60,6 +60,7 @@ class Picture:
 
 @numba.njit(cache=True, inline="always")
 def pixel_of(angle: float, half_angle: float, n: int) -> int:
+    """`pixel_index` of one angle, for use in compiled loops."""
     position = angle / half_angle
     if not abs(position) <= 1.0:  # outside the field, and NaN, which no comparison holds for
         return -1
