@@ -141,8 +141,8 @@ def _fit(basis: list[Array], values: Array) -> Array:
 
 
 def _correlation(a: Array, b: Array) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    return float(np.sum(a * b) / max(math.sqrt(np.sum(a * a) * np.sum(b * b)), 1e-300))
+    from_a, from_b = a - np.mean(a), b - np.mean(b)
+    return float(np.sum(from_a * from_b) / max(math.sqrt(np.sum(from_a**2) * np.sum(from_b**2)), 1e-300))
 
 
 def _averaged(scene: Array, shape: tuple[int, ...] | Array) -> Array:
