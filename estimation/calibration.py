@@ -133,14 +133,10 @@ class _Axis:
 
     def conclude(self) -> None:
         """The torque's scale from driven motion, else what a bias tells of it, else the nominal J."""
-        comb = self.axis.capacitance
-        if comb is not None:
-            told = {key: self.values[key].value for key in ("theta0", "theta_th", "C0") if key in self.values}
-            comb = replace(comb, **told)
+        axis = self.device_axis()  # with the bell as found
         frequencies = {round(record.frequency) for record in self.driven}
-        if len(frequencies) > 1 and comb is not None and self.axis.require_drive().kind == "electrostatic":
-            found = mechanics_from_driven(comb, self.driven)
-            self.values |= found
+        if len(frequencies) > 1:
+            self.values |= mechanics_from_driven(axis, self.driven)
             return
         if self.driven:
             self.notes.append(f"{self.name}: one drive frequency does not tell J; record two or more")

@@ -22,7 +22,7 @@ from scanner.lowpass import lowpass, step_coefficients
 Array = NDArray[np.float64]
 
 CYCLES = 20.0  # of the motion, a block of a driven record
-STEPS_A_CYCLE = 40  # of Runge-Kutta in a ringdown's fit: phase right to 1e-6 a cycle
+STEPS_A_CYCLE = 80  # of Runge-Kutta in a ringdown's fit: its frequency is then right to 3e-7
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,24 @@ class Driven:
     rate: float
 
 
-def mechanics_from_driven(comb: Capacitance, records: Sequence[Driven]) -> dict[str, Value]:
+def drive_torque(axis: Axis, record: Driven) -> Array:
+    """Torque of the drive at the samples of a record, shape (n,) [N m]."""
+    drive = axis.require_drive()
+    if drive.kind == "linear":
+        return (drive.torque_per_volt or 0.0) * record.voltage
+    comb = axis.require_capacitance()
+    return electrostatic_torque(capacitance_slope(record.angle, comb.C0, comb.theta0, comb.theta_th), record.voltage)
+
+
+def mechanics_from_driven(axis: Axis, records: Sequence[Driven]) -> dict[str, Value]:
     """``J``, ``b`` and ``k`` from driven motion: the equation of motion (chen2020 eq 9), at the motion's frequency.
 
     A block's phasors of angle and torque obey (k/J - w^2 + j w b/J) Θ = T / J, linear in k/J, b/J and 1/J. Phase and
     amplitude at one drive frequency give two equations, so two frequencies are needed.
+
+    Args:
+        axis: its drive and its capacitance set the torque; its mechanics are not used.
+        records: steady motion.
 
     Raises:
         BadInput: one frequency only.
@@ -86,11 +99,10 @@ def mechanics_from_driven(comb: Capacitance, records: Sequence[Driven]) -> dict[
     rows, targets = [], []
     for record in records:
         w = 2 * np.pi * record.frequency
-        slope = capacitance_slope(record.angle, comb.C0, comb.theta0, comb.theta_th)
         block = block_length(record.frequency, record.rate, CYCLES)
         turn, torque = (
             block_phasors(values, record.rate, 0.0, record.frequency, block)[1]
-            for values in (record.angle, electrostatic_torque(slope, record.voltage))
+            for values in (record.angle, drive_torque(axis, record))
         )
         unit = np.exp(-1j * np.angle(turn))  # every block's angle made real: rows are then in phase and in quadrature
         row = np.stack([np.abs(turn), 1j * w * np.abs(turn), -torque * unit], axis=1)

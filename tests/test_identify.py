@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.papers.sine import driven, linear_axis
 from benchmarks.papers.threshold import sensing_axis
 from estimation.calibration import identify, kind_of
 from estimation.identify import Driven, mechanics_from_driven, profile, ringdown
@@ -16,6 +17,7 @@ from phantoms.waveforms import Constant, Sine
 from recon.cli import main
 from scanner.device import Device
 from scanner.devices import load
+from scanner.drift import Drift
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
@@ -55,16 +57,29 @@ def test_driven_motion_tells_the_torques_scale(moving):
     for seed in range(40):
         rng = np.random.default_rng(seed)
         noisy = [replace(r, angle=r.angle + PSD * rng.standard_normal(r.angle.size)) for r in moving]
-        draws.append(mechanics_from_driven(AXIS.require_capacitance(), noisy))
+        draws.append(mechanics_from_driven(AXIS, noisy))
     truth = {"J": m.J, "b": m.b, "k": m.k}
     for key, value in truth.items():
         assert np.mean([d[key].value for d in draws]) == pytest.approx(value, rel=2e-3)
     assert min(coverage(draws, truth).values()) >= 0.8
 
 
+def test_a_linear_drive_tells_them_too():
+    true = linear_axis(1000.0, 50.0)
+    records = []
+    for f in (960.0, 1030.0):
+        angle, drive = driven(true, f, 0.05, 0.1, Drift())
+        noisy = angle + PSD * np.random.default_rng(int(f)).standard_normal(angle.size)
+        records.append(Driven(noisy, drive(np.arange(angle.size) / 1e6), f, 1e6))
+    found, m = mechanics_from_driven(true, records), true.require_mechanics()
+    for key in ("J", "b", "k"):
+        assert found[key].value == pytest.approx(getattr(m, key), abs=4 * found[key].sd)
+        assert found[key].sd < 1e-3 * getattr(m, key)
+
+
 def test_one_drive_frequency_is_not_enough(moving):
     with pytest.raises(BadInput, match="two or more drive frequencies"):
-        mechanics_from_driven(AXIS.require_capacitance(), moving[:1])
+        mechanics_from_driven(AXIS, moving[:1])
 
 
 def test_a_ringdown_tells_frequency_and_damping(decay):

@@ -65,7 +65,7 @@ def torque_scales(axis: Axis, seed: int, noise: float = 2e-4) -> dict[str, tuple
         time = np.arange(moved[::2].size) / RATE
         seen = moved[::2] + noise * rng.standard_normal(time.size)
         records.append(Driven(seen, plan.drives["x"](time), f / 2, RATE))
-    driven = mechanics_from_driven(axis.require_capacitance(), records)
+    driven = mechanics_from_driven(axis, records)
     return {"ringdown": (ring["J"].value, ring["J"].sd), "driven": (driven["J"].value, driven["J"].sd)}
 
 

@@ -11,16 +11,16 @@ from benchmarks.papers.figures import HERE, Results
 from scanner.errors import BadInput
 from scanner.files import replacing
 
-PARTS = ("circuit", "parametric", "table3", "threshold", "hybrid", "sine", "registration")
+PARTS = ("circuit", "parametric", "identification", "table3", "threshold", "hybrid", "sine", "registration")
 
 
 def main(names: list[str]) -> None:
-    """Run the named parts (all by default) and update ``results.json`` with theirs."""
+    """Run the named parts and put theirs into ``results.json``; all of them, which starts it anew, by default."""
     unknown = set(names) - set(PARTS)
     if unknown:
         raise BadInput(f"no part is named {', '.join(sorted(unknown))}", hint=f"there are {', '.join(PARTS)}")
     path = HERE / "results.json"
-    results: Results = json.loads(path.read_text()) if path.exists() else {}
+    results: Results = json.loads(path.read_text()) if names and path.exists() else {}
     for name in names or PARTS:
         begun = time.perf_counter()
         found: Results = import_module(f"benchmarks.papers.{name}").results()

@@ -255,7 +255,7 @@ def lag_modelled(of: Trial, half: Sequence[int]) -> tuple[Axis, Callable[[Array,
     comb = of.axis.require_capacitance()
     sections = (*of.axis.require_readout().lpf_hz, envelope_section(AmdmCircuit()))
     records, senses = [of.references[i] for i in half], [of.senses[i] for i in half]
-    mechanics = mechanics_from_driven(comb, records)
+    mechanics = mechanics_from_driven(of.axis, records)
     full = readout_from_driven(comb, records, senses, sections)
     line = readout_from_driven(comb, records, senses, sections, ("a_cir", "b_cir"))
     axis = replace(of.axis, mechanics=Mechanics(**{key: found.value for key, found in mechanics.items()}))
@@ -303,6 +303,7 @@ TRIALS, SEED = 12, 2020
 def results() -> Results:
     """Entries of ``results.json``, and the paper's figs 8 and 9."""
     table = run(TRIALS, SEED)
+    draw_signals(trial(scene(3), SEED))
     out: Results = {}
     for name, (phase, angle) in PAPER.items():
         for what, paper in (("peak", phase), ("angle", angle)):
@@ -336,6 +337,29 @@ def results() -> Results:
     out["chen2020.lag_modelled.phase_rmse_deg"] = max(both, key=lambda e: e["ours"])
     draw(table)
     return out
+
+
+def draw_signals(of: Trial) -> None:
+    """Fig 8: drive and angle over two periods at the middle of the band, true and estimated."""
+    middle = len(of.scene.frequencies) // 2 | 1
+    sense, drive, true = of.senses[middle], of.references[middle].voltage, of.scene.records[middle][1]
+    paper, late = constant_phase(of, range(0, len(of.senses), 2))
+    shown = {
+        "ACM": theta(problem_of(of.axis, sense, drive), "acm", PRINTED_TORQUE_NOISE),
+        "EKF": theta(problem_of(paper, sense, drive, late), "ekf", 1e14),
+        "UKF": theta(problem_of(paper, sense, drive, late), "ukf", 1e14),
+    }
+    cut = slice(round(SCORED_FROM * RATE), round(SCORED_FROM * RATE) + 640)
+    time = 1e6 * np.arange(640) / RATE
+    with figure("chen2020_fig8", rows=2, size=(7.0, 4.6)) as axes:
+        axes[0, 0].plot(time, drive[cut])
+        axes[0, 0].set(ylabel="drive [V]")
+        axes[1, 0].plot(time, np.rad2deg(true[cut]), "k", label="true")
+        for name, found in shown.items():
+            turned = found[cut] * np.sign(found[cut] @ true[cut])
+            axes[1, 0].plot(time, np.rad2deg(turned), lw=0.8, label=name)
+        axes[1, 0].set(xlabel="time [us]", ylabel="angle [deg]")
+        axes[1, 0].legend(fontsize=7)
 
 
 def draw(table: Table) -> None:
