@@ -100,8 +100,8 @@ def reference_of(
         reference = drive_reference(drive, "half-drive", low)
         if own.mechanics and not 0.75 < reference.frequency / own.resonance < 1.33:
             raise BadInput(
-                f"oscillates at {2 * reference.frequency:.6g} Hz, and axis {axis} moves at half of that near its resonance "
-                f"of {own.resonance:.6g} Hz",
+                f"oscillates at {2 * reference.frequency:.6g} Hz, and axis {axis} moves at half of that near its "
+                f"resonance of {own.resonance:.6g} Hz",
                 file=drive.file,
                 channel=drive.name,
                 hint="check its sample_rate, and J and k of the device",

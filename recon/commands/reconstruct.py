@@ -29,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
-    parser.add_argument(
-        "--estimator", metavar="NAME", help="tracker, ukf, ekf, constant, sensor, ...; by what was recorded if not given"
-    )
+    parser.add_argument("--estimator", metavar="NAME", help="tracker, ukf, ekf, ...; else by what was recorded")
     parser.add_argument("--pixels", type=size, default=(400, 400), metavar="WxH", help="size of the picture (400x400)")
     parser.add_argument("--p", type=positive, default=1.0, help="pixels of shift that are tolerated (1)")
     parser.add_argument(
