@@ -152,7 +152,8 @@ def _averaged(scene: Array, shape: tuple[int, ...] | Array) -> Array:
 
     # What is far finer than the picture is averaged in blocks first: a filter as wide as a coarse pixel takes seconds.
     height, width = np.minimum(scene.shape, np.ceil(4.0 * np.asarray(shape))).astype(int)
-    scene = cv2.resize(np.asarray(scene, np.float64), (int(width), int(height)), interpolation=cv2.INTER_AREA)
+    size = int(width), int(height)
+    scene = np.asarray(cv2.resize(np.asarray(scene, np.float64), size, interpolation=cv2.INTER_AREA), np.float64)
     # A box of k points has the variance (k² - 1) / 12; itself it would have no middle where k is even.
     finer = np.array(scene.shape) / np.asarray(shape)
     return np.asarray(gaussian_filter(scene, np.sqrt(np.maximum(finer**2 - 1.0, 0.0) / 12.0), mode="nearest"))
