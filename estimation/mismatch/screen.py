@@ -13,9 +13,9 @@ from estimation.mismatch.fit import Comparison, Fit
 from estimation.mismatch.model import Candidate, Model
 from scanner.device import Device
 from scanner.terms import Term
+from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
-AMPLITUDES = ("linear", "inverse", "factor")
 
 
 @dataclass(frozen=True)

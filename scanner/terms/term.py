@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 STAGES = ("drive", "mechanics", "capacitance", "readout", "timing", "optics")
 AMPLITUDES = ("linear", "inverse", "factor")
+"""Kinds of parameter that say how much of the effect there is: at x = 0 there is none."""
 
 
 @dataclass(frozen=True)
