@@ -43,26 +43,24 @@ def parts(
     phase: Array,
     swing: Array,
     optics_px: float = 0.0,
-    turn: float = 0.0,
 ) -> dict[str, float]:
     """Displacement of samples along one axis by cause, rms over the scan [px]; the causes add in quadrature.
 
     theta = A sin(alpha) is moved by A cos(alpha) dphi + dA sin(alpha): over a period the two are uncorrelated and each
-    counts half. The law of the pixels (ceil, chen2020 eq 2) spreads a sample evenly over one pixel, variance 1/12, and
-    a detector that integrates over one sample spreads it evenly over the way A cos(alpha) turn that the beam goes.
+    counts half. The law of the pixels (ceil, chen2020 eq 2) spreads a sample evenly over one pixel: variance 1/12.
+    The detector is taken to sample instants; one that integrates belongs to the optics.
 
     Args:
         amplitude: of the motion [rad]. half_angle: of the field [rad]. pixels: across it.
         phase: phase errors, or their standard deviations, any shape [rad].
         swing: relative errors of the amplitude about its mean, any shape; a uniform one is magnification, no blur.
         optics_px: standard deviation of the spot [px].
-        turn: what the motion's phase advances while the detector integrates, 2 pi f / rate [rad]; 0 samples instants.
     """
     scale = 0.5 * pixels * amplitude / half_angle
     found = {
         "phase": scale * math.sqrt(0.5 * float(np.mean(np.square(phase)))),
         "amplitude": scale * math.sqrt(0.5 * float(np.mean(np.square(swing)))),
-        "sampling": math.sqrt((1.0 + 0.5 * (scale * turn) ** 2) / 12.0),
+        "sampling": math.sqrt(1.0 / 12.0),
         "optics": optics_px,
     }
     return found | {"total": math.sqrt(sum(value**2 for value in found.values()))}
