@@ -191,7 +191,7 @@ def integrate(
     return angle, rate
 
 
-class _Address(types.WrapperAddressProtocol):  # type: ignore[misc]
+class _Address(types.WrapperAddressProtocol):
     """A compiled law by its address: asking numba for it anew at every call would cost more than the integration."""
 
     def __init__(self, law: Callable[..., Any]):

@@ -1,6 +1,9 @@
 """Shared by all tests."""
 
+import os
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
 
 import hypothesis
 import pytest
