@@ -18,6 +18,12 @@ Array = NDArray[np.float64]
 CHUNK = 1 << 20
 """Samples that are looked at in one go where a whole channel has to pass by."""
 
+SLOWEST, FASTEST = 1e-6, 1e15
+"""Sample rates that a clock can have [Hz]."""
+
+LARGEST = 1e100
+"""Values beyond are no measurement, and their squares no numbers."""
+
 CHANNEL_UNITS = {
     "drive_x": "V", "drive_y": "V", "bias_x": "V", "bias_y": "V",
     "sense_x": "V", "sense_y": "V", "sense": "V",
@@ -146,8 +152,10 @@ def checked_channel(
             state = "is missing" if value is None else f"is {value!r}, not a finite number"
             raise bad(f"{key} {state}", f"state {key} as a number")
     rate, first_time, slope, zero = (float(value) for value in numbers.values())  # type: ignore[arg-type]
-    if rate <= 0:
-        raise bad(f"sample_rate is {rate:g} Hz", "state a rate greater than 0")
+    if not SLOWEST <= rate <= FASTEST:
+        raise bad(f"sample_rate is {rate:g} Hz", f"state a rate from {SLOWEST:g} to {FASTEST:g} Hz")
+    if (abs(first_time) + raw.shape[0] / rate) * rate > 2**52:
+        raise bad(f"starts at {first_time:g} s, where its samples have one and the same time", "state start near 0")
     if slope == 0:
         raise bad("gain is 0, which leaves nothing of the samples", "state value = gain * raw + offset")
     own, factor = _own_unit(name, unit, file)
@@ -162,7 +170,8 @@ def check_signal(signal: Channel, *, constant_ok: bool = False) -> None:
         constant_ok: a channel that never changes is fine (a bias).
 
     Raises:
-        BadInput: a sample that is not finite (with the time of the first one), or a signal that never changes.
+        BadInput: a sample that is not finite (with the time of the first one) or no measurement, or a signal that never
+            changes.
     """
     low, high = np.inf, -np.inf
     for first in range(0, signal.size, CHUNK):
@@ -174,6 +183,9 @@ def check_signal(signal: Channel, *, constant_ok: bool = False) -> None:
             hint = "cut the recording there or repair the sample"
             raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
         low, high = min(low, values.min()), max(high, values.max())
+    if max(-low, high) > LARGEST:
+        what = f"reaches {max(-low, high):.3g} {signal.unit}"
+        raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:
         what = f"stays at {low:.9g} {signal.unit} throughout"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check that it was connected")

@@ -142,7 +142,7 @@ HOLDS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
             ("1000.0", '"1 kHz"'),
             "BOTH: sense_x: sample_rate is '1 kHz', not a finite number; state sample_rate as a number",
         ),
-        (("1000.0", "-1"), "BOTH: sense_x: sample_rate is -1 Hz; state a rate greater than 0"),
+        (("1000.0", "-1"), "BOTH: sense_x: sample_rate is -1 Hz; state a rate from 1e-06 to 1e+15 Hz"),
         (('"x"', '"z"'), "BOTH: sense_x: has shape (2, 2); store it as (n,)"),
         (('"x"', '"cell"'), "BOTH: sense_x: holds object, not real numbers; store integers or floats"),
         (('"x"', '"label"'), "BOTH: sense_x: holds <U1, not real numbers; store integers or floats"),

@@ -228,9 +228,9 @@ Delta_X	0,25	0,5
 ***End_of_Header***
 X_Value	V	slow	Comment
 0,00	1,5	7	warm
-0,25	2,5	
+0,25	2,5\t
 0,50	3,5	8
-0,75	4,5	
+0,75	4,5\t
 """
 
 

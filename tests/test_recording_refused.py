@@ -79,7 +79,7 @@ BAD_FILES = {
     ),
     "rate zero": (
         replaced("sense_x", [1.0], sample_rate=0.0),
-        "sense_x: sample_rate is 0 Hz; state a rate greater than 0",
+        "sense_x: sample_rate is 0 Hz; state a rate from 1e-06 to 1e+15 Hz",
     ),
     "rate nan": (
         replaced("sense_x", [1.0], sample_rate=nan),

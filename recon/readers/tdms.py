@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recon.readers.contents import Contents, Lazy, Variable, rate_of, spelled, unique
 from scanner.errors import BadInput
+from scanner.files import check_claim
 
 # LabVIEW's zero of time, which stands where a waveform has no absolute start.
 EPOCH = np.datetime64("1904-01-01T00:00:00")
@@ -36,6 +37,8 @@ def read_tdms(path: Path) -> Contents:
         file = TdmsFile.open(path)
         note = "the file's last part is incomplete" if file.file_status.incomplete_final_segment else ""
         channels = [channel for group in file.groups() for channel in group.channels()]
+        for item in (file, *file.groups(), *channels):
+            _check_scales(item.properties)
         names = unique(f"{channel.group_name}/{channel.name}" for channel in channels)
         begun = [_absolute(channel.properties.get("wf_start_time")) for channel in channels]
         zero = min((time for time in begun if time is not None), default=None)
@@ -58,6 +61,12 @@ def _parsing(path: Path, channel: str | None = None) -> Iterator[None]:
         raise BadInput(what, file=path, channel=channel, hint="copy it again") from None
 
 
+def _check_scales(said: Mapping[str, Any]) -> None:
+    """nptdms counts to the number of scales that is claimed; each needs properties of its own."""
+    if said.get("NI_Number_Of_Scales", 0) > len(said):
+        raise ValueError(f"claims {said['NI_Number_Of_Scales']} scales")
+
+
 def _absolute(value: object) -> np.datetime64 | None:
     known = isinstance(value, np.datetime64) and not np.isnat(value) and value > EPOCH
     return value if known else None  # type: ignore[return-value]
@@ -74,4 +83,6 @@ def _variable(path: Path, channel: Any, note: str, begun: float) -> Variable:
         with _parsing(path, channel.name):
             return np.asarray(channel[first:stop])
 
-    return Variable(Lazy((len(channel),), np.dtype(channel.dtype), fetch), unit, rate, start, note)
+    dtype = np.dtype(channel.dtype)
+    check_claim(len(channel) * dtype.itemsize, path.stat().st_size, file=path, channel=channel.name)
+    return Variable(Lazy((len(channel),), dtype, fetch), unit, rate, start, note)
