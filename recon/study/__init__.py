@@ -1,0 +1,1 @@
+"""Blur studies: many simulated recordings, each reconstructed in many ways, as one table."""

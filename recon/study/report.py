@@ -1,0 +1,192 @@
+"""The report of a study: blur against phase error, where the bound holds, estimator against estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import blur, views
+from recon.report import Figure, Section, Table, render
+from recon.study.plan import Study
+from recon.study.table import Columns
+
+Array = NDArray[np.float64]
+
+LEAST_DEG = 1e-4  # phase errors below are drawn here: an error of 0 has no place on a logarithmic axis
+
+
+def study_report(study: Study, data: Columns, summary: Mapping[str, Any]) -> str:
+    """The page.
+
+    Args:
+        data: the study's table as columns (``recon.study.table.columns``).
+    """
+    snr = f"{len(study.snr_db)} noise levels" if study.snr_db else "the device's own noise"
+    lead = (
+        f"{len(study.phantoms)} phantoms, {len(study.designs)} scan designs, {len(study.drifts)} drifts, {snr}, "
+        f"{study.seeds} seeds, {len(study.estimators)} estimators, {len(study.pixels)} resolutions, {len(study.p)} "
+        f"values of p: {summary['cells']} cells, {summary['failed']} of them failed."
+    )
+    worked = {name: column[data["failed"] == ""] for name, column in data.items()}
+    notes = [f"failed: {reason}" for reason in summary["reasons"]]
+    sections = [Section("Estimators", ESTIMATORS_TEXT, _estimators(summary["estimators"]))]
+    if worked["seed"].size:
+        maps = [_bound_map(study, worked, design.name) for design in study.designs]
+        sections += [
+            Section("Blur against phase error", BLUR_TEXT, figures=[_blur_figure(study, worked)], least="40rem"),
+            Section("Where the bound holds", MAP_TEXT, figures=maps, least="40rem"),
+            Section(
+                "Estimator against estimator",
+                RIVALS_TEXT,
+                _rivals(study, worked),
+                [_error_figure(study, worked)],
+                "40rem",
+            ),
+        ]
+    return render(study.name, lead, sections, notes)
+
+
+ESTIMATORS_TEXT = (
+    "Over all recordings, resolutions and both axes. Phase error: rms over a scan. Picture error: rms against the "
+    "noiseless scene, in units of the scene's contrast."
+)
+BLUR_TEXT = (
+    "Above, the phase's share of the blur; a phase error δφ moves a sample by m δφ cos α pixels, rms m δφ/√2 (line). "
+    "Below, the picture's own error, which knows nothing of that law. Dashed: the bound p/m."
+)
+MAP_TEXT = (
+    "How much of the scan has a phase error within ±p/m: mean over phantoms, noise levels, seeds and both axes."
+)
+RIVALS_TEXT = (
+    "How often, in per cent of recordings and axes, the estimator of the row has a smaller phase error than that of "
+    "the column; both saw the same recordings. Below, phase error: median, and the 10th to the 90th percentile."
+)
+
+
+def _estimators(statistics: Mapping[str, Mapping[str, float | None]]) -> Table:
+    head = ["", "phase error, median [°]", "95th percentile [°]", "scan within ±p/m", "picture error", "time [s]"]
+    rows = []
+    for name, own in statistics.items():
+        formats = {
+            "phase_rmse_deg_median": ".4f", "phase_rmse_deg_p95": ".4f", "within_bound": ".1%",
+            "picture_error_median": ".3f", "seconds_median": ".2f", "failed": ".1%",
+        }  # fmt: skip
+        rows.append([name, *("–" if (v := own[key]) is None else format(v, spec) for key, spec in formats.items())])
+    return Table([*head, "failed"], rows)
+
+
+def _blur_figure(study: Study, data: Columns) -> Figure:
+    drawing, axes = views.figure(2, len(study.pixels), (max(4.5, 3.4 * len(study.pixels)), 5.4))
+    middle = study.p[len(study.p) // 2]
+    for column, pixels in enumerate(study.pixels):
+        here = (data["pixels"] == pixels) & (data["p"] == study.p[0])
+        law = np.geomspace(max(LEAST_DEG, data["phase_rmse_deg"][here].min(initial=1.0)), 20.0, 50)
+        axes[0, column].plot(law, 0.5 * pixels * np.radians(law) / np.sqrt(2.0), color="#444", lw=0.8)
+        for name, colour in zip(study.estimators, _colours(), strict=False):
+            own = here & (data["estimator"] == name)
+            error = np.maximum(data["phase_rmse_deg"][own], LEAST_DEG)
+            for row, what in enumerate(("blur_phase_px", "picture_error")):
+                axes[row, column].loglog(error, data[what][own], ".", ms=4, alpha=0.6, color=colour, label=name)
+        for row in (0, 1):
+            for p in study.p:
+                bound = np.degrees(blur.bound(p, pixels / 2))
+                axes[row, column].axvline(bound, color="#444", lw=0.8, ls="--")
+                axes[row, column].text(
+                    bound, 0.98, f" p = {p:g}", transform=axes[row, column].get_xaxis_transform(), va="top", fontsize=7
+                )
+        axes[0, column].axhline(middle / np.sqrt(2.0), color="#bbb", lw=0.6)
+        axes[0, column].set(title=f"{pixels} × {pixels} pixels")
+        axes[1, column].set(xlabel="phase error, rms [°]")
+    axes[0, 0].set(ylabel="blur by phase, rms [px]")
+    axes[1, 0].set(ylabel="picture error")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return Figure(views.figure_uri(drawing), "blur by phase and picture error; each dot is one scan and axis")
+
+
+def _bound_map(study: Study, data: Columns, design: str) -> Figure:
+    """Fraction of the scan within the bound over (resolution, drift): a panel for each p and estimator."""
+    drifts = sorted(study.drifts)
+    pixels = sorted(study.pixels)
+    size = (1.2 + 2.2 * len(study.estimators), 0.9 + (0.6 + 0.28 * len(drifts)) * len(study.p))
+    drawing, axes = views.figure(len(study.p), len(study.estimators), size)
+    for row, p in enumerate(study.p):
+        for column, name in enumerate(study.estimators):
+            chosen = (data["design"] == design) & (data["p"] == p) & (data["estimator"] == name)
+            held = _means(data, chosen, ("drift", drifts), ("pixels", [float(n) for n in pixels]))
+            panel = axes[row, column]
+            panel.imshow(held, vmin=0.0, vmax=1.0, cmap="RdYlGn", aspect="auto")
+            for i, j in np.ndindex(held.shape):
+                if np.isfinite(held[i, j]):
+                    panel.text(j, i, f"{100 * held[i, j]:.0f}", ha="center", va="center", fontsize=8, color="#111")
+            panel.set(
+                xticks=range(len(pixels)),
+                xticklabels=[f"{n}" for n in pixels] if p == study.p[-1] else [],
+                yticks=range(len(drifts)),
+                yticklabels=[f"{100 * d:g} %" for d in drifts] if column == 0 else [],
+            )
+            if row == 0:
+                panel.set_title(name, fontsize=9)
+            if column == 0:
+                panel.set_ylabel(f"drift, p = {p:g}")
+    drawing.supxlabel("pixels across", fontsize=9)
+    return Figure(views.figure_uri(drawing), f"{design}: per cent of the scan within ±p/m, by resolution and drift")
+
+
+def _means(
+    data: Columns, chosen: NDArray[np.bool_], rows: tuple[str, Sequence[float]], across: tuple[str, Sequence[float]]
+) -> Array:
+    """Mean of ``within_bound`` over the chosen rows at each pair of two columns' values; nan where there are none."""
+    out = np.full((len(rows[1]), len(across[1])), np.nan)
+    for i, j in np.ndindex(out.shape):
+        own = chosen & (data[rows[0]] == rows[1][i]) & (data[across[0]] == across[1][j])
+        if own.any():
+            out[i, j] = np.mean(data["within_bound"][own])
+    return out
+
+
+def _rivals(study: Study, data: Columns) -> Table:
+    """For each pair of estimators, in which part of what both did the row's has the smaller phase error."""
+    errors: dict[str, dict[tuple[Any, ...], float]] = {name: {} for name in study.estimators}
+    once = (data["pixels"] == study.pixels[0]) & (data["p"] == study.p[0])  # a phase error knows neither
+    scans = zip(*(data[name][once] for name in ("phantom", "design", "drift", "snr_db", "seed", "axis")), strict=True)
+    names, values = data["estimator"][once], data["phase_rmse_deg"][once]
+    for scan, name, value in zip(scans, names, values, strict=True):
+        errors[str(name)][tuple(str(each) for each in scan)] = float(value)
+
+    def wins(row: str, column: str) -> str:
+        both = errors[row].keys() & errors[column].keys()
+        if row == column or not both:
+            return "–"
+        return f"{100 * np.mean([errors[row][scan] < errors[column][scan] for scan in both]):.0f}"
+
+    table = [[row, *(wins(row, column) for column in study.estimators)] for row in study.estimators]
+    return Table(["", *study.estimators], table)
+
+
+def _error_figure(study: Study, data: Columns) -> Figure:
+    panels = [("drift", "drift of the stiffness [%]", 100.0)]
+    if len(study.snr_db) > 1:
+        panels.append(("snr_db", "SNR of the sense signal [dB]", 1.0))
+    drawing, axes = views.figure(1, len(panels), (4.6 * len(panels), 3.2))
+    for panel, (what, label, unit) in zip(axes[0], panels, strict=True):
+        for name, colour in zip(study.estimators, _colours(), strict=False):
+            own = data["estimator"] == name
+            at = np.unique(data[what][own])
+            if not at.size:
+                continue
+            error = [np.maximum(data["phase_rmse_deg"][own & (data[what] == value)], LEAST_DEG) for value in at]
+            low, median, high = np.array([np.percentile(each, [10, 50, 90]) for each in error]).T
+            panel.fill_between(unit * at, low, high, color=colour, alpha=0.15, lw=0)
+            panel.plot(unit * at, median, "o-", ms=3, lw=1.2, color=colour, label=name)
+        panel.set(yscale="log", xlabel=label)
+    axes[0, 0].set_ylabel("phase error, rms [°]")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return Figure(views.figure_uri(drawing), "phase error of each estimator: median, 10th to 90th percentile")
+
+
+def _colours() -> list[str]:
+    """Enough colours for every estimator there is."""
+    return [*views.COLOURS, "#4aa3a2", "#7a7a7a", "#d08fb2"]
