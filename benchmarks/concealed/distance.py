@@ -1,13 +1,14 @@
 """How plainly a recording shows what is hidden in it, and how far that lies from its nearest look-alike, in sigma.
 
-Linearised at the truth: every effect is the change that it makes in the whitened channels, scaled to its size; what the
-nominal parameters within their tolerances, the unknown start and a free offset can imitate is projected out, then
-what each look-alike at any size can. Two hypotheses at distance d are told apart with probability Phi(d/2).
+Linearised at the scanner without the effect: the effect is the change that it makes in the whitened channels, scaled to
+its size; what the nominal parameters within their tolerances, the unknown start and a free offset can imitate is
+projected out, then what each look-alike at any size can. Two hypotheses at distance d are told apart with probability
+Phi(d/2). Not at the truth: there, scaling laws make an effect look like a change of gain and torque together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from math import pi
 from typing import Any
@@ -15,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.concealed.effects import CATALOGUE, Effect
-from benchmarks.concealed.generator import Sealed
+from benchmarks.concealed.effects import CATALOGUE, Effect, Scene, Shape
+from benchmarks.concealed.generator import Hidden, Sealed
 from benchmarks.concealed.motion import RATE, THETA
-from benchmarks.concealed.readout import limited, observe
+from benchmarks.concealed.readout import limited, observe, settle
 from benchmarks.concealed.scanner_truth import Truth
 from benchmarks.concealed.worlds import World
 
@@ -28,46 +29,63 @@ UNSTATED = 0.02
 """Relative uncertainty of a nominal value whose tolerance the device file does not state."""
 START = 0.1
 """Uncertainty of the state in which a recording finds the mirror, over its swing."""
+SHAPES = np.array([[0.45, 0.55, 0.4], [0.15, 0.85, 0.1], [0.8, 0.2, 0.75]])
+"""At which a look-alike whose law has a shape is tried; their span is what it can imitate."""
 FIELDS = {"b_cir": "offset"}
 """Nominal values that the truth calls by another name."""
 
 
 def distances(sealed: Sealed) -> list[dict[str, Any]]:
     """For every hidden effect ``sigma``, its own size, and the ``distance`` to its ``nearest`` listed look-alike."""
-    world, truth = sealed.world, sealed.truth
-    here = _whitened(sealed, world, truth)
+    return [_distance(sealed, i) for i in range(len(sealed.hidden))]
+
+
+def _distance(sealed: Sealed, i: int) -> dict[str, Any]:
+    scene, secret = sealed.scene, sealed.hidden[i]
+    others = [h for j, h in enumerate(sealed.hidden) if j != i]
+    base = _hiding(scene, others)
+    world = settle(scene.world, base)
+    here = _whitened(sealed, world, base)
 
     def change(to: Truth, by: float, start: World = world) -> Array:
         return (_whitened(sealed, start, to) - here) / by
 
-    hidden = [_tangent(sealed, i, change) for i in range(len(sealed.hidden))]
-    nuisances, priors = zip(*_nuisances(sealed, change), strict=True)
-    rivals = list(_rivals(sealed, change))
-    columns = np.array([*hidden, *nuisances, *(column for _, column in rivals)])
+    def column(effect: Effect, size: float, shape: Shape) -> Array:
+        """What an effect adds, from a share of it small enough to be linear in."""
+        return change(effect.on(base, scene, effect.gentle * size, shape), effect.gentle**effect.power)
+
+    nuisances, priors = zip(*_nuisances(sealed, world, base, change), strict=True)
+    free = [change(_hiding(scene, [replace(h, size=1.005 * h.size) for h in others]), 0.005)] if others else []
+    taken = {name for h in sealed.hidden for name in h.fields}
+    rivals = [
+        (effect.name, column(effect, size, shape))
+        for effect in CATALOGUE
+        if effect.shows_in(world)
+        for shape in SHAPES[: 3 if effect.shaped else 1]
+        # A law that no small share is linear in bends with its size: its smallest and its largest span the bend.
+        for size in effect.sizes[world.family][: 1 if effect.is_linear else 2]
+        if not taken & effect.law(scene, base, size, shape).keys()
+    ]
+    columns = np.array([column(secret.effect, secret.size, secret.shape), *nuisances, *free, *(c for _, c in rivals)])
     gram = columns @ columns.T
-    first = len(hidden)
-    known = list(range(first, first + len(nuisances)))
-    gram[known, known] += np.array(priors)
-    found = []
-    for i, secret in enumerate(sealed.hidden):
-        others = known + [j for j in range(first) if j != i]
-        apart: dict[str, float] = {}
-        for name in dict.fromkeys(name for name, _ in rivals):
-            rival = [first + len(nuisances) + j for j, (other, _) in enumerate(rivals) if other == name]
-            apart[name] = _left_over(gram, i, others + rival)
-        apart = dict(sorted(apart.items(), key=lambda item: item[1]))
-        nearest = next(iter(apart))
-        found.append({
-            "effect": secret.effect.name,
-            "sigma": _left_over(gram, i, others),
-            "nearest": nearest,
-            "distance": apart[nearest],
-            "rivals": {name: apart[name] for name in list(apart)[:5]},
-        })  # fmt: skip
-    return found
+    held = np.arange(1, 1 + len(nuisances))
+    gram[held, held] += np.array(priors)
+    first = 1 + len(nuisances) + len(free)
+    known = list(range(1, first))
+    apart = {
+        name: left_over(gram, 0, known + [first + j for j, (other, _) in enumerate(rivals) if other == name])
+        for name, _ in rivals
+    }
+    nearest_first = sorted(apart, key=lambda name: apart[name])
+    return {
+        "sigma": left_over(gram, 0, known),
+        "nearest": nearest_first[0],
+        "distance": apart[nearest_first[0]],
+        "rivals": {name: apart[name] for name in nearest_first[:5]},
+    }
 
 
-def _left_over(gram: Array, i: int, projected: list[int]) -> float:
+def left_over(gram: Array, i: int, projected: list[int]) -> float:
     """Length of column i once the span of the ``projected`` columns, each held by its prior, is taken out."""
     scale = np.sqrt(np.diag(gram)[projected])
     scale[scale == 0] = 1.0
@@ -90,23 +108,18 @@ def _whitened(sealed: Sealed, world: World, truth: Truth) -> Array:
     return np.concatenate(white)
 
 
-def _tangent(sealed: Sealed, i: int, change: Callable[..., Array]) -> Array:
-    """What the i-th hidden effect does to the channels, from its slope at the truth."""
-    less = 0.005
-    sizes = [h.size * (1 - less * (j == i)) for j, h in enumerate(sealed.hidden)]
-    return change(_with_sizes(sealed, sizes), -less)
-
-
-def _with_sizes(sealed: Sealed, sizes: list[float]) -> Truth:
-    truth = sealed.scene.world.truth
-    for h, size in zip(sealed.hidden, sizes, strict=True):
-        truth = h.effect.on(truth, sealed.scene, size, h.shape)
+def _hiding(scene: Scene, hidden: Iterable[Hidden]) -> Truth:
+    """The scene's scanner with these effects in it."""
+    truth = scene.world.truth
+    for h in hidden:
+        truth = h.effect.on(truth, scene, h.size, h.shape)
     return truth
 
 
-def _nuisances(sealed: Sealed, change: Callable[..., Array]) -> Iterator[tuple[Array, float]]:
+def _nuisances(
+    sealed: Sealed, world: World, truth: Truth, change: Callable[..., Array]
+) -> Iterator[tuple[Array, float]]:
     """Columns of what a fit is free to move, and the weight of the prior that holds each: 1 of a tolerance, 0 none."""
-    world, truth = sealed.world, sealed.truth
     tolerance: dict[str, float] = dict(world.device["x"]["tolerance"])
     if not truth.torque_per_volt:
         tolerance.setdefault("J", UNSTATED)
@@ -125,21 +138,3 @@ def _nuisances(sealed: Sealed, change: Callable[..., Array]) -> Iterator[tuple[A
         turn = 2 * pi * sealed.noise.mains * harmonic * t
         for wave in (np.sin(turn), np.cos(turn)):
             yield np.concatenate([wave, silent]), 0.0
-
-
-def _rivals(sealed: Sealed, change: Callable[..., Array]) -> Iterator[tuple[str, Array]]:
-    """Directions that the catalogue's other effects would move the channels in; several where the law has a shape."""
-    taken = {field for h in sealed.hidden for field in h.fields}
-    for effect in CATALOGUE:
-        if not effect.shows_in(sealed.world) or any(effect.name == h.effect.name for h in sealed.hidden):
-            continue
-        for u in (0.15, 0.45, 0.8) if effect.shaped else (0.5,):
-            fields = _small(sealed, effect, u)
-            if not taken & fields.keys():
-                yield effect.name, change(sealed.truth._replace(**fields), 1.0)
-
-
-def _small(sealed: Sealed, effect: Effect, u: float) -> dict[str, float]:
-    """An effect at half its smallest size."""
-    shape = np.array([u, 1 - u, u])
-    return effect.law(sealed.scene, sealed.truth, 0.5 * effect.sizes[sealed.world.family][0], shape)

@@ -61,6 +61,8 @@ class Effect:
         needs_angle: shows only against a reference detector.
         parameters: what the key calls a number and in how much of which unit, where that is not the number itself.
         listed: stands in the catalogue.
+        gentle: share of a size that is small enough for its change to be linear, yet large enough to be there at all.
+        power: of the size that a small change goes with.
     """
 
     name: str
@@ -72,6 +74,13 @@ class Effect:
     needs_angle: frozenset[str] = frozenset()
     parameters: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     listed: bool = True
+    gentle: float = 0.02
+    power: int = 1
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether a small share of a size tells the direction of all of it."""
+        return self.gentle <= 0.02
 
     def shows_in(self, world: World) -> bool:
         """Whether a recording of this world could show it."""
@@ -175,9 +184,9 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect("viscoelastic", "mechanics", {"ring": (0.02, 0.2), "drive": (0.001, 0.008), "tf": (0.02, 0.2)}, shaped=True,
            law=lambda s, p, r, u: {"k_v": r * p.k, "tau_v": 0.2 * 30 ** float(u[0]) / s.omega}),
     Effect("second-mode", "mechanics", {"ring": (0.02, 0.15), "drive": (0.01, 0.05), "tf": (0.02, 0.15)}, shaped=True,
-           parameters=IN_HERTZ, law=_second_mode),
+           parameters=IN_HERTZ, gentle=0.2, power=2, law=_second_mode),
     Effect("mode-coupling", "mechanics", {"drive": (1.5, 4.0), "tf": (3.0, 6.0)}, shaped=True,
-           parameters=IN_HERTZ, law=_mode_coupling),
+           parameters=IN_HERTZ, gentle=1.0, law=_mode_coupling),
     Effect("inertia-scale", "mechanics", {"drive": (0.05, 0.3)}, signed=True, law=lambda s, p, r, u: {"scale": 1 + r}),
     Effect("comb-offset", "capacitance", combs(0.002, 0.015), signed=True,
            law=lambda s, p, r, u: {"theta_c": r}),
@@ -185,14 +194,14 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect("drive-droop", "drive", {"drive": (0.03, 0.15)}, parameters={"droop": ("g", 1)},
            law=lambda s, p, r, u: {"droop": 1 - r}),
     Effect("drive-lag", "drive", {"drive": (0.1, 0.5), "tf": (0.1, 0.5)},
-           parameters=IN_HERTZ, law=lambda s, p, r, u: {"drive_corner": s.drive_omega / r}),
+           parameters=IN_HERTZ, gentle=0.6, law=lambda s, p, r, u: {"drive_corner": s.drive_omega / r}),
     Effect("charging", "drive", combs(0.5, 3.0), signed=True, shaped=True,
            parameters={"charge": ("V_c", 1), "charge_tau": ("tau", 1)},
            law=lambda s, p, r, u: {"charge": r, "charge_tau": _tau(s, u[0])}),
     Effect("carrier-torque", "drive", {"drive": (0.01, 0.03)},
            law=lambda s, p, r, u: {"carrier": r * 1350.0}),
     Effect("readout-lag", "readout", everywhere(0.02, 0.2), needs_angle=frozenset({"ring"}),
-           parameters=IN_HERTZ, law=lambda s, p, r, u: {"readout_corner": s.omega / r}),
+           parameters=IN_HERTZ, gentle=0.6, law=lambda s, p, r, u: {"readout_corner": s.omega / r}),
     Effect("filter-lag", "readout", {"drive": (0.05, 0.25)}, signed=True,
            parameters={"sections": ("s", 1)}, law=lambda s, p, r, u: {"sections": 1 + r}),
     Effect("square-law", "readout", {"drive": (0.055, 0.070)}, law=_square_law, parameters={"square_Cp": ("C_p", 1)}),
@@ -202,13 +211,14 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect("gain-drift", "readout", everywhere(0.05, 0.25), signed=True, parameters={"gain_drift": ("drift", 1)},
            law=lambda s, p, r, u: {"gain_drift": r}),
     Effect("saturation", "readout", everywhere(0.1, 0.4),
-           law=lambda s, p, r, u: {"limit": s.middle + (1 - r) * s.height}),
+           gentle=1.0, law=lambda s, p, r, u: {"limit": s.middle + (1 - r) * s.height}),
     Effect("sensor-cubic", "readout", {"ring": (0.05, 0.2), "tf": (0.05, 0.2)}, parameters={"sensor_cubic": ("c3", 1)},
            law=lambda s, p, r, u: {"sensor_cubic": r / s.height**2}),
     Effect("interference", "readout", everywhere(0.02, 0.1), shaped=True, parameters=IN_HERTZ,
            law=lambda s, p, r, u: {"tone": r * s.height, "tone_frequency": _beside_harmonics(s.omega, float(u[0])),
                                    "tone_phase": 2 * pi * float(u[1])}),
     Effect("carrier-leakage", "readout", {"drive": (0.001, 0.05)}, shaped=True,
+           gentle=1.0,
            law=lambda s, p, r, u: {"leak": r * (p.Cb + 0.6 * p.C0), "leak_phase": _between(0.3, 1.5, u[0])}),
     Effect("channel-delay", "timing", {"ring": (10e-6, 150e-6), "drive": (0.1e-6, 3e-6), "tf": (5e-6, 150e-6)},
            needs_angle=frozenset({"ring"}), law=lambda s, p, r, u: {"delay": r}),

@@ -59,7 +59,7 @@ def _edge(s: Scene, p: Truth, r: float, u: Shape) -> dict[str, float]:
 
 
 UNLISTED: tuple[Effect, ...] = tuple(
-    Effect(name, stage, sizes, law, needs_angle=frozenset(needs), listed=False)
+    Effect(name, stage, sizes, law, needs_angle=frozenset(needs), listed=False, gentle=1.0 if law is _slew else 0.02)
     for name, stage, sizes, law, needs in (
         ("one-sided-stop", "mechanics", everywhere(0.05, 0.3), _kink, ()),
         ("warming-damping", "mechanics", everywhere(0.4, 1.5), _warming, ()),
