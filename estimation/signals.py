@@ -43,7 +43,7 @@ def senses(recording: Recording, device: Device, gaps_ok: bool = False) -> list[
     """The sense channels, checked: every axis of the device in one of them.
 
     Args:
-        gaps_ok: samples may be missing (NaN); the samples are then not looked through.
+        gaps_ok: samples may be missing (NaN).
 
     Raises:
         ChannelMissing: an axis has no sense channel.
@@ -63,9 +63,8 @@ def senses(recording: Recording, device: Device, gaps_ok: bool = False) -> list[
             Sense(recording.require(f"sense_{name}", "this estimator needs it"), axis.require_readout(), (name,))
             for name, axis in device.axes.items()
         ]
-    if not gaps_ok:
-        for sense in found:
-            check_signal(sense.channel)
+    for sense in found:
+        check_signal(sense.channel, gaps_ok=gaps_ok)
     return found
 
 

@@ -162,12 +162,13 @@ def checked_channel(
     return Channel(name, own, rate, first_time, raw, 0, raw.shape[0], slope * factor, zero * factor, file)
 
 
-def check_signal(signal: Channel, *, constant_ok: bool = False) -> None:
+def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = False) -> None:
     """Look through a whole channel, chunk by chunk, for what no estimator can work with.
 
     Args:
         signal: a channel of one or more columns.
         constant_ok: a channel that never changes is fine (a bias).
+        gaps_ok: samples that are not finite are missing, and that is fine.
 
     Raises:
         BadInput: a sample that is not finite (with the time of the first one) or no measurement, or a signal that never
@@ -177,13 +178,15 @@ def check_signal(signal: Channel, *, constant_ok: bool = False) -> None:
     for first in range(0, signal.size, CHUNK):
         values = signal.read(first, first + CHUNK)
         finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if not finite.all():
+        if gaps_ok:
+            values = values[finite]
+        elif not finite.all():
             index = first + int(np.argmin(finite))
             what = f"sample {index} at {signal.start + index / signal.sample_rate:.9g} s is not finite"
             hint = "cut the recording there or repair the sample"
             raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
-        low, high = min(low, values.min()), max(high, values.max())
-    if max(-low, high) > LARGEST:
+        low, high = min(low, values.min(initial=np.inf)), max(high, values.max(initial=-np.inf))
+    if np.isfinite(low) and max(-low, high) > LARGEST:
         what = f"reaches {max(-low, high):.3g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:

@@ -14,7 +14,7 @@ from worlds import DRIVES, own_electrodes, separate_electrodes, shared_electrode
 
 from estimation.estimate import estimate
 from estimation.signals import reference_of, senses
-from estimation.tracker import track
+from estimation.tracker import PhaseSeen, track
 from estimation.tracker.angle import SEGMENT, SlowAngle
 from estimation.tracker.blocks import CLIPPED_RUN, basis, project, residual_variance, solved
 from estimation.tracker.orbit import axis_law, turn_of
@@ -253,6 +253,28 @@ def test_gap_is_bridged_and_its_uncertainty_grows() -> None:
         assert np.mean(np.abs(phase) < 3 * axis.phase_sd) > 0.97
 
 
+def test_phases_seen_in_the_picture_bridge_a_gap() -> None:
+    def gap(y: np.ndarray) -> np.ndarray:
+        y[50_000:110_000] = np.nan
+        return y
+
+    device, recording = devices.load("imaging"), with_sense(noisy(9), gap)
+    alone = track(recording, device)
+    whole = track(noisy(9), device)
+    time = np.linspace(0.0105, 0.0215, 12)
+    seen = {}
+    for name, axis in whole.axes.items():
+        phase = np.interp(time, axis.time, axis.phase)
+        phase[3] = np.nan  # a slice that shows nothing
+        seen[name] = PhaseSeen(time, phase, np.full(12, np.deg2rad(0.02)))
+    helped = track(recording, device, seen=seen)
+    for name in "xy":
+        inside = (whole.axes[name].time > 0.0105) & (whole.axes[name].time < 0.0215)
+        assert helped.axes[name].phase_sd[inside].max() < 0.7 * alone.axes[name].phase_sd[inside].max()
+        phase, _ = errors(helped.axes[name], quiet()[1][f"angle_{name}"][0])
+        assert np.rad2deg(np.abs(phase).max()) < 0.1
+
+
 def test_clipped_tops_are_bridged() -> None:
     motion = track(with_sense(noisy(6), lambda y: np.clip(y, *np.quantile(y, [0.15, 0.85]))), devices.load("imaging"))
     assert motion.info["sense"]["used"] < 0.85  # type: ignore[index]
@@ -383,7 +405,7 @@ def test_no_samples_are_refused() -> None:
 
 def test_signal_that_never_changes_is_refused() -> None:
     constant = with_sense(shared_electrode()[0], np.zeros_like)
-    with pytest.raises(BadInput, match="never changes"):
+    with pytest.raises(BadInput, match="stays at 0 V"):
         track(constant, devices.load("imaging"))
 
 

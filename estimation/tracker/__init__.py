@@ -1,5 +1,5 @@
 """The tracker: block demodulation, and a smoother on the slow flow of phase and amplitude."""
 
-from estimation.tracker.track import track
+from estimation.tracker.track import PhaseSeen, track
 
-__all__ = ["track"]
+__all__ = ["PhaseSeen", "track"]

@@ -88,9 +88,6 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
     projections = project(channel, starts, length, lines, w, settling)
     if not projections.counts.any():
         raise BadInput("holds no sample that can be used", file=channel.file, channel=channel.name)
-    noise_var = _noise(projections)
-    if not noise_var.max() > 0.0:
-        raise BadInput("never changes", file=channel.file, channel=channel.name, hint="check that it was recorded")
     laws = tuple(axis_law(axis, sense.readout) for axis in axes)
     forces = [
         _force(drive_voltage(recording, name), time, width, psi[:, i], w[:, i], laws[i])
@@ -112,7 +109,7 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
         roots=np.ascontiguousarray(roots),
         unroots=unroots,
         geometry=projections.geometry,
-        noise_var=noise_var,
+        noise_var=_noise(projections),
         known=np.zeros(psi.shape),
         known_var=np.full(psi.shape, np.inf),
         ladder=np.stack([_ladder(axis, sense) for axis in axes]),

@@ -264,7 +264,9 @@ def _update(signal, k, x, P, about, values, jacobian):  # type: ignore[no-untype
         if np.isfinite(signal.known_var[k, a]):
             at = a * STATES + PHASE
             PH, S = P[at].copy(), P[at, at] + signal.known_var[k, a]
+            period = 2.0 * np.pi / signal.main  # theta and -theta look alike to a capacitance
             e = signal.known[k, a] - x[at]
+            e -= period * np.round(e / period)
             x += PH / S * e
             P -= np.outer(PH, PH) / S
     return -0.5 * (chi2 + logdet), chi2, count

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,17 @@ LISTENED = 64  # blocks that may be taken together to find a motion in noise
 PROBED = 200  # blocks from which the sign is told
 
 
+class PhaseSeen(NamedTuple):
+    """Measurements of one axis's phase, made some other way: times [s], phases as in ``AxisMotion`` [rad], sds [rad].
+
+    Each is taken at the middle of the block that it falls in. NaN, or an infinite sd, is no measurement.
+    """
+
+    time: Array
+    phase: Array
+    sd: Array
+
+
 @dataclass(frozen=True)
 class Belief:
     """State and covariance before a block, and whether each axis's motion has been found."""
@@ -61,12 +74,15 @@ class Track:
     live: NDArray[np.bool_]
 
 
-def track(recording: Recording, device: Device, causal: bool = False) -> Motion:
+def track(
+    recording: Recording, device: Device, causal: bool = False, seen: Mapping[str, PhaseSeen] | None = None
+) -> Motion:
     """Phase and amplitude of all axes from their sense signals.
 
     Args:
         causal: each block from what came before it only (a filter); its latency is half a block. By default all
             blocks from all of the recording (a smoother).
+        seen: further measurements of an axis's phase, from a picture that shows forward beside backward, by axis.
 
     Raises:
         BadInput: a channel shows no motion, or cannot be used. ChannelMissing: an axis has no sense channel.
@@ -77,7 +93,7 @@ def track(recording: Recording, device: Device, causal: bool = False) -> Motion:
     for sense in senses(recording, device, gaps_ok=True):
         even = is_capacitive(sense.readout)
         references = {name: reference_of(recording, device, name, sense.channel, even) for name in sense.axes}
-        prepared = prepare(recording, device, sense, references)
+        prepared = with_phases(prepare(recording, device, sense, references), seen or {})
         start, signs = signed(prepared, starting_belief(prepared, device))
         walk = tuned_walk(prepared, start)
         found = follow(prepared, start, walk, causal)
@@ -93,6 +109,24 @@ def track(recording: Recording, device: Device, causal: bool = False) -> Motion:
         axes |= {name: _axis_motion(prepared, found, i, clock, signs[i]) for i, name in enumerate(sense.axes)}
         info[sense.channel.name] = _facts(prepared, found, walk)
     return Motion(axes, "tracker-causal" if causal else "tracker", info)
+
+
+def with_phases(prepared: Prepared, seen: Mapping[str, PhaseSeen]) -> Prepared:
+    """The blocks with further measurements of their phase; several in one block count as their weighted mean."""
+    signal = prepared.signal
+    known, var = signal.known.copy(), signal.known_var.copy()
+    for a, name in enumerate(prepared.sense.axes):
+        if name in seen:
+            time, phase, sd = seen[name]
+            used = np.isfinite(phase) & np.isfinite(sd)
+            block = np.round((time[used] - prepared.time[0]) / signal.step).astype(np.int64)
+            inside = (block >= 0) & (block < prepared.time.size)
+            weight = 1.0 / sd[used][inside] ** 2
+            total = np.bincount(block[inside], weight, prepared.time.size)
+            told = total > 0.0
+            mean = np.bincount(block[inside], weight * phase[used][inside], prepared.time.size)
+            known[told, a], var[told, a] = mean[told] / total[told], 1.0 / total[told]
+    return replace(prepared, signal=signal._replace(known=known, known_var=var))
 
 
 def starting_belief(prepared: Prepared, device: Device) -> Belief:
