@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon import blur, views
+from recon.pipeline import AXES
 from recon.report import Figure, Section, Table, render
 from recon.study.plan import Study
 from recon.study.table import Columns
 
 Array = NDArray[np.float64]
 
+SIGNS = "o+^xs"
 LEAST_DEG = 1e-4  # phase errors below are drawn here: an error of 0 has no place on a logarithmic axis
 
 
@@ -24,11 +27,10 @@ def study_report(study: Study, data: Columns, summary: Mapping[str, Any]) -> str
     Args:
         data: the study's table as columns (``recon.study.table.columns``).
     """
-    snr = f"{len(study.snr_db)} noise levels" if study.snr_db else "the device's own noise"
     lead = (
-        f"{len(study.phantoms)} phantoms, {len(study.designs)} scan designs, {len(study.drifts)} drifts, {snr}, "
-        f"{study.seeds} seeds, {len(study.estimators)} estimators, {len(study.pixels)} resolutions, {len(study.p)} "
-        f"values of p: {summary['cells']} cells, {summary['failed']} of them failed."
+        f"Phantoms {len(study.phantoms)}, scan designs {len(study.designs)}, drifts {len(study.drifts)}, noise levels "
+        f"{max(1, len(study.snr_db))}, seeds {study.seeds}, estimators {len(study.estimators)}, resolutions "
+        f"{len(study.pixels)}, values of p {len(study.p)}: {summary['cells']} cells, {summary['failed']} failed."
     )
     worked = {name: column[data["failed"] == ""] for name, column in data.items()}
     notes = [f"failed: {reason}" for reason in summary["reasons"]]
@@ -55,7 +57,8 @@ ESTIMATORS_TEXT = (
 )
 BLUR_TEXT = (
     "Above, the phase's share of the blur; a phase error δφ moves a sample by m δφ cos α pixels, rms m δφ/√2 (line). "
-    "Below, the picture's own error, which knows nothing of that law. Dashed: the bound p/m."
+    "Below, the picture's own error, which knows nothing of that law, against the phase error rms over both axes; each "
+    "phantom has its own sign. Dashed: the bound p/m."
 )
 MAP_TEXT = (
     "How much of the scan has a phase error within ±p/m: mean over phantoms, noise levels, seeds and both axes."
@@ -79,31 +82,33 @@ def _estimators(statistics: Mapping[str, Mapping[str, float | None]]) -> Table:
 
 
 def _blur_figure(study: Study, data: Columns) -> Figure:
-    drawing, axes = views.figure(2, len(study.pixels), (max(4.5, 3.4 * len(study.pixels)), 5.4))
-    middle = study.p[len(study.p) // 2]
-    for column, pixels in enumerate(study.pixels):
-        here = (data["pixels"] == pixels) & (data["p"] == study.p[0])
+    drawing, axes = views.figure(2, len(study.pixels), (max(5.0, 4.5 * len(study.pixels)), 6.4))
+    for (above, below), pixels in zip(axes.T, study.pixels, strict=True):
+        here = (data["pixels"] == pixels) & (data["p"] == study.p[0])  # neither blur nor picture knows p
         law = np.geomspace(max(LEAST_DEG, data["phase_rmse_deg"][here].min(initial=1.0)), 20.0, 50)
-        axes[0, column].plot(law, 0.5 * pixels * np.radians(law) / np.sqrt(2.0), color="#444", lw=0.8)
+        above.plot(law, 0.5 * pixels * np.radians(law) / np.sqrt(2.0), color="#444", lw=0.8)
         for name, colour in zip(study.estimators, _colours(), strict=False):
-            own = here & (data["estimator"] == name)
-            error = np.maximum(data["phase_rmse_deg"][own], LEAST_DEG)
-            for row, what in enumerate(("blur_phase_px", "picture_error")):
-                axes[row, column].loglog(error, data[what][own], ".", ms=4, alpha=0.6, color=colour, label=name)
-        for row in (0, 1):
+            for phantom, sign in zip(study.phantoms, cycle(SIGNS), strict=False):
+                x, y = (
+                    here & (data["estimator"] == name) & (data["phantom"] == phantom) & (data["axis"] == axis)
+                    for axis in AXES
+                )
+                label = name if phantom == study.phantoms[0] else None
+                style: dict[str, Any] = {"ms": 4, "alpha": 0.6, "color": colour}
+                error = np.maximum(data["phase_rmse_deg"], LEAST_DEG)
+                above.loglog(error[x | y], data["blur_phase_px"][x | y], sign, label=label, **style)
+                below.loglog(np.hypot(error[x], error[y]) / np.sqrt(2.0), data["picture_error"][x], sign, **style)
+        for panel in (above, below):
             for p in study.p:
                 bound = np.degrees(blur.bound(p, pixels / 2))
-                axes[row, column].axvline(bound, color="#444", lw=0.8, ls="--")
-                axes[row, column].text(
-                    bound, 0.98, f" p = {p:g}", transform=axes[row, column].get_xaxis_transform(), va="top", fontsize=7
-                )
-        axes[0, column].axhline(middle / np.sqrt(2.0), color="#bbb", lw=0.6)
-        axes[0, column].set(title=f"{pixels} × {pixels} pixels")
-        axes[1, column].set(xlabel="phase error, rms [°]")
-    axes[0, 0].set(ylabel="blur by phase, rms [px]")
-    axes[1, 0].set(ylabel="picture error")
+                panel.axvline(bound, color="#444", lw=0.8, ls="--")
+                panel.text(bound, 0.98, f" p = {p:g}", transform=panel.get_xaxis_transform(), va="top", fontsize=7)
+        above.set_title(f"{pixels} × {pixels} pixels", fontsize=9)
+        below.set_xlabel("phase error, rms [°]")
+    axes[0, 0].set_ylabel("blur by phase, rms [px]")
+    axes[1, 0].set_ylabel("picture error")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    return Figure(views.figure_uri(drawing), "blur by phase and picture error; each dot is one scan and axis")
+    return Figure(views.figure_uri(drawing), "blur by phase, a sign a scan and axis; picture error, a sign a scan")
 
 
 def _bound_map(study: Study, data: Columns, design: str) -> Figure:
@@ -117,7 +122,7 @@ def _bound_map(study: Study, data: Columns, design: str) -> Figure:
             chosen = (data["design"] == design) & (data["p"] == p) & (data["estimator"] == name)
             held = _means(data, chosen, ("drift", drifts), ("pixels", [float(n) for n in pixels]))
             panel = axes[row, column]
-            panel.imshow(held, vmin=0.0, vmax=1.0, cmap="RdYlGn", aspect="auto")
+            panel.imshow(held, vmin=0.0, vmax=1.0, cmap="RdYlGn", alpha=0.6, aspect="auto")
             for i, j in np.ndindex(held.shape):
                 if np.isfinite(held[i, j]):
                     panel.text(j, i, f"{100 * held[i, j]:.0f}", ha="center", va="center", fontsize=8, color="#111")
@@ -181,7 +186,7 @@ def _error_figure(study: Study, data: Columns) -> Figure:
             low, median, high = np.array([np.percentile(each, [10, 50, 90]) for each in error]).T
             panel.fill_between(unit * at, low, high, color=colour, alpha=0.15, lw=0)
             panel.plot(unit * at, median, "o-", ms=3, lw=1.2, color=colour, label=name)
-        panel.set(yscale="log", xlabel=label)
+        panel.set(yscale="log", xlabel=label, xticks=unit * np.unique(data[what]))
     axes[0, 0].set_ylabel("phase error, rms [°]")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return Figure(views.figure_uri(drawing), "phase error of each estimator: median, 10th to 90th percentile")
