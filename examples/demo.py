@@ -1,4 +1,4 @@
-"""What `make demo` runs: simulate a scan whose resonances drift, reconstruct it four ways, say where the report is.
+"""What `make demo` runs: simulate a scan whose resonances drift, reconstruct it in several ways, say where the report is.
 
 python examples/demo.py [FOLDER]
 """
@@ -20,7 +20,7 @@ from recon.views import save_picture, uri
 from scanner.recording import Recording
 
 SPIRAL = Path(__file__).parent.parent.parent / "shared" / "data" / "afm_spiral"
-ESTIMATORS = {"constant phase": "constant", "EKF": "ekf", "UKF": "ukf"}
+ESTIMATORS = {"constant phase": "constant", "EKF": "ekf", "UKF": "ukf", "tracker": "tracker"}
 LEAD = (
     "A tissue picture under a resonant scanner, both axes on one electrode, 400 × 400 pixels, 60 ms at 5 MS/s. Both "
     "mirrors soften by 0.2 %, and their phases leave the bound of 0.286° many times over."
@@ -61,7 +61,7 @@ def main(folder: Path) -> None:
             f"{name:>14}: phase error {x['phase_rmse_deg']:.3f}° x, {y['phase_rmse_deg']:.3f}° y; within the bound "
             f"{x['within_bound']:.1%}, {y['within_bound']:.1%}; picture error {ratio:.2f} × that of the true motion"
         )
-    print(f"picture: {folder / 'ukf.png'}\nreport:  {folder / 'report.html'}   ({time.perf_counter() - began:.1f} s)")
+    print(f"picture: {folder / 'tracker.png'}\nreport:  {folder / 'report.html'}   ({time.perf_counter() - began:.1f} s)")
 
 
 def measured_spiral(folder: Path) -> Section:
