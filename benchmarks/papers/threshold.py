@@ -163,6 +163,8 @@ def draw(rates: Mapping[float, tuple[Array, Array]], slopes: Mapping[float, tupl
             drawn.legend(fontsize=7)
         axes[0, 0].set(xlabel="sampling rate [kHz]", ylim=(1e-14, 1e-8))
         axes[0, 1].set(xlabel="slope of the sensor's gain, $N_\\theta$ relative to the device's")
+        axes[0, 1].set_xticks(SLOPES, [f"{slope:g}" for slope in SLOPES])
+        axes[0, 1].minorticks_off()
     theta = np.linspace(-0.15, 0.15, 301)
     with figure("chen2019_fig6", columns=2, size=(9.0, 3.0)) as axes:
         for factor in SLOPES:
