@@ -29,20 +29,20 @@ UNSTATED = 0.02
 """Relative uncertainty of a nominal value whose tolerance the device file does not state."""
 START = 0.1
 """Uncertainty of the state in which a recording finds the mirror, over its swing."""
-SHAPES = np.array([[0.45, 0.55, 0.4], [0.15, 0.85, 0.1], [0.8, 0.2, 0.75]])
-"""At which a look-alike whose law has a shape is tried; their span is what it can imitate."""
+SHAPES = np.array([[0.15, 0.85, 0.1], [0.45, 0.55, 0.4], [0.8, 0.2, 0.75]])
+"""At which a look-alike whose law has a shape is tried, in order of their first number."""
 FIELDS = {"b_cir": "offset"}
 """Nominal values that the truth calls by another name."""
 
 
 def distances(sealed: Sealed) -> list[dict[str, Any]]:
     """For every hidden effect ``sigma``, its own size, and the ``distance`` to its ``nearest`` listed look-alike."""
-    return [_distance(sealed, i) for i in range(len(sealed.hidden))]
+    return [_distance(sealed, secret) for secret in sealed.hidden]
 
 
-def _distance(sealed: Sealed, i: int) -> dict[str, Any]:
-    scene, secret = sealed.scene, sealed.hidden[i]
-    others = [h for j, h in enumerate(sealed.hidden) if j != i]
+def _distance(sealed: Sealed, secret: Hidden) -> dict[str, Any]:
+    scene = sealed.scene
+    others = [h for h in sealed.hidden if h is not secret]
     base = _hiding(scene, others)
     world = settle(scene.world, base)
     here = _whitened(sealed, world, base)
@@ -58,24 +58,25 @@ def _distance(sealed: Sealed, i: int) -> dict[str, Any]:
     free = [change(_hiding(scene, [replace(h, size=1.005 * h.size) for h in others]), 0.005)] if others else []
     taken = {name for h in sealed.hidden for name in h.fields}
     rivals = [
-        (effect.name, column(effect, size, shape))
+        (effect.name, i, column(effect, size, shape))
         for effect in CATALOGUE
         if effect.shows_in(world)
-        for shape in SHAPES[: 3 if effect.shaped else 1]
+        for i, shape in enumerate(SHAPES[: len(SHAPES) if effect.shaped else 1])
         # A law that no small share is linear in bends with its size: its smallest and its largest span the bend.
         for size in effect.sizes[world.family][: 1 if effect.is_linear else 2]
         if not taken & effect.law(scene, base, size, shape).keys()
     ]
-    columns = np.array([column(secret.effect, secret.size, secret.shape), *nuisances, *free, *(c for _, c in rivals)])
+    columns = np.array([column(secret.effect, secret.size, secret.shape), *nuisances, *free, *(c for *_, c in rivals)])
     gram = columns @ columns.T
     held = np.arange(1, 1 + len(nuisances))
     gram[held, held] += np.array(priors)
     first = 1 + len(nuisances) + len(free)
     known = list(range(1, first))
-    apart = {
-        name: left_over(gram, 0, known + [first + j for j, (other, _) in enumerate(rivals) if other == name])
-        for name, _ in rivals
-    }
+    apart: dict[str, float] = {}
+    for name, i, _ in rivals:
+        # Two neighbouring shapes span a law and its slope in that shape; more would imitate what no one law can.
+        near = [first + j for j, (other, k, _) in enumerate(rivals) if other == name and k in (i, i + 1)]
+        apart[name] = min(apart.get(name, np.inf), left_over(gram, 0, known + near))
     nearest_first = sorted(apart, key=lambda name: apart[name])
     return {
         "sigma": left_over(gram, 0, known),
