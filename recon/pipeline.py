@@ -14,10 +14,12 @@ from tqdm import tqdm
 
 from estimation.estimate import default_estimator, estimate
 from estimation.signals import device_of
+from estimation.tracker.angle import SlowAngle
 from recon import blur
 from recon.mapping import Grid, Picture, accumulate, mean_picture
 from recon.registration import PhaseError, phase_error
 from recon.score import AxisError, Truth, axis_error
+from recon.slow_mapping import accumulate_slow
 from scanner.channel import Channel, check_signal
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
@@ -157,9 +159,11 @@ def _mapped(motion: Motion, intensity: Channel, grid: Grid) -> Picture:
     sums = counts = None
     for first in range(0, intensity.size, CHUNK):
         stop = min(first + CHUNK, intensity.size)
-        sums, counts = accumulate(
-            x.read(first, stop), y.read(first, stop), intensity.read(first, stop), grid, sums, counts
-        )
+        seen = intensity.read(first, stop)
+        if isinstance(x, SlowAngle) and isinstance(y, SlowAngle) and seen.ndim == 1:
+            sums, counts = accumulate_slow(x, y, first, seen, grid, sums, counts)
+        else:
+            sums, counts = accumulate(x.read(first, stop), y.read(first, stop), seen, grid, sums, counts)
     assert sums is not None
     assert counts is not None
     return mean_picture(sums, counts, grid)
