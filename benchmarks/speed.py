@@ -24,14 +24,17 @@ from scipy.stats import binned_statistic_2d
 
 from estimation.filters import prepare, run_compiled
 from estimation.reference_filters import run_reference
+from estimation.tracker import track
 from phantoms.experiment import Experiment, run
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.mapping import Grid, accumulate, pixel_index
+from recon.slow_mapping import accumulate_slow
 from scanner import devices
 
 RESULTS = Path(__file__).with_name("results.json")
 REFERENCE_STEPS = 1500
+DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
 
 
 def best(function: Callable[[], object], repeats: int = 5) -> float:
@@ -87,6 +90,23 @@ def mapping() -> dict[str, float]:
     }
 
 
+def tracker() -> dict[str, float]:
+    """Tracker over two axes on one electrode, a second of it; mapping from its slow motion; the machine's memory."""
+    recording, _ = simulate(devices.load("imaging"), Plan(DRIVES, 1.0))
+    motion = track(recording, recording.device)
+    size = recording["sense"].size
+    seconds = best(lambda: track(recording, recording.device), 2)
+    x, y = (motion.axes[axis].angle for axis in "xy")
+    intensity = np.random.default_rng(0).random(size).astype(np.float32)
+    grid = Grid(400, 400, 0.18, 0.18)
+    block = np.ones(50_000_000)
+    return {
+        "tracker.samples_per_s": size / seconds,
+        "mapping.slow_samples_per_s": size / best(lambda: accumulate_slow(x, y, 0, intensity, grid)),
+        "memory.read_gb_per_s": block.nbytes / best(block.sum) / 1e9,
+    }
+
+
 def pipeline() -> dict[str, float]:
     """The whole command on the demo's recording, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
@@ -101,7 +121,7 @@ def pipeline() -> dict[str, float]:
 
 def main() -> None:
     results: dict[str, float] = {}
-    for part in (filters, mapping, pipeline):
+    for part in (filters, mapping, tracker, pipeline):
         print(f"{part.__name__} ...", file=sys.stderr)
         results |= part()
     RESULTS.write_text(json.dumps({key: float(f"{value:.4g}") for key, value in results.items()}, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""What `make demo` runs: simulate a scan whose resonances drift, reconstruct it in several ways, say where the report is.
+"""What `make demo` runs: simulate a scan whose resonances drift, reconstruct it, say where the report is.
 
 python examples/demo.py [FOLDER]
 """
@@ -61,7 +61,9 @@ def main(folder: Path) -> None:
             f"{name:>14}: phase error {x['phase_rmse_deg']:.3f}° x, {y['phase_rmse_deg']:.3f}° y; within the bound "
             f"{x['within_bound']:.1%}, {y['within_bound']:.1%}; picture error {ratio:.2f} × that of the true motion"
         )
-    print(f"picture: {folder / 'tracker.png'}\nreport:  {folder / 'report.html'}   ({time.perf_counter() - began:.1f} s)")
+    print(
+        f"picture: {folder / 'tracker.png'}\nreport:  {folder / 'report.html'}   ({time.perf_counter() - began:.1f} s)"
+    )
 
 
 def measured_spiral(folder: Path) -> Section:
