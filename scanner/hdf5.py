@@ -18,6 +18,10 @@ DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
 """How h5py says that HDF5 cannot make sense of a file."""
 
 
+MOST_VALUES = 1 << 16
+"""Values that an attribute holds where HDF5 stores it with its object, a byte each."""
+
+
 @contextmanager
 def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
     """For reading from a file that is open: what HDF5 cannot make sense of becomes BadInput."""
@@ -90,6 +94,11 @@ def _check_samples(item: h5py.Dataset, path: str, where: str) -> None:
 def attributes(item: h5py.HLObject) -> dict[str, Any]:
     """Attributes as Python values: text as str, arrays of one element as that element; BadInput where damaged."""
     with undamaged(item.file.filename, item.name):
+        for key in item.attrs:
+            shape = item.attrs.get_id(key).shape or ()
+            if prod(shape) > MOST_VALUES:  # h5py would read them one by one
+                what = f"attribute {key} claims {prod(shape)} values"
+                raise BadInput(what, file=item.file.filename, channel=item.name, hint="copy the file again")
         return {key: _plain(value) for key, value in item.attrs.items()}
 
 

@@ -66,14 +66,14 @@ class Recording:
         path = Path(path)
         file = open_hdf5(path)
         try:
-            attrs = attributes(file)
-            _check_format(attrs.pop("format", None), attrs.pop("version", None), path)
-            group = child(file, "channels", h5py.Group)
-            if group is None or not len(group):
-                raise BadInput("holds no channels", file=path, hint="store signals under /channels")
             with undamaged(path):
+                attrs = attributes(file)
+                _check_format(attrs.pop("format", None), attrs.pop("version", None), path)
+                group = child(file, "channels", h5py.Group)
+                if group is None or not len(group):
+                    raise BadInput("holds no channels", file=path, hint="store signals under /channels")
                 channels = {name: _open_channel(group, name, path) for name in group}
-            text = _device_text(file, path)
+                text = _device_text(file, path)
         except BaseException:
             file.close()
             raise

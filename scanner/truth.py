@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from scanner.errors import BadInput
-from scanner.hdf5 import attributes, child, open_hdf5
+from scanner.hdf5 import attributes, child, open_hdf5, undamaged
 
 Truth = Mapping[str, Any]
 """Nested: name -> array, number, text, ``(one of these, attributes)``, or a mapping of the same kind."""
@@ -37,7 +37,7 @@ def read_truth(path: str | Path) -> dict[str, Any] | None:
     Raises:
         BadInput: the file cannot be read, or its truth is not stored in it.
     """
-    with open_hdf5(Path(path)) as file:
+    with open_hdf5(Path(path)) as file, undamaged(path):
         group = child(file, "truth", h5py.Group)
         return None if group is None else _read(group)
 

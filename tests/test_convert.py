@@ -5,13 +5,17 @@ from __future__ import annotations
 from functools import reduce
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import tifffile
+import wholes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import savemat
 
+from recon.cli import main
 from recon.convert import convert, convert_file, open_any
 from scanner.device import Device
 from scanner.errors import BadInput, DeviceInvalid
@@ -277,3 +281,49 @@ def test_one_door_for_recordings_and_instruments_files(tmp_path: Path) -> None:
         assert recording["sense_x"].raw.dtype == np.int16  # with gain and offset, as the recording's form has it
         np.testing.assert_array_equal(recording["sense_x"].read(), [0, 0.5, 1, 1.5, 2])
         assert recording.attrs["source_format"] == "NumPy archive"
+
+
+def test_arguments_say_what_a_mapping_says(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "a.csv").write_text("t,a,b\n0,1,4\n1,2,5\n2,3,6\n")
+    out = tmp_path / "a.h5"
+    given = ["convert", str(tmp_path / "a.csv"), "--channel", "sense_x=a", "--channel", "intensity=b", "-o", str(out)]
+    assert main([*given, "--unit", "V", "--unit", "intensity=counts", "--rate", "5e6", "--start", "sense_x=0.5"]) == 0
+    assert "sense_x: a, V (mapping), 5000000 Hz (mapping), from 0.5 s (mapping), 3 samples" in capsys.readouterr().out
+    with Recording.open(out) as recording:
+        assert recording["intensity"].unit == "counts"
+        assert (recording["sense_x"].start, recording["intensity"].start) == (0.5, 0.0)
+    out.unlink()
+    for wrong, words in {
+        ("--unit", "V"): "says no sample_rate of variable 'a'",
+        ("--rate", "fast"): "--rate: 'fast' is no number",
+        ("--unit", "drive_x=V"): "--unit: 'drive_x' is no channel named by --channel",
+        ("--channel", "sense_x=b"): "--channel: 'sense_x=b' names no channel and variable of its own",
+        ("--mapping", "m.toml"): "--mapping: stands beside --channel",
+    }.items():
+        assert main([*given, *wrong]) == 2
+        told = capsys.readouterr().err
+        assert words in told
+        assert told.count("\n") == 1
+    assert main(["convert", str(tmp_path / "a.csv"), "-o", str(out)]) == 2
+    assert "nothing says which variable is which channel" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_picture_from_an_instruments_file(tmp_path: Path) -> None:
+    wholes.recording(tmp_path / "whole.h5")
+    with h5py.File(tmp_path / "whole.h5") as file:
+        columns = {name: file[f"channels/{name}"][:] for name in ("sense_y", "angle_x", "intensity")}
+        device = str(file["device"].attrs["toml"])
+    np.savez(tmp_path / "a.npz", **columns)
+    units = {"angle_x": 'unit = "rad"\nscale = 1e-5\n'}
+    lines = [
+        f'[channels.{name}]\nvariable = "{name}"\nsample_rate = 1e6\n' + units.get(name, 'unit = "V"\n')
+        for name in columns
+    ]
+    (tmp_path / "m.toml").write_text("".join(lines) + device.replace("[", "[device."))
+    common = ["--pixels", "50x50", "-o"]
+    assert main(["reconstruct", str(tmp_path / "whole.h5"), *common, str(tmp_path / "ours")]) == 0
+    mapped = ["reconstruct", str(tmp_path / "a.npz"), "--mapping", str(tmp_path / "m.toml")]
+    assert main([*mapped, *common, str(tmp_path / "theirs")]) == 0
+    ours, theirs = (tifffile.imread(tmp_path / name / "image.tif") for name in ("ours", "theirs"))
+    np.testing.assert_array_equal(ours, theirs)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from errno import EINVAL
@@ -48,8 +47,10 @@ def _parsing(path: Path) -> Iterator[None]:
         raise BadInput("no such file", file=path, hint="name the instrument's file")
     try:
         yield
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError, RuntimeError) as error:
-        if isinstance(error, BadInput) or (isinstance(error, OSError) and error.errno not in (None, EINVAL)):
+    except (BadInput, MemoryError):
+        raise
+    except Exception as error:  # the parsers stumble in as many ways as a file can be damaged
+        if isinstance(error, OSError) and error.errno not in (None, EINVAL):
             raise  # as of a full disk; a damaged directory asks for places before the file's beginning
         what = f"is not a whole NumPy archive: {error or type(error).__name__}"
         raise BadInput(what, file=path, hint="copy or save it again") from None
