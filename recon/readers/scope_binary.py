@@ -35,9 +35,7 @@ def read_scope(path: Path) -> Contents:
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), np.errstate(all="ignore"):
             read = Wfm.from_file(str(path))
-            variables = {
-                str(each.name).replace(" ", ""): _variable(each, read.parser_name) for each in read.channels
-            }
+            variables = {str(each.name).replace(" ", ""): _variable(each, read.parser_name) for each in read.channels}
     except MemoryError:
         raise
     except Exception as error:  # the parsers stumble in as many ways as a file can be damaged
