@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint bench papers clean
+.PHONY: demo test lint bench papers concealed clean
 
 $(STAMP): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed; run make PYTHON=python3.x" if sys.version_info < (3, 11) else 0)'
@@ -28,6 +28,11 @@ bench: $(STAMP)
 
 papers: $(STAMP)
 	$(BIN)/python benchmarks/papers/run.py
+
+concealed: $(STAMP)
+	mkdir -p sealed
+	$(BIN)/python -m benchmarks.concealed.make sealed/recordings sealed/keys --workers 2
+	$(BIN)/python -m benchmarks.concealed.score sealed/recordings sealed/keys/keys.json sealed/out
 
 clean:
 	rm -rf $(VENV) demo-output

@@ -19,6 +19,7 @@ from phantoms.targets import tissue
 from recon.blur import bound, picture_error
 from recon.mapping import Grid, Picture, map_samples
 from recon.registration import phase_error
+from recon.views import visible
 
 Array = NDArray[np.float64]
 
@@ -94,7 +95,7 @@ def results() -> Results:
 def draw(pictures: dict[float, Mapped]) -> None:
     with figure("chen2020_fig10", columns=len(pictures), size=(13.0, 3.7)) as axes:
         for drawn, (error, made) in zip(axes[0], pictures.items(), strict=True):
-            drawn.imshow(made.picture.image[120:280, 120:280], cmap="gray")
+            drawn.imshow(visible(made.picture)[120:280, 120:280], cmap="gray")
             drawn.set(
                 title=f"{error:g}° off: {made.largest_px:.2f} px\nfound {made.found_deg:.3f}°", xticks=[], yticks=[]
             )
