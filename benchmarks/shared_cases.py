@@ -1,6 +1,6 @@
 """The handed-over cases: every recording diagnosed, every answer held against the key.
 
-    python -m benchmarks.concealed.shared_cases FOLDER [CASE ...]
+    python -m benchmarks.shared_cases FOLDER [CASE ...]
 
 FOLDER holds ``case-NN.h5`` and ``keys.json``. The diagnosis sees the recording only; the key is opened when it is done.
 """
