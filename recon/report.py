@@ -108,8 +108,8 @@ def comparison_report(
     coverage = Figure(views.uri(views.png(views.coverage_image(first.picture.coverage))), COVERAGE_CAPTION)
     tracked = {name: results[name] for name in estimated}
     sections = [
-        Section("One recording, one picture an estimator", figures=pictures, pixelated=True),
-        Section("Enlarged", figures=enlarged, pixelated=True),
+        Section("One recording, one picture an estimator", figures=pictures, least="11rem", pixelated=True),
+        Section("Enlarged", figures=enlarged, least="11rem", pixelated=True),
         Section("In figures", PICTURE_TEXT, Table(["", *results], rows)),
         Section("Phase", _phase_text(first), None, phase_figures(tracked), "26rem"),
         Section("Blur", BLUR_TEXT, figures=[blur_of(blurs, first.p)], least="30rem"),
