@@ -29,8 +29,8 @@ from scanner.recording import Recording
 Array = NDArray[np.float64]
 
 AXES = ("x", "y")
-SLICE = 0.01  # seconds of scan in which forward and backward sweeps are registered
-REGISTERED = 0.24  # seconds that are registered at the most
+SLICE = 25  # periods of the slower axis registered as one: some 15 are needed, and in a long one a drift goes on
+REGISTERED = 800  # periods of the slower axis that are registered at the most
 CHUNK = 1 << 20  # samples mapped at a time
 
 
@@ -121,7 +121,8 @@ def reconstruct(
             )
         progress.update()
         progress.set_postfix_str("registration")
-        seen = [error for window in _windows(intensity) for error in _register(motion, intensity, grid, *window)]
+        windows = _windows(motion, intensity)
+        seen = [error for window in windows for error in _register(motion, intensity, grid, *window)]
         progress.update()
         errors = {axis: axis_error(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles} if truth else {}
         progress.update()
@@ -169,9 +170,14 @@ def _mapped(motion: Motion, intensity: Channel, grid: Grid) -> Picture:
     return mean_picture(sums, counts, grid)
 
 
-def _windows(intensity: Channel) -> list[tuple[int, int]]:
+def _slow_period(motion: Motion) -> float:
+    """Of the slower axis [s]."""
+    return 1.0 / min(float(np.median(axis.frequency)) for axis in motion.axes.values())
+
+
+def _windows(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
     """Samples (first, stop) in which sweeps are registered: all of a short recording, three parts of a long one."""
-    whole = round(REGISTERED * intensity.sample_rate)
+    whole = round(REGISTERED * _slow_period(motion) * intensity.sample_rate)
     if intensity.size <= whole:
         return [(0, intensity.size)]
     part = whole // 3
@@ -182,7 +188,7 @@ def _register(motion: Motion, intensity: Channel, grid: Grid, first: int, stop: 
     x, y = (motion.axes[axis].angle for axis in AXES)
     time = x.start + np.arange(first, stop) / x.sample_rate
     swing_x, swing_y = (np.interp(time, motion.axes[axis].time, motion.axes[axis].amplitude) for axis in AXES)
-    slices = max(1, round((stop - first) / x.sample_rate / SLICE))
+    slices = max(1, round((stop - first) / x.sample_rate / _slow_period(motion) / SLICE))
     places, seen = (x.read(first, stop), y.read(first, stop)), intensity.read(first, stop)
     errors = phase_error(*places, seen, x.sample_rate, grid, swing_x, swing_y, slices)
     return [replace(error, time=error.time + first / x.sample_rate) for error in errors]

@@ -95,8 +95,8 @@ def test_forward_and_backward_sweeps_show_the_true_phase_error(scan: Path, tmp_p
         seen = summary[axis]["picture_phase_error_deg"]
         assert abs(seen["value"] - summary[axis]["phase_bias_deg"]) < 0.05
         assert seen["sd"] < 0.02
-        assert len(seen["slices"]) == 2
-        assert [each["time"] for each in seen["slices"]] == pytest.approx([0.005, 0.015], abs=1e-4)
+        assert len(seen["slices"]) == 3
+        assert [each["time"] for each in seen["slices"]] == pytest.approx([0.02 / 6, 0.01, 0.1 / 6], abs=1e-4)
 
 
 @pytest.mark.parametrize("method", ["ekf", "constant"])
