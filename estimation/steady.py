@@ -107,7 +107,7 @@ def axis_from_angle(
             hint="record for longer",
         )
     amplitude = np.abs(phasors)
-    if noise_sd is None:  # the scatter of second differences of white noise is sqrt(6) of its own
+    if noise_sd is None:  # sixth differences leave no motion; of white noise they scatter sqrt(924) times as much
         noise_sd = float(np.median(np.abs(np.diff(angle[: 1 << 18], n=6))) / 0.6745 / np.sqrt(924.0))
     phase = unwrapped(np.angle(phasors) - reference.phase(time))
     return AxisMotion(
