@@ -22,6 +22,7 @@ from scanner.errors import BadInput, DeviceInvalid
 from scanner.integrate import rk4
 from scanner.laws import amdm_voltage, capacitance, capacitance_slope, position_voltage, transimpedance_voltage
 from scanner.lowpass import lowpass, step_coefficients
+from scanner.optics import place, recorded
 from scanner.recording import Recording
 
 Array = NDArray[np.float64]
@@ -243,9 +244,9 @@ def simulate(
     }
     if scene is not None:
         field_of_view = device.require_scan()
-        light = sample(
-            scene.light, truth["angle_x"], truth["angle_y"], field_of_view.half_angle_x, field_of_view.half_angle_y
-        )
+        x, y = (place(device, name, truth[f"angle_{name}"], time) for name in ("x", "y"))
+        light = sample(scene.light, x, y, field_of_view.half_angle_x, field_of_view.half_angle_y)
+        light = recorded(device, light, time)
         channels["intensity"] = (detect(light, plan.sample_rate, scene.detector, rng), "V")
         told["scene"] = scene.light.astype(np.float32)
     recording = Recording.from_arrays(

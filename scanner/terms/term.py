@@ -8,7 +8,8 @@ A term file holds one ``TERM``. Its law is one or more of these functions, in th
 ``torque``      compiled with ``TORQUE``: torque and hidden states (mechanics)
 ``bell``        compiled with ``BELL``: extra capacitance and its slope
 ``modulate``    ``(capacitance, p, view) -> capacitance``: before an AMDM readout's sections
-``output``      ``(signal, p, view) -> signal``: the channel that the variant names
+``output``      ``(signal, p, view) -> signal``: the channel that the variant names; ``"place"`` is where on the
+                sample the beam stands, told as an angle
 ==============  ============================================================================================
 """
 
@@ -137,7 +138,8 @@ class Term:
         lookalikes: effect -> what tells the two apart.
         hidden: scales of the hidden states (angle for angle), at most two.
         applies: whether an axis can show the effect at all, from its axis and scales.
-        channels: kinds of channel that ``output`` acts on, one variant each: ``"sense"``, ``"angle"``.
+        channels: kinds of channel that ``output`` acts on, one variant each: ``"sense"``, ``"angle"``,
+            ``"intensity"`` or ``"place"``.
     """
 
     effect: str
