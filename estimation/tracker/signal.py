@@ -79,7 +79,7 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
     width = length / channel.sample_rate
     time: Array = channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate)
     own = [references[name] for name in sense.axes]
-    psi = np.stack([_mean_phase(reference, time, width) for reference in own], axis=1)
+    psi = np.stack([mean_phase(reference, time, width) for reference in own], axis=1)
     w = np.gradient(psi, time, axis=0)
     lines = _lines(axes, sense, w, channel.sample_rate)
     settling = 0
@@ -90,7 +90,7 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
         raise BadInput("holds no sample that can be used", file=channel.file, channel=channel.name)
     laws = tuple(axis_law(axis, sense.readout) for axis in axes)
     forces = [
-        _force(drive_voltage(recording, name), time, width, psi[:, i], w[:, i], laws[i])
+        drive_force(drive_voltage(recording, name), time, width, psi[:, i], w[:, i], laws[i])
         for i, name in enumerate(sense.axes)
     ]
     passed, passed_by_w = _passed(sense, lines, w)
@@ -124,7 +124,7 @@ def _block_length(axes: list[Axis], frequencies: list[float], rate: float) -> in
     return max(64, round(max([width, DECAY_SHARE * min(decays)] if decays else [width]) * rate))
 
 
-def _mean_phase(reference: Reference, time: Array, width: float) -> Array:
+def mean_phase(reference: Reference, time: Array, width: float) -> Array:
     """Reference phase averaged over each block (Simpson): what a demodulation with a straight line sees of a sweep."""
     before, middle, after = (reference.phase(time + shift * width) for shift in (-0.5, 0.0, 0.5))
     return (before + 4.0 * middle + after) / 6.0
@@ -142,7 +142,7 @@ def _lines(axes: list[Axis], sense: Sense, w: Array, rate: float) -> Index:
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
-def _force(channel: Channel | None, time: Array, width: float, psi: Array, w: Array, law: AxisLaw) -> Complex:
+def drive_force(channel: Channel | None, time: Array, width: float, psi: Array, w: Array, law: AxisLaw) -> Complex:
     """Harmonics of the drive's force about each block, shape (blocks, DRIVEN); zero where nothing was recorded."""
     force = np.zeros((time.size, DRIVEN), np.complex128)
     if channel is None:

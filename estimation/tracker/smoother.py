@@ -241,12 +241,12 @@ def _update(signal, k, x, P, about, values, jacobian):  # type: ignore[no-untype
     """Bring block k's measurements, linearised about ``about``, into ``x`` and ``P``, one at a time.
 
     Returns:
-        (log-likelihood, squared normalised innovations, measurements).
+        (log-likelihood, squared normalised innovations, measurements), the last two of the projections alone.
     """
     n, roots, noise = x.size, signal.roots[signal.geometry[k]], signal.noise_var[k]
     root = roots[0]
     H, r = root @ jacobian, signal.whitened[k] - root @ values[0] - roots[1] @ values[1] - roots[2] @ values[2]
-    chi2, logdet, count = 0.0, 0.0, 0
+    chi2, logdet, known, count = 0.0, 0.0, 0.0, 0  # a known phase that misfits is no jump of the motion
     for i in range(r.size):
         if (root[i] ** 2).sum() <= 0.0:  # a direction in which the block has no samples
             continue
@@ -269,7 +269,8 @@ def _update(signal, k, x, P, about, values, jacobian):  # type: ignore[no-untype
             e -= period * np.round(e / period)
             x += PH / S * e
             P -= np.outer(PH, PH) / S
-    return -0.5 * (chi2 + logdet), chi2, count
+            known += e * e / S + np.log(S)
+    return -0.5 * (chi2 + logdet + known), chi2, count
 
 
 @njit(cache=True, error_model="numpy")

@@ -106,7 +106,7 @@ def track(
                     hint="the resonance did not start; check drive voltage and frequency",
                 )
         clock = intensity_clock(recording, sense.channel)
-        axes |= {name: _axis_motion(prepared, found, i, clock, signs[i]) for i, name in enumerate(sense.axes)}
+        axes |= {name: axis_motion(prepared, found, i, clock, signs[i]) for i, name in enumerate(sense.axes)}
         info[sense.channel.name] = _facts(prepared, found, walk)
     return Motion(axes, "tracker-causal" if causal else "tracker", info)
 
@@ -292,7 +292,7 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     return replace(start, x=x), ["known: the combs' offset theta_th" if sure else "ambiguous" for sure in known]
 
 
-def _axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, float, int], sign: str) -> AxisMotion:
+def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, float, int], sign: str) -> AxisMotion:
     signal, at = prepared.signal, i * STATES
     axes = len(prepared.laws)
     rates = np.empty((len(prepared.time), axes), np.complex128)
