@@ -35,5 +35,6 @@ def reconstruct_file(path: Path, output: Path, options: Options, mapping: Path |
         write_motion(folder / "motion.h5", result.motion)
         write_json(folder / "summary.json", summary)
         save_picture(folder / "image.png", result.picture)
-        (folder / "report.html").write_text(reconstruction_report(result, summary), encoding="utf-8")
+        page = reconstruction_report(result, summary, recording["intensity"])
+        (folder / "report.html").write_text(page, encoding="utf-8")
     return summary

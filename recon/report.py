@@ -11,6 +11,8 @@ import numpy as np
 from recon import views
 from recon.pipeline import AXES, Reconstruction
 from recon.summary import mirrored
+from recon.sweeps import sweeps
+from scanner.channel import Channel
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Section:
     Attributes:
         least: width below which figures no longer share a row (CSS).
         pixelated: show pixels as squares.
+        sweeps: what the phase sliders map, see :func:`recon.sweeps.sweeps`; in one section of a page at the most.
     """
 
     heading: str
@@ -44,6 +47,7 @@ class Section:
     figures: Sequence[Figure] = field(default_factory=tuple)
     least: str = "15rem"
     pixelated: bool = False
+    sweeps: Mapping[str, Any] | None = None
 
 
 def render(title: str, lead: str, sections: Sequence[Section], notes: Sequence[str] = ()) -> str:
@@ -51,11 +55,16 @@ def render(title: str, lead: str, sections: Sequence[Section], notes: Sequence[s
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(loader=PackageLoader("recon"), autoescape=True, undefined=StrictUndefined)
-    return environment.get_template("report.html").render(title=title, lead=lead, sections=sections, notes=notes)
+    page = environment.get_template("report.html")
+    return page.render(title=title, lead=lead, sections=sections, notes=notes, unvisited=views.UNVISITED)
 
 
-def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) -> str:
-    """One recording's report."""
+def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], intensity: Channel) -> str:
+    """One recording's report.
+
+    Args:
+        intensity: of the recording; a stretch of it goes into the page, for the phase sliders.
+    """
     grid = result.picture.grid
     lead = (
         f"{result.motion.estimator}: {summary['samples']} samples of {result.recorded * 1e3:.4g} ms on {grid.width} × "
@@ -72,6 +81,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) ->
         Section(
             "Phase", _phase_text(result), axis_table(summary), phase_figures({result.motion.estimator: result}), "26rem"
         ),
+        by_hand(result, intensity),
         Section(
             "Blur", BLUR_TEXT, figures=[blur_of({a: summary[a]["blur_px"] for a in AXES}, result.p)], least="30rem"
         ),
@@ -129,6 +139,21 @@ PICTURE_TEXT = (
     "how far forward and backward sweeps lie apart. Picture error: rms against the noiseless scene over visited "
     "pixels, once a uniform magnification is taken out, and its ratio to that of the true motion."
 )
+
+
+def by_hand(result: Reconstruction, intensity: Channel) -> Section:
+    """Sliders that add to the phases, for what chen2020 did by hand before its filter did it."""
+    heading = "Phase by hand"
+    data = sweeps(result, intensity)
+    if data is None:
+        return Section(heading, "The scan is too short for the phase sliders.")
+    first, stop = (1e3 * seconds for seconds in data["seconds"])
+    text = (
+        f"The scan from {first:.4g} to {stop:.4g} ms, mapped again as the sliders move: forward sweeps in magenta, "
+        "backward sweeps in green. A wrong phase moves them apart; where they agree the colours add up to grey, and that should "
+        "be at the estimate, 0°. Arrow keys move by 0.01°."
+    )
+    return Section(heading, text, sweeps=data)
 
 
 def axis_table(summary: Mapping[str, Any]) -> Table:
