@@ -150,8 +150,8 @@ def by_hand(result: Reconstruction, intensity: Channel) -> Section:
     first, stop = (1e3 * seconds for seconds in data["seconds"])
     text = (
         f"The scan from {first:.4g} to {stop:.4g} ms, mapped again as the sliders move: forward sweeps in magenta, "
-        "backward sweeps in green. A wrong phase moves them apart; where they agree the colours add up to grey, and that should "
-        "be at the estimate, 0°. Arrow keys move by 0.01°."
+        "backward sweeps in green. A wrong phase moves them apart; where they agree the colours add up to grey, "
+        "and that should be at the estimate, 0°. Arrow keys move by 0.01°."
     )
     return Section(heading, text, sweeps=data)
 
