@@ -9,15 +9,23 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from recon.convert import open_any
 from recon.output import replacing_folder
 from scanner.device import Device
-from scanner.recording import Recording
 
 
 def diagnose_files(
-    paths: Sequence[Path], output: Path, device: Path | None = None, terms: Path | None = None, quiet: bool = False
+    paths: Sequence[Path],
+    output: Path,
+    device: Path | None = None,
+    terms: Path | None = None,
+    mapping: Path | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Diagnose recordings of one device; write diagnosis.json, device.toml and report.html into ``output``.
+
+    Args:
+        mapping: what makes instruments' files recordings, see :func:`recon.convert.open_any`.
 
     Raises:
         BadInput: a recording, the device or the term file cannot be used.
@@ -32,7 +40,7 @@ def diagnose_files(
     if terms is not None:
         register(terms)
     with ExitStack() as stack:
-        recordings = [stack.enter_context(Recording.open(path)) for path in paths]
+        recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = Device.load(device) if device is not None else None
         with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
             diagnosis = diagnose(recordings, nominal, bar.set_description_str)

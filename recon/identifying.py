@@ -8,10 +8,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recon.convert import open_any
 from recon.output import replacing_folder
 from scanner.device import Device
 from scanner.errors import BadInput
-from scanner.recording import Recording
 
 if TYPE_CHECKING:
     from estimation.calibration import Identified
@@ -23,8 +23,13 @@ UNITS = {
 }  # fmt: skip
 
 
-def identify_files(paths: Sequence[Path], output: Path, device: Path | None = None) -> dict[str, Any]:
+def identify_files(
+    paths: Sequence[Path], output: Path, device: Path | None = None, mapping: Path | None = None
+) -> dict[str, Any]:
     """Identify a device and write device.toml, summary.json and report.html into ``output``.
+
+    Args:
+        mapping: what makes instruments' files recordings, see :func:`recon.convert.open_any`.
 
     Raises:
         BadInput: a recording or the device cannot be used, or nothing can be told.
@@ -32,7 +37,7 @@ def identify_files(paths: Sequence[Path], output: Path, device: Path | None = No
     from estimation.calibration import identify
 
     with ExitStack() as stack:
-        recordings = [stack.enter_context(Recording.open(path)) for path in paths]
+        recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = Device.load(device) if device else next((r.device for r in recordings if r.device), None)
         if nominal is None:
             hint = "give one with --device, or record it under /device"

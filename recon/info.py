@@ -7,19 +7,24 @@ from typing import Any
 
 import h5py
 
+from recon.convert import open_any
 from recon.readers import read
 from recon.readers.contents import Variable
 from scanner.channel import CHANNEL_UNITS
 from scanner.hdf5 import attributes, open_hdf5
-from scanner.recording import FORMAT, Recording
+from scanner.recording import FORMAT
 
 HEADING = f"""\
 # A suggestion to edit, not a guess to trust: name each channel by what it is, drop the others, state what stands
 # behind a #. Channels: {", ".join(CHANNEL_UNITS)}, intensity."""
 
 
-def info(path: Path, format: str | None = None) -> dict[str, Any]:
+def info(path: Path, format: str | None = None, mapping: Path | None = None) -> dict[str, Any]:
     """Variables of a file with size, unit and clock as far as it states them, and a mapping to start from.
+
+    Args:
+        format: where neither the file's beginning nor its name tells.
+        mapping: list the recording that it makes of the file instead, see :func:`recon.convert.open_any`.
 
     Returns:
         ``file``, ``format``, ``about`` (name, device, start of the recording, ... as stated), ``variables`` (``shape``,
@@ -29,8 +34,8 @@ def info(path: Path, format: str | None = None) -> dict[str, Any]:
     Raises:
         BadInput: as :func:`recon.readers.read` or :meth:`Recording.open`.
     """
-    if format is None and _is_recording(path):
-        return _of_recording(path)
+    if mapping is not None or (format is None and _is_recording(path)):
+        return _of_recording(path, mapping)
     contents = read(path, format)
     try:
         return {
@@ -66,8 +71,8 @@ def _is_recording(path: Path) -> bool:
         return attributes(file).get("format") == FORMAT
 
 
-def _of_recording(path: Path) -> dict[str, Any]:
-    with Recording.open(path) as recording:
+def _of_recording(path: Path, mapping: Path | None) -> dict[str, Any]:
+    with open_any(path, mapping) as recording:
         device = {} if recording.device is None else {"device": recording.device.name}
         return {
             "file": str(path),

@@ -8,14 +8,24 @@ from typing import Any
 
 import numpy as np
 
+from recon.convert import open_any
 from recon.output import replacing_folder
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
 
-def predict_file(path: Path, output: Path, device: Path | None = None, terms: Path | None = None) -> dict[str, Any]:
+def predict_file(
+    path: Path,
+    output: Path,
+    device: Path | None = None,
+    terms: Path | None = None,
+    mapping: Path | None = None,
+) -> dict[str, Any]:
     """Predict one recording and write predicted.h5 and summary.json into ``output``.
+
+    Args:
+        mapping: what makes an instrument's file a recording, see :func:`recon.convert.open_any`.
 
     Raises:
         BadInput: the recording or the device cannot be used.
@@ -25,7 +35,7 @@ def predict_file(path: Path, output: Path, device: Path | None = None, terms: Pa
 
     if terms is not None:
         register(terms)
-    with Recording.open(path) as recording:
+    with open_any(path, mapping) as recording:
         used = Device.load(device) if device is not None else recording.device
         if used is None:
             hint = "give one with --device, or record it under /device"

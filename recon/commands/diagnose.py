@@ -10,6 +10,7 @@ from typing import Any
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="recordings of one device (.h5)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
     parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms of your own")
 
@@ -17,7 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.diagnosing import diagnose_files
 
-    return diagnose_files(args.recordings, args.output, device=args.device, terms=args.terms, quiet=args.json)
+    return diagnose_files(
+        args.recordings, args.output, device=args.device, terms=args.terms, mapping=args.mapping, quiet=args.json
+    )
 
 
 def tell(summary: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="calibration recordings (.h5)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the device")
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument(
         "--device", type=Path, metavar="FILE", help="nominal device TOML in place of the recordings' own"
     )
@@ -18,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.identifying import identify_files
 
-    return identify_files(args.recordings, args.output, device=args.device)
+    return identify_files(args.recordings, args.output, device=args.device, mapping=args.mapping)
 
 
 def tell(summary: dict[str, Any]) -> str:

@@ -9,13 +9,15 @@ from typing import Any
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="a recording, or an instrument's file")
-    parser.add_argument("--format", help="the file's format, where neither its beginning nor its name tells")
+    one = parser.add_mutually_exclusive_group()
+    one.add_argument("--format", help="the file's format, where neither its beginning nor its name tells")
+    one.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: list the recording that it makes of the file")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.info import info
 
-    return info(args.file, args.format)
+    return info(args.file, args.format, args.mapping)
 
 
 def tell(summary: dict[str, Any]) -> str:
