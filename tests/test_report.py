@@ -144,7 +144,7 @@ def test_the_script_maps_as_the_program_does(data: dict, tmp_path: Path) -> None
         # The script interpolates straight on beyond the first and last knots, and holds its arrays as float32.
         assert np.mean(np.array(counts) == own_counts.ravel()) > 0.98
         assert np.corrcoef(sums, own_sums.ravel())[0, 1] > 0.98
-        assert sum(counts) == pytest.approx(own_counts.sum(), abs=2)
+        assert abs(sum(counts) - int(own_counts.sum())) <= 1e-3 * own_counts.sum()  # at the edge
 
 
 LOOK = """<pre id="seen"></pre><script>
