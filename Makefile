@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint bench papers concealed clean
+.PHONY: demo test lint bench papers concealed wheel-check clean
 
 $(STAMP): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed; run make PYTHON=python3.x" if sys.version_info < (3, 11) else 0)'
@@ -33,6 +33,9 @@ concealed: $(STAMP)
 	mkdir -p sealed
 	$(BIN)/python -m benchmarks.concealed.make sealed/recordings sealed/keys --workers 2
 	$(BIN)/python -m benchmarks.concealed.score sealed/recordings sealed/keys/keys.json sealed/out
+
+wheel-check: $(STAMP)
+	$(BIN)/python benchmarks/wheel.py
 
 clean:
 	rm -rf $(VENV) demo-output
