@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scanner.demodulate import block_length, block_phasors
 from scanner.device import Amdm, Axis, Capacitance, Mechanics, Position, Transimpedance
 from scanner.errors import BadInput
-from scanner.integrate import rk4
 from scanner.laws import capacitance, capacitance_slope, electrostatic_torque
 from scanner.lowpass import lowpass, step_coefficients
+from scanner.trajectory import integrate
 
 Array = NDArray[np.float64]
 
@@ -142,16 +142,15 @@ def ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[
     used = angle[::stride]
     step = stride / rate / steps_a_stride
     n = (used.size - 1) * steps_a_stride
-    voltage = np.full(2 * n + 1, bias)
-    shape = (comb.C0, comb.theta0, comb.theta_th) if comb else (0.0, 1.0, 0.0)
+    voltage = np.full((n, 3), bias)
     w0, loss0 = _first_guess(used, rate / stride, mechanics)
     scale = np.array([1e-3 * w0, 0.1 * loss0, 0.01 * np.abs(used).max(), 0.01 * w0 * np.abs(used).max(), 0.1])
 
     def trajectory(x: Array) -> Array:
         w, loss, theta, omega, log_inverse = start + scale * np.append(x, np.zeros(5 - x.size))
         J = mechanics.J * np.exp(-log_inverse)
-        b, k = np.full(2 * n + 1, loss * J), np.full(2 * n + 1, w * w * J)
-        return rk4(theta, omega, voltage, b, k, step, steps_a_stride, J, *shape, 0.0)[0]
+        tried = Axis(Mechanics(J, max(loss, 1e-6 * loss0) * J, w * w * J), comb)  # a step of the fit may overshoot
+        return integrate(tried, (theta, omega), voltage, step)[0][::steps_a_stride]
 
     around = np.arange(min(used.size, 2 * STEPS_A_CYCLE))
     line = np.polynomial.polynomial.polyfit(around[:9] * stride / rate, used[:9], 3)

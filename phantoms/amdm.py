@@ -9,7 +9,7 @@ from phantoms.forward import quantised
 from phantoms.waveforms import Waveform
 from scanner.circuit import AmdmCircuit, run
 from scanner.device import Axis
-from scanner.integrate import rk4
+from scanner.trajectory import integrate, thirds
 
 Array = NDArray[np.float64]
 
@@ -37,15 +37,12 @@ def recorded(
     Returns:
         (sense [V], angle [rad], drive voltage [V]) at the samples, shape (round(duration sample_rate),) each.
     """
-    mechanics, comb = axis.require_mechanics(), axis.require_capacitance()
+    comb = axis.require_capacitance()
     clock = FINE * sample_rate
     before, n = round(settle * sample_rate) * FINE, round(duration * sample_rate) * FINE
     half_steps = (np.arange(2 * (before + n) + 1) - 2 * before) / (2 * clock)
     volt = drive(half_steps)
-    ones = np.ones(1)
-    b, k = (np.broadcast_to(value * ones, volt.shape) for value in (mechanics.b, mechanics.k))
-    shape = comb.C0, comb.theta0, comb.theta_th
-    angle, rate = rk4(kick, 0.0, volt + circuit.carrier(half_steps), b, k, 1 / clock, 1, mechanics.J, *shape, 0.0)
+    angle, rate = integrate(axis, (kick, 0.0), thirds(volt + circuit.carrier(half_steps)), 1 / clock)
     cut = slice(max(0, before - round(2e-4 * clock)), before + n)  # the sections' switching on stays before t = 0
     stages = run(circuit, comb, angle[cut], rate[cut], volt[::2][cut], clock, (cut.start - before) / clock)
     kept = slice(before - cut.start, None, FINE)

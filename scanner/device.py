@@ -8,7 +8,7 @@ a round trip through a program that is older than it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import pi, sqrt
 from pathlib import Path
 from typing import Any, ClassVar
@@ -315,6 +315,11 @@ class Device:
             hint = f"add the table [{name}]; the device holds {', '.join(self.axes)}"
             raise DeviceInvalid("is missing and needed here", file=self.source, channel=name, hint=hint)
         return self.axes[name]
+
+    def sensed_axis(self, name: str) -> Axis:
+        """One axis with the readout that sees it, its own or the shared one; raises as :meth:`axis`."""
+        axis = self.axis(name)
+        return axis if self.readout is None else replace(axis, readout=self.readout)
 
     def require_scan(self) -> Scan:
         """The field of view; DeviceInvalid where the device states none."""

@@ -5,8 +5,8 @@ One chain for everybody who asks what a device would have recorded: prediction, 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from scanner.trajectory import Bell, Torque, integrate
 
 Array = NDArray[np.float64]
 _NOTHING = np.empty(0)
+
+RELAXATIONS = 2
+"""Turns in which coupled axes are moved again; each gains the square of the coupling."""
 
 
 @dataclass(frozen=True)
@@ -65,16 +68,35 @@ class Path:
 
     Attributes:
         axis: with the constants that its terms gave it.
+        added: its terms.
+        inputs: as recorded.
         angle, rate: shape (n + 1,) [rad, rad/s].
-        voltage: that pulled, terms included, and
-        raw_voltage: as recorded, shape (n + 1,) [V].
+        voltage: that pulled, terms included, shape (n + 1,) [V].
     """
 
     axis: Axis
+    added: tuple[Added, ...]
+    inputs: Inputs
     angle: Array
     rate: Array
     voltage: Array
-    raw_voltage: Array
+
+    def after(self, first: int) -> Path:
+        """The path from step ``first`` on."""
+        inputs = replace(self.inputs, voltage=self.inputs.voltage[first:], t0=self.inputs.t0 + first * self.inputs.step)
+        return replace(
+            self, inputs=inputs, angle=self.angle[first:], rate=self.rate[first:], voltage=self.voltage[first:]
+        )
+
+    def followed_by(self, path: Path) -> Path:
+        """This path and the one that goes on where it ends."""
+        return replace(
+            self,
+            inputs=replace(self.inputs, voltage=np.concatenate([self.inputs.voltage, path.inputs.voltage])),
+            angle=np.concatenate([self.angle[:-1], path.angle]),
+            rate=np.concatenate([self.rate[:-1], path.rate]),
+            voltage=np.concatenate([self.voltage[:-1], path.voltage]),
+        )
 
 
 def added_terms(axis: Axis) -> tuple[Added, ...]:
@@ -113,41 +135,95 @@ def move(
     """The motion of one axis under its drive.
 
     Args:
-        axis: nominal values.
+        axis: nominal values, with the readout that sees it.
         start: angle [rad] and rate [rad/s] at the first sample.
         other: angle of the other axis, shape (n, 3) [rad].
     """
-    raw = _samples(inputs.voltage)
+    axis = with_constants(axis, added)
+    voltage = pulling(axis, added, inputs)
+    torques = [Torque(each.term.torque, each.values, each.hidden) for each in added if each.term.torque is not None]
+    bells = [Bell(each.term.bell, each.values) for each in added if each.term.bell is not None]
+    angle, rate = integrate(axis, start, voltage, inputs.step, inputs.t0, torques, bells, other)
+    return Path(axis, tuple(added), inputs, angle, rate, samples(voltage))
+
+
+def with_constants(axis: Axis, added: Iterable[Added]) -> Axis:
+    """The axis with the constants that its terms give it."""
     for each in added:
         if each.term.constants is not None:
             axis = each.term.constants(axis, each.values)
-    view = View(inputs.time, inputs.step, axis.readout, _NOTHING, raw, _NOTHING, _NOTHING)
+    return axis
+
+
+def pulling(axis: Axis, added: Sequence[Added], inputs: Inputs) -> Array:
+    """The voltage on the combs, terms included, shape (n, 3) [V]."""
+    view = View(inputs.time, inputs.step, axis.readout, _NOTHING, samples(inputs.voltage), _NOTHING, _NOTHING)
     voltage = inputs.voltage
     for each in by_stage(added):
         if each.term.voltage is not None:
             voltage = each.term.voltage(voltage, each.values, view)
-    torques = [Torque(each.term.torque, each.values, each.hidden) for each in added if each.term.torque is not None]
-    bells = [Bell(each.term.bell, each.values) for each in added if each.term.bell is not None]
-    angle, rate = integrate(axis, start, voltage, inputs.step, inputs.t0, torques, bells, other)
-    return Path(axis, angle, rate, _samples(voltage), raw)
+    return voltage
 
 
-def sense(readout: Readout, added: Sequence[Added], paths: Sequence[Path], inputs: Inputs) -> Array:
-    """The sense channel, shape (n + 1,) [V]; several paths stand for combs on one electrode."""
+Mover = Callable[[str, Inputs, tuple[float, float], "Array | None"], Path]
+"""(axis, inputs, start, other axis's angle) -> its motion."""
+
+
+def move_all(inputs: Mapping[str, Inputs], starts: Mapping[str, tuple[float, float]], coupled: bool,
+             mover: Mover) -> dict[str, Path]:  # fmt: skip
+    """The motion of every axis; coupled ones are relaxed by turns: the weaker the coupling, the fewer it takes.
+
+    Args:
+        coupled: whether a term looks at the other axis.
+    """
+    paths = {name: mover(name, inputs[name], starts[name], None) for name in inputs}
+    for _ in range(RELAXATIONS if coupled and len(paths) > 1 else 0):
+        before = dict(paths)
+        for name in inputs:
+            (other,) = (path for each, path in before.items() if each != name)
+            paths[name] = mover(name, inputs[name], starts[name], _thirds(other))
+    return paths
+
+
+def _thirds(path: Path) -> Array:
+    """Angle at the start, middle and end of every step, by cubic Hermite interpolation, shape (n, 3)."""
+    a, b = path.angle[:-1], path.angle[1:]
+    middle = 0.5 * (a + b) + path.inputs.step / 8.0 * (path.rate[:-1] - path.rate[1:])
+    return np.stack([a, middle, b], axis=1)
+
+
+def sense(readout: Readout, paths: Sequence[Path]) -> Array:
+    """The sense channel, shape (n + 1,) [V]; several paths stand for combs on one electrode.
+
+    Args:
+        readout: nominal. A term that changes its constants, or the signal behind it, may stand with any of its axes.
+    """
+    readout = effective(readout, paths)
     match readout:
         case Amdm():
-            signal = np.sum([_comb(path, added) for path in paths], axis=0)
-            for each in added:
-                if each.term.modulate is not None:
-                    signal = each.term.modulate(signal, each.values, _view(paths[0], inputs, readout))
-            signal = amdm_voltage(_demodulated(signal, readout, inputs.step), readout.a_cir, readout.b_cir)
+            signal = np.sum([_comb(path) for path in paths], axis=0)
+            for path in paths:
+                for each in path.added:
+                    if each.term.modulate is not None:
+                        signal = each.term.modulate(signal, each.values, _view(path, readout))
+            signal = amdm_voltage(_demodulated(signal, readout, paths[0].inputs.step), readout.a_cir, readout.b_cir)
         case Position():
             signal = position_voltage(paths[0].angle, readout.gain, readout.offset)
         case _:
             # The current is that of the voltage on the comb, the nominal bias where none was recorded.
-            path = paths[0]
-            signal = transimpedance_voltage(_comb_slope(path, added), path.rate, readout.R_s, path.voltage)
-    return output("sense", signal, added, paths[0], inputs, readout)
+            currents = [
+                transimpedance_voltage(_comb_slope(path), path.rate, readout.R_s, path.voltage) for path in paths
+            ]
+            signal = np.sum(currents, axis=0)
+    return passed("sense", signal, paths, readout)
+
+
+def effective(readout: Readout, paths: Sequence[Path]) -> Readout:
+    """The readout with the constants that the terms of all its axes give it."""
+    for path in paths:
+        terms = [each for each in path.added if each.term.stage == "readout"]
+        readout = with_constants(replace(path.axis, readout=readout), terms).require_readout()
+    return readout
 
 
 def _demodulated(signal: Array, readout: Amdm, step: float) -> Array:
@@ -160,44 +236,42 @@ def _demodulated(signal: Array, readout: Amdm, step: float) -> Array:
     return dense[::2].copy()
 
 
-def reference(added: Sequence[Added], path: Path, inputs: Inputs) -> Array:
+def reference(path: Path) -> Array:
     """The reference angle, shape (n + 1,) [rad]."""
-    return output("angle", path.angle, added, path, inputs, path.axis.readout)
+    return passed("angle", path.angle, [path], path.axis.readout)
 
 
-def output(
-    channel: str, signal: Array, added: Sequence[Added], path: Path, inputs: Inputs, readout: Readout | None
-) -> Array:
-    """``signal`` after the output laws that act on ``channel``, in the order of their stages."""
-    for each in by_stage(added):
+def passed(channel: str, signal: Array, paths: Sequence[Path], readout: Readout | None) -> Array:
+    """``signal`` after the terms that act on ``channel``, in the order of their stages."""
+    acting = [(each, path) for path in paths for each in path.added]
+    for each, path in sorted(acting, key=lambda pair: STAGES.index(pair[0].term.stage)):
         kind, _, variant = each.channel.partition(":")
-        if each.term.output is not None and kind == channel:
-            signal = each.term.output(signal, each.values, _view(path, inputs, readout, variant))
+        if kind == channel:
+            signal = each.term.passed(signal, each.values, _view(path, readout, variant))
     return signal
 
 
-def _comb(path: Path, added: Sequence[Added]) -> Array:
+def _comb(path: Path) -> Array:
     comb = path.axis.require_capacitance()
-    total = capacitance(path.angle, comb.C0, comb.Cb, comb.theta0, comb.theta_th)
-    return total + _extra(path, added, 0)
+    return capacitance(path.angle, comb.C0, comb.Cb, comb.theta0, comb.theta_th) + _extra(path, 0)
 
 
-def _comb_slope(path: Path, added: Sequence[Added]) -> Array:
+def _comb_slope(path: Path) -> Array:
     comb = path.axis.require_capacitance()
-    return capacitance_slope(path.angle, comb.C0, comb.theta0, comb.theta_th) + _extra(path, added, 1)
+    return capacitance_slope(path.angle, comb.C0, comb.theta0, comb.theta_th) + _extra(path, 1)
 
 
-def _extra(path: Path, added: Sequence[Added], derivative: int) -> Array | float:
-    laws = [each for each in added if each.term.bell is not None]
-    if not laws:
-        return 0.0
-    along = [Bell(each.term.bell, each.values).along(path.angle, path.axis) for each in laws if each.term.bell]
-    return np.sum([extra[derivative] for extra in along], axis=0)
+def _extra(path: Path, derivative: int) -> Array | float:
+    bells = [Bell(each.term.bell, each.values) for each in path.added if each.term.bell is not None]
+    return sum((bell.along(path.angle, path.axis)[derivative] for bell in bells), start=0.0)
 
 
-def _view(path: Path, inputs: Inputs, readout: Readout | None, variant: str = "") -> View:
-    return View(inputs.time, inputs.step, readout, path.voltage, path.raw_voltage, path.angle, path.rate, variant)
+def _view(path: Path, readout: Readout | None, variant: str = "") -> View:
+    inputs = path.inputs
+    raw = samples(inputs.voltage)
+    return View(inputs.time, inputs.step, readout, path.voltage, raw, path.angle, path.rate, variant)
 
 
-def _samples(voltage: Array) -> Array:
+def samples(voltage: Array) -> Array:
+    """Of a voltage at the start, middle and end of every step, shape (n, 3), that at the n + 1 samples."""
     return np.append(voltage[:, 0], voltage[-1, 2])

@@ -61,19 +61,38 @@ _LAWS = types.Tuple(
 
 
 @njit(inline="always")
-def _acceleration(t, theta, omega, other, volt, z, dz, laws):  # type: ignore[no-untyped-def]
-    """Angular acceleration; fills the rates ``dz`` of the hidden states."""
-    torques, torque_p, n_torques, bells, bell_p, n_bells, nominal, electrostatic = laws
-    torque = nominal[6] * volt
-    if electrostatic:
-        slope = capacitance_slope(theta, nominal[3], nominal[4], nominal[5])
-        for i in range(n_bells):
-            slope += bells[i](theta, bell_p[i], nominal)[1]
+def _extra_slope(theta, laws):  # type: ignore[no-untyped-def]
+    """What the capacitance terms add to dC/dtheta."""
+    bells, p, n, nominal = laws[3], laws[4], laws[5], laws[6]
+    slope = 0.0
+    for i in range(n):
+        slope += bells[i](theta, p[i], nominal)[1]
+    return slope
+
+
+@njit(inline="always")
+def _extra_torque(t, theta, omega, other, volt, z, dz, laws):  # type: ignore[no-untyped-def]
+    """Torque of the mechanics terms; fills the rates ``dz`` of their hidden states."""
+    torques, p, n, nominal = laws[0], laws[1], laws[2], laws[6]
+    total = 0.0
+    for i in range(n):
+        torque, dz[i, 0], dz[i, 1] = torques[i](t, theta, omega, other, volt, z[i, 0], z[i, 1], p[i], nominal)
+        total += torque
+    return total
+
+
+@njit(inline="always")
+def _acceleration(t, theta, omega, other, volt, z, dz, laws, values):  # type: ignore[no-untyped-def]
+    J, b, k, C0, theta0, theta_th, torque_per_volt = values
+    torque = torque_per_volt * volt
+    if laws[7]:
+        slope = capacitance_slope(theta, C0, theta0, theta_th)
+        if laws[5] > 0:
+            slope += _extra_slope(theta, laws)
         torque += electrostatic_torque(slope, volt)
-    for i in range(n_torques):
-        extra, dz[i, 0], dz[i, 1] = torques[i](t, theta, omega, other, volt, z[i, 0], z[i, 1], torque_p[i], nominal)
-        torque += extra
-    return angular_acceleration(theta, omega, torque, nominal[0], nominal[1], nominal[2])
+    if laws[2] > 0:
+        torque += _extra_torque(t, theta, omega, other, volt, z, dz, laws)
+    return angular_acceleration(theta, omega, torque, J, b, k)
 
 
 @njit(inline="always")
@@ -87,23 +106,25 @@ def _advance(out, z, h, dz, n):  # type: ignore[no-untyped-def]
     cache=True, nogil=True,
 )  # fmt: skip
 def _integrate(theta, omega, z, voltage, other, t, step, laws, angle, rate):  # type: ignore[no-untyped-def]
-    half, n = 0.5 * step, laws[2]
+    half, n, nominal = 0.5 * step, laws[2], laws[6]
+    # In registers: from an array they would be loaded anew at every stage, which takes longer than the stage itself.
+    values = (nominal[0], nominal[1], nominal[2], nominal[3], nominal[4], nominal[5], nominal[6])
     z, mid = z.copy(), np.zeros_like(z)
     d1, d2, d3, d4 = np.zeros_like(z), np.zeros_like(z), np.zeros_like(z), np.zeros_like(z)
     angle[0], rate[0] = theta, omega
     for i in range(voltage.shape[0]):
-        v0, v1, v2 = voltage[i]
-        o0, o1, o2 = other[i]
-        a1 = _acceleration(t, theta, omega, o0, v0, z, d1, laws)
+        v0, v1, v2 = voltage[i, 0], voltage[i, 1], voltage[i, 2]
+        o0, o1, o2 = other[i, 0], other[i, 1], other[i, 2]
+        a1 = _acceleration(t, theta, omega, o0, v0, z, d1, laws, values)
         w2 = omega + half * a1
         _advance(mid, z, half, d1, n)
-        a2 = _acceleration(t + half, theta + half * omega, w2, o1, v1, mid, d2, laws)
+        a2 = _acceleration(t + half, theta + half * omega, w2, o1, v1, mid, d2, laws, values)
         w3 = omega + half * a2
         _advance(mid, z, half, d2, n)
-        a3 = _acceleration(t + half, theta + half * w2, w3, o1, v1, mid, d3, laws)
+        a3 = _acceleration(t + half, theta + half * w2, w3, o1, v1, mid, d3, laws, values)
         w4 = omega + step * a3
         _advance(mid, z, step, d3, n)
-        a4 = _acceleration(t + step, theta + step * w3, w4, o2, v2, mid, d4, laws)
+        a4 = _acceleration(t + step, theta + step * w3, w4, o2, v2, mid, d4, laws, values)
         theta += step / 6.0 * (omega + 2.0 * w2 + 2.0 * w3 + w4)
         omega += step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
         for j in range(n):
@@ -189,6 +210,11 @@ def integrate(
     theta, omega = float(start[0]), float(start[1])
     _integrate(theta, omega, hidden, np.ascontiguousarray(voltage), others, float(t0), float(step), laws, angle, rate)
     return angle, rate
+
+
+def thirds(half_steps: Array) -> Array:
+    """What is told at every half step, shape (2 n + 1,), at the start, middle and end of every step, shape (n, 3)."""
+    return np.stack([half_steps[:-2:2], half_steps[1::2], half_steps[2::2]], axis=1)
 
 
 class _Address(types.WrapperAddressProtocol):

@@ -12,7 +12,7 @@ from benchmarks.papers.sine import driven, linear_axis
 from benchmarks.papers.threshold import sensing_axis
 from estimation.calibration import identify, kind_of
 from estimation.identify import Driven, mechanics_from_driven, profile, ringdown
-from phantoms.forward import Plan, Start, sense_voltage, settled, simulate, trajectory
+from phantoms.forward import Plan, Start, settled, simulate, trajectory
 from phantoms.waveforms import Constant, Sine
 from recon.cli import main
 from scanner.device import Device
@@ -20,6 +20,7 @@ from scanner.devices import load
 from scanner.drift import Drift
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.response import sense
 
 DRIVEN = load("chen2020-driven")
 AXIS = DRIVEN.axis("x")
@@ -32,7 +33,7 @@ def moving() -> list[Driven]:
     records = []
     for f in (31400.0, 31480.0, 31560.0):
         plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.004, RATE, substeps=4)
-        angle, _ = trajectory(AXIS, plan, settled(AXIS, replace(plan, settle=0.04)), 0.0, 0.004)
+        angle = trajectory(AXIS, plan, settled(AXIS, replace(plan, settle=0.04)), 0.0, 0.004).angle
         records.append(Driven(angle[:-1:4], plan.drives["x"](np.arange(20000) / RATE), f / 2, RATE))
     return records
 
@@ -42,8 +43,8 @@ def decay() -> tuple[np.ndarray, np.ndarray]:
     """Noiseless decay of the chen2019 device under its bias: angle and sense."""
     axis = sensing_axis()
     plan = Plan({"x": Constant(10.0)}, 0.08, 500e3, substeps=4)
-    angle, rate = (v[:-1:4] for v in trajectory(axis, plan, Start(0.15, 0.0), 0.0, 0.08))
-    return angle, sense_voltage(axis.require_readout(), {"x": axis}, {"x": angle}, {"x": rate}, 2e-6, {})
+    path = trajectory(axis, plan, Start(0.15, 0.0), 0.0, 0.08)
+    return path.angle[:-1:4], sense(axis.require_readout(), [path])[:-1:4]
 
 
 def coverage(draws: list[dict], truth: dict[str, float]) -> dict[str, float]:

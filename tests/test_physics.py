@@ -1,5 +1,7 @@
 """Laws, integrator, parametric resonance and readout against analytic cases."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,21 +10,22 @@ from scipy.special import ive
 
 from scanner import devices
 from scanner.demodulate import block_length, block_phasors, unwrapped
-from scanner.device import Capacitance
+from scanner.device import Axis, Capacitance, Mechanics
 from scanner.drift import settling
 from scanner.harmonics import capacitance_harmonics, readout_response
-from scanner.integrate import rk4
 from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, electrostatic_torque
 from scanner.lowpass import lowpass, response, step_coefficients
 from scanner.parametric import sine_drive, slow_flow, steady_state, stiffness_modulation, threshold, tongue_edges
+from scanner.trajectory import integrate, thirds
 
 COMB = Capacitance(C0=5.71e-12, Cb=9.79e-12, theta0=0.2, theta_th=0.01)
 DRIVEN = devices.load("chen2020-driven").axis("x")
+SWUNG = replace(DRIVEN, capacitance=Capacitance(C0=5.71e-12, Cb=0.0, theta0=0.2))
 
 
-def run(theta, omega, step, steps, voltage=0.0, b=0.0, stride=1, J=1e-15, k=9.6e-6, C0=0.0):
-    n = 2 * steps + 1
-    return rk4(theta, omega, np.full(n, voltage), np.full(n, b), np.full(n, k), step, stride, J, C0, 0.2, 0.0, 0.0)
+def run(theta, omega, step, steps, voltage=0.0, b=1e-40, stride=1, J=1e-15, k=9.6e-6, C0=0.0):
+    axis = Axis(Mechanics(J, b, k), Capacitance(C0, 0.0, 0.2) if C0 else None)
+    return tuple(v[::stride] for v in integrate(axis, (theta, omega), np.full((steps, 3), voltage), step))
 
 
 @given(st.floats(-0.6, 0.6))
@@ -74,10 +77,7 @@ def test_integrator_is_of_fourth_order_on_the_driven_equation() -> None:
         steps = round(1e-3 / step)
         t = 0.5 * step * np.arange(2 * steps + 1)
         v = 30 + 30 * np.sin(2 * np.pi * 31400 * t)
-        m = DRIVEN.require_mechanics()
-        angle, _ = rk4(
-            0.15, 0.0, v, np.full(t.size, m.b), np.full(t.size, m.k), step, steps, m.J, 5.71e-12, 0.2, 0.0, 0.0
-        )
+        angle, _ = integrate(SWUNG, (0.15, 0.0), thirds(v), step)
         return float(angle[-1])
 
     exact = end(2.5e-8)
@@ -113,7 +113,6 @@ def test_harmonics_are_the_bessel_functions(amplitude: float) -> None:
 def test_threshold_and_tongue_hold_in_the_full_equation() -> None:
     """Rest is unstable inside the tongue's edges and stable outside, found by integrating from a tiny angle."""
     drive = lambda f: sine_drive(f, 30.0, 30.0)  # noqa: E731
-    m = DRIVEN.require_mechanics()
     edges = tongue_edges(DRIVEN, drive(31400.0))
     assert edges is not None
 
@@ -121,7 +120,7 @@ def test_threshold_and_tongue_hold_in_the_full_equation() -> None:
         step, steps = 2e-7, 100_000
         t = 0.5 * step * np.arange(2 * steps + 1)
         v = 30 + 30 * np.sin(2 * np.pi * f * t)
-        angle, _ = rk4(1e-6, 0.0, v, np.full(t.size, m.b), np.full(t.size, m.k), step, 1, m.J, 5.71e-12, 0.2, 0.0, 0.0)
+        angle, _ = integrate(SWUNG, (1e-6, 0.0), thirds(v), step)
         return np.log(np.abs(angle[-5000:]).max() / np.abs(angle[45_000:50_000]).max())
 
     width = edges[1] - edges[0]
@@ -145,11 +144,10 @@ def test_slow_flow_gives_the_steady_state_of_the_full_equation() -> None:
     assert state is not None
     amplitude, phase = state
     assert np.abs(slow_flow(DRIVEN, drive, amplitude, phase)).max() < 1e-3
-    m = DRIVEN.require_mechanics()
     step, steps = 1e-7, 250_000
     t = 0.5 * step * np.arange(2 * steps + 1)
     v = 30 + 30 * np.sin(2 * np.pi * 31400.0 * t)
-    angle, _ = rk4(amplitude, 0.0, v, np.full(t.size, m.b), np.full(t.size, m.k), step, 1, m.J, 5.71e-12, 0.2, 0.0, 0.0)
+    angle, _ = integrate(SWUNG, (amplitude, 0.0), thirds(v), step)
     tc, z = block_phasors(angle[-20_000:], 1 / step, (steps - 19_999) * step, 15700.0, 10_000)
     found = np.angle(z[-1] * np.exp(-2j * np.pi * 15700.0 * tc[-1]))
     assert np.abs(z[-1]) == pytest.approx(amplitude, rel=2e-3)

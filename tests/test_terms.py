@@ -142,8 +142,9 @@ def test_array_laws_do_what_they_say() -> None:
 def test_a_readout_gain_drifts_from_the_recording_s_start() -> None:
     inputs = Inputs(np.zeros((1000, 3)), STEP, t0=0.5)
     path = move(LINEAR, [], inputs, (0.1, 0.0))
-    plain = sense(LINEAR.readout, [], [path], inputs)
-    drifted = sense(LINEAR.readout, [Added(catalogue()["gain-drift"], (0.1, 1.0))], [path], inputs)
+    plain = sense(LINEAR.readout, [path])
+    drifting = Added(catalogue()["gain-drift"], (0.1, 1.0))
+    drifted = sense(LINEAR.readout, [replace(path, added=(drifting,))])
     np.testing.assert_allclose(drifted, plain * (1 + 0.1 * inputs.time))
 
 

@@ -18,10 +18,11 @@ from benchmarks.papers.threshold import lilliefors, sensing_axis
 from estimation.filters import Problem, prepare, tuned_heights
 from estimation.hybrid import SIGMA_CYCLES, detector_for, run_hybrid
 from estimation.threshold import Detector, crossing_law, crossings
-from phantoms.forward import Plan, Start, quantised, sense_voltage, trajectory
+from phantoms.forward import Plan, Start, quantised, trajectory
 from phantoms.waveforms import Constant
 from scanner.device import Axis, Device
 from scanner.recording import Recording
+from scanner.response import sense
 
 Array = NDArray[np.float64]
 
@@ -56,12 +57,12 @@ def trial(seed: int) -> Trial:
     phase, w = rng.uniform(0, 2 * np.pi), 2 * np.pi * true.resonance
     plan = Plan({"x": Constant(BIAS)}, DURATION, RATE, substeps=4)
     start = Start(AMPLITUDE * np.cos(phase), -AMPLITUDE * w * np.sin(phase))
-    angle, rate = (v[:-1:4] for v in trajectory(true, plan, start, 0.0, DURATION))
-    readout = true.require_readout()
-    sense = sense_voltage(readout, {"x": true}, {"x": angle}, {"x": rate}, 1 / RATE, {})
-    sense = quantised(sense + rng.normal(0.0, readout.noise_sd, sense.size), readout.bits, 10.0)
+    path = trajectory(true, plan, start, 0.0, DURATION)
+    readout, angle = true.require_readout(), path.angle[:-1:4]
+    signal = sense(readout, [path])[:-1:4]
+    signal = quantised(signal + rng.normal(0.0, readout.noise_sd, signal.size), readout.bits, 10.0)
     told = miscalibrated(true, rng)
-    channels = {"sense_x": (sense, "V", RATE, 0.0), "bias_x": (np.full(sense.size, BIAS), "V", RATE, 0.0)}
+    channels = {"sense_x": (signal, "V", RATE, 0.0), "bias_x": (np.full(signal.size, BIAS), "V", RATE, 0.0)}
     recording = Recording.from_arrays(channels, Device("told", {"x": told}))
     (problem,) = prepare(recording, recording.device)  # type: ignore[arg-type]
     return Trial(problem, told, angle, float(tuned_heights(problem)[0]))

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from benchmarks.papers.figures import Results, entry, figure
 from benchmarks.papers.threshold import sensing_axis
 from estimation.identify import Driven, Value, mechanics_from_driven, profile, ringdown
-from phantoms.forward import Plan, Start, sense_voltage, settled, trajectory
+from phantoms.forward import Plan, Start, settled, trajectory
 from phantoms.waveforms import Constant, Sine
 from scanner.device import Axis
 from scanner.devices import load
 from scanner.laws import capacitance
+from scanner.response import sense
 
 Array = NDArray[np.float64]
 
@@ -31,8 +32,8 @@ DECAY_RATE = 500e3
 def decay(axis: Axis) -> tuple[Array, Array]:
     """Noiseless ringdown of the chen2019 device: angle [rad] and sense [V]."""
     plan = Plan({"x": Constant(10.0)}, 0.08, DECAY_RATE, substeps=4)
-    angle, rate = (v[:-1:4] for v in trajectory(axis, plan, Start(0.15, 0.0), 0.0, 0.08))
-    return angle, sense_voltage(axis.require_readout(), {"x": axis}, {"x": angle}, {"x": rate}, 1 / DECAY_RATE, {})
+    path = trajectory(axis, plan, Start(0.15, 0.0), 0.0, 0.08)
+    return path.angle[:-1:4], sense(axis.require_readout(), [path])[:-1:4]
 
 
 def driven(axis: Axis) -> list[Driven]:
@@ -40,7 +41,7 @@ def driven(axis: Axis) -> list[Driven]:
     records = []
     for f in (31400.0, 31460.0, 31520.0, 31580.0):
         plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.004, 5e6, substeps=4)
-        angle, _ = trajectory(axis, plan, settled(axis, plan), 0.0, 0.004)
+        angle = trajectory(axis, plan, settled(axis, plan), 0.0, 0.004).angle
         records.append(Driven(angle[:-1:4], plan.drives["x"](np.arange(20000) / 5e6), f / 2, 5e6))
     return records
 

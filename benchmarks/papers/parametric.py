@@ -30,7 +30,7 @@ def swept(axis: Axis, f0: float, f1: float, duration: float = SWEEP_TIME) -> tup
     drive = Sweep(f0, f1, duration, 30.0, 30.0)
     plan = Plan({"x": drive}, duration, SWEEP_RATE, substeps=1)
     offset = replace(axis, capacitance=replace(axis.require_capacitance(), theta_th=OFFSET))
-    angle, _ = trajectory(offset, plan, Start(0.0, 0.0), 0.0, duration)
+    angle = trajectory(offset, plan, Start(0.0, 0.0), 0.0, duration).angle
     block = block_length(f0 / 2, SWEEP_RATE, 10.0)
     time, z = block_phasors(angle, SWEEP_RATE, 0.0, f0 / 2, block)
     centre = 0.5 * drive.angle(time)
@@ -45,7 +45,7 @@ def jump(frequency: Array, amplitude: Array) -> float:
 def decays(axis: Axis, drive: Waveform, duration: float = 0.02) -> float:
     """Amplitude left of 0.15 rad after ``duration`` under the drive, as a fraction."""
     plan = Plan({"x": drive}, duration, RATE, substeps=2)
-    angle, _ = trajectory(axis, plan, Start(0.15, 0.0), 0.0, duration)
+    angle = trajectory(axis, plan, Start(0.15, 0.0), 0.0, duration).angle
     tail = angle[-round(len(angle) / 20) :]
     return float(np.abs(tail).max() / 0.15)
 
@@ -55,13 +55,13 @@ def torque_scales(axis: Axis, seed: int, noise: float = 2e-4) -> dict[str, tuple
     rng = np.random.default_rng(seed)
     drive = Sequence([(Sine(31480.0, 30.0, 30.0), 0.002), (Constant(BIAS), 0.02)])
     plan = Plan({"x": drive}, 0.022, RATE, substeps=2)
-    angle, _ = trajectory(axis, plan, settled(axis, Plan({"x": Sine(31480.0, 30.0, 30.0)}, 0.0)), 0.0, 0.022)
+    angle = trajectory(axis, plan, settled(axis, Plan({"x": Sine(31480.0, 30.0, 30.0)}, 0.0)), 0.0, 0.022).angle
     free = angle[round(0.002 * RATE) * 2 :: 2]
     ring, _ = ringdown(free + noise * rng.standard_normal(free.size), RATE, axis, BIAS)
     records = []
     for f in (31400.0, 31500.0):
         plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.01, RATE, substeps=2)
-        moved, _ = trajectory(axis, plan, settled(axis, plan), 0.0, 0.01)
+        moved = trajectory(axis, plan, settled(axis, plan), 0.0, 0.01).angle
         time = np.arange(moved[::2].size) / RATE
         seen = moved[::2] + noise * rng.standard_normal(time.size)
         records.append(Driven(seen, plan.drives["x"](time), f / 2, RATE))

@@ -7,7 +7,7 @@ that this leaves is the paper's own: sqrt(2) times the deviation that its UKF ke
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from phantoms.forward import Plan, Start, trajectory
 from phantoms.waveforms import Sine
 from scanner.device import Axis, Drive, Mechanics
 from scanner.drift import Drift, settling
-from scanner.integrate import rk4
+from scanner.trajectory import integrate, thirds
 
 Array = NDArray[np.float64]
 
@@ -54,8 +54,7 @@ def driven(axis: Axis, frequency: float, amplitude: float, duration: float, drif
     )
     turn = np.angle(answer)
     start = Start(amplitude * np.sin(turn), amplitude * w * np.cos(turn))
-    angle, _ = trajectory(axis, plan, start, 0.0, duration)
-    return angle[:-1:4], plan.drives[axis.name]  # type: ignore[return-value]
+    return trajectory(axis, plan, start, 0.0, duration).angle[:-1:4], plan.drives[axis.name]  # type: ignore[return-value]
 
 
 def later(values: Array, seconds: float) -> Array:
@@ -109,9 +108,8 @@ def a7m20(seed: int, duration: float = 0.3) -> Record:
     volt = drive(half_steps - 7.6e-6)
     volt[::2] += 0.48 * drive.amplitude * rng.standard_normal(angle.size + 1)
     volt[1::2] = 0.5 * (volt[:-1:2] + volt[2::2])
-    k = m.k * 1.004
-    steady = np.full(volt.shape, 1.0)
-    modelled, _ = rk4(angle[0], 0.0, volt, m.b * steady, k * steady, 1 / RATE, 1, m.J, 0.0, 1.0, 0.0, 1.0)
+    told = replace(axis, mechanics=replace(m, k=1.004 * m.k))
+    modelled, _ = integrate(told, (angle[0], 0.0), thirds(volt), 1 / RATE)
     edge = round(0.02 * RATE)
     reference = ldv(angle, 2e-3 * DEG, 5e-3 * DEG, rng)
     return Record(*(v[edge:-1] if v is modelled else v[edge:] for v in (angle, modelled, reference)), 800.0)

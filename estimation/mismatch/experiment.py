@@ -15,6 +15,7 @@ from scanner.errors import BadInput, DeviceInvalid
 from scanner.recording import Recording
 from scanner.response import Inputs
 from scanner.terms import Scales
+from scanner.trajectory import thirds
 
 Array = NDArray[np.float64]
 
@@ -168,8 +169,7 @@ def _output_channels(recording: Recording, device: Device) -> dict[str, tuple[st
 
 def _drive_channels(recording: Recording, axis: Axis) -> list[Channel]:
     names = [f"drive_{axis.name}", f"bias_{axis.name}"]
-    drive = axis.require_drive()
-    if drive.kind == "linear" and names[0] not in recording:
+    if axis.drive is not None and axis.drive.kind == "linear" and names[0] not in recording:
         recording.require(names[0], f"the linear drive of axis {axis.name} cannot be simulated without it")
     return [recording[name] for name in names if name in recording]
 
@@ -212,7 +212,7 @@ def _voltage(channels: list[Channel], rest: float, start: float, step: float, n:
         samples = channel.read()
         lag, stride = (start - channel.start) * channel.sample_rate, step * channel.sample_rate / 2
         half = between(samples, lag + stride * np.arange(2 * n + 1, dtype=float))
-        total += np.stack([half[:-2:2], half[1::2], half[2::2]], axis=1)
+        total += thirds(half)
     return total
 
 
@@ -306,11 +306,12 @@ def thinned(values: Array, factor: int) -> Array:
 def _scales(device: Device, name: str, inputs: Inputs, outputs: tuple[Output, ...], lines: Array, two: bool,
             duration: float) -> Scales:  # fmt: skip
     axis = device.axis(name)
-    mechanics, drive, readout = axis.require_mechanics(), axis.require_drive(), readout_of(device, name)
+    mechanics, readout = axis.require_mechanics(), readout_of(device, name)
     voltage = inputs.voltage[:, 0]
     line = strongest_line(voltage, 1 / inputs.step)
     resonance = 2 * np.pi * mechanics.resonance
-    rate = 2 * np.pi * line if drive.kind == "linear" and line else np.pi * line if line else resonance
+    parametric = axis.drive is not None and axis.drive.kind == "electrostatic"
+    rate = np.pi * line if parametric and line else 2 * np.pi * line if line else resonance
     if not 0.5 < rate / resonance < 2.0:
         rate = resonance
     sensed = next((o for o in outputs if o.kind == "sense" and name in o.axes), outputs[0])

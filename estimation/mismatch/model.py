@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from estimation.mismatch.experiment import Output, Run, readout_of
 from scanner.device import Amdm, Axis, Device, Readout
-from scanner.response import Added, Path, added_terms, move, reference, sense
+from scanner.response import Added, Inputs, Path, added_terms, move, move_all, reference, sense, with_constants
 from scanner.terms import Parameter, Scales, Term
 
 Array = NDArray[np.float64]
@@ -187,42 +187,37 @@ class Model:
         paths = self.paths(run, r, axes, added, x, stop)
         signals = []
         for output in run.outputs:
-            inputs = _cut(run.inputs[output.axes[0]], stop)
+            seen = [paths[name] for name in output.axes]
             if output.kind == "sense":
-                readout = paths[output.axes[0]].axis.readout
+                readout = axes[output.axes[0]].readout
                 assert readout is not None
-                terms = [term for name in output.axes for term in added[name]]
-                signal = sense(readout, terms, [paths[name] for name in output.axes], inputs)
+                signals.append(sense(readout, seen))
             else:
-                name = output.axes[0]
-                signal = reference(added[name], paths[name], inputs)
-            signals.append(signal)
+                signals.append(reference(seen[0]))
         return signals
 
     def paths(self, run: Run, r: int, axes: dict[str, Axis], added: dict[str, tuple[Added, ...]], x: Array,
               stop: float) -> dict[str, Path]:  # fmt: skip
-        """The motion of every axis; coupled axes are relaxed by turns: the weaker the coupling, the fewer."""
-        coupled = len(run.inputs) > 1 and any(
-            each.term.effect == "cross-axis-coupling" for a in added.values() for each in a
-        )
-        paths: dict[str, Path] = {}
-        for turn in range(3 if coupled else 1):
-            previous = dict(paths)
-            for name in run.inputs:
-                inputs = _cut(run.inputs[name], stop)
-                scales = run.scales[name]
-                start = (
-                    scales.amplitude * x[self._where[("start", name, "angle", r)]],
-                    scales.amplitude * scales.rate * x[self._where[("start", name, "rate", r)]],
-                )
-                other = next((p for other, p in previous.items() if other != name), None) if turn else None
-                if other is None:
-                    paths[name] = self._remembered(axes[name], added[name], inputs, start, r)
-                else:
-                    paths[name] = move(axes[name], added[name], inputs, start, _thirds(other, inputs.step))
-        return paths
+        """The motion of every axis."""
 
-    def _remembered(self, axis: Axis, added: tuple[Added, ...], inputs, start: tuple[float, float], r: int) -> Path:  # type: ignore[no-untyped-def]
+        def moved(name: str, inputs: Inputs, start: tuple[float, float], other: Array | None) -> Path:
+            if other is not None:
+                return move(axes[name], added[name], inputs, start, other)
+            return self._remembered(axes[name], added[name], inputs, start, r)
+
+        inputs = {name: _cut(each, stop) for name, each in run.inputs.items()}
+        coupled = any(each.term.coupled for terms in added.values() for each in terms)
+        starts = {name: self.start(name, r, x) for name in run.inputs}
+        return move_all(inputs, starts, coupled, moved)
+
+    def start(self, name: str, r: int, x: Array) -> tuple[float, float]:
+        """Angle [rad] and rate [rad/s] of an axis at the first sample of one run."""
+        scales = self.runs[r].scales[name]
+        angle, rate = (x[self._where[("start", name, each, r)]] for each in ("angle", "rate"))
+        return scales.amplitude * angle, scales.amplitude * scales.rate * rate
+
+    def _remembered(self, axis: Axis, added: tuple[Added, ...], inputs: Inputs,
+                    start: tuple[float, float], r: int) -> Path:  # fmt: skip
         """The last two motions are kept: a changed readout needs no new integration."""
         acting = [each for each in added if _moves(each.term)]
         key = (
@@ -234,10 +229,7 @@ class Model:
                 self._paths.pop(next(iter(self._paths)))
             self._paths[key] = move(axis, acting, inputs, start)
         path = self._paths[key]
-        for each in added:  # constants of the readout do not move the mirror
-            if each.term.constants is not None and each.term.stage in ("readout", "timing", "optics"):
-                axis = each.term.constants(axis, each.values)
-        return replace(path, axis=replace(path.axis, readout=axis.readout))
+        return replace(path, axis=with_constants(axis, added), added=added)
 
     def _offset(self, output: Output, signal: Array, r: int, x: Array) -> Array:
         gain = self.index("gain", output.name, "gain", r)
@@ -299,14 +291,7 @@ def _moves(term: Term) -> bool:
     return term.stage in ("drive", "mechanics", "capacitance")
 
 
-def _cut(inputs, stop: float):  # type: ignore[no-untyped-def]
+def _cut(inputs: Inputs, stop: float) -> Inputs:
     if stop >= 1.0:
         return inputs
     return replace(inputs, voltage=inputs.voltage[: max(8, int(stop * len(inputs.voltage)))])
-
-
-def _thirds(path: Path, step: float) -> Array:
-    """Angle at the start, middle and end of every step, by cubic Hermite interpolation, shape (n, 3)."""
-    a, b = path.angle[:-1], path.angle[1:]
-    middle = 0.5 * (a + b) + step / 8.0 * (path.rate[:-1] - path.rate[1:])
-    return np.stack([a, middle, b], axis=1)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View, shifted
+from scanner.terms.term import Parameter, Term
 
 Array = NDArray[np.float64]
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return shifted(signal, -p[0] / view.step)
+def clock(time: Array, p: Sequence[float]) -> Array:
+    return time - p[0]
 
 
 TERM = Term(
@@ -27,5 +27,5 @@ TERM = Term(
         "drive-lag": "the angle comes late too: record the angle",
     },
     channels=("sense", "angle"),
-    output=output,
+    clock=clock,
 )

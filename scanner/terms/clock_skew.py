@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View, shifted
+from scanner.terms.term import Parameter, Term
 
 Array = NDArray[np.float64]
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return shifted(signal, p[0] * view.time / view.step)
+def clock(time: Array, p: Sequence[float]) -> Array:
+    return (1.0 + p[0]) * time
 
 
 TERM = Term(
@@ -24,5 +24,5 @@ TERM = Term(
     source="IEEE 1588: drift of free-running oscillators, 1 to 200 ppm",
     lookalikes={"resonance-drift": "it moves the amplitude as well: drive the mirror, or record the angle"},
     channels=("sense", "angle"),
-    output=output,
+    clock=clock,
 )

@@ -22,4 +22,5 @@ TERM = Term(
     lookalikes={"second-mode": "its frequency is not the other axis's: record the other axis"},
     applies=lambda axis, scales: scales.two_axes,
     torque=torque,
+    coupled=True,
 )

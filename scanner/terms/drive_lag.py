@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.terms.term import Parameter, Term, View, section
+from scanner.trajectory import thirds
 
 Array = NDArray[np.float64]
 
@@ -15,7 +16,7 @@ Array = NDArray[np.float64]
 def voltage(voltage: Array, p: Sequence[float], view: View) -> Array:
     half = np.append(voltage[:, :2].ravel(), voltage[-1, 2])
     slow = section(half, p[0], 0.5 * view.step)
-    return np.stack([slow[:-2:2], slow[1::2], slow[2::2]], axis=1)
+    return thirds(slow)
 
 
 TERM = Term(

@@ -30,4 +30,5 @@ TERM = Term(
     lookalikes={"channel-delay": "it stays when the motion stops: record two amplitudes, or a detuned drive"},
     applies=lambda axis, scales: scales.voltage_rms > 0,
     output=output,
+    of_axis=True,
 )

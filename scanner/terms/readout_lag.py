@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View, section
-
-Array = NDArray[np.float64]
+from scanner.terms.term import Parameter, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return section(signal, p[0], view.step)
+def corners(p: Sequence[float]) -> tuple[float, ...]:
+    return (p[0],)
 
 
 TERM = Term(
@@ -26,5 +23,5 @@ TERM = Term(
         "channel-delay": "a delay turns all harmonics by one time, shrinks none: drive harder, or at two frequencies",
         "drive-lag": "for a linear axis the two commute: record the angle, or drive harder",
     },
-    output=output,
+    corners=corners,
 )

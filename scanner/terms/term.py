@@ -10,6 +10,8 @@ A term file holds one ``TERM``. Its law is one or more of these functions, in th
 ``modulate``    ``(capacitance, p, view) -> capacitance``: before an AMDM readout's sections
 ``output``      ``(signal, p, view) -> signal``: the channel that the variant names; ``"place"`` is where on the
                 sample the beam stands, told as an angle
+``clock``       ``(time, p) -> time``: which time a sample of that channel shows
+``corners``     ``(p) -> corners``: first-order low-passes that the channel passes last [Hz]
 ==============  ============================================================================================
 """
 
@@ -140,6 +142,8 @@ class Term:
         applies: whether an axis can show the effect at all, from its axis and scales.
         channels: kinds of channel that ``output`` acts on, one variant each: ``"sense"``, ``"angle"``,
             ``"intensity"`` or ``"place"``.
+        of_axis: on an electrode that all combs share, whether each axis may have the effect for itself.
+        coupled: whether ``torque`` looks at the other axis's angle.
     """
 
     effect: str
@@ -154,9 +158,28 @@ class Term:
     bell: Callable[..., Any] | None = None
     modulate: Callable[[Array, Sequence[float], View], Array] | None = None
     output: Callable[[Array, Sequence[float], View], Array] | None = None
+    clock: Callable[[Array, Sequence[float]], Array] | None = None
+    corners: Callable[[Sequence[float]], tuple[float, ...]] | None = None
     hidden: tuple[Callable[[Scales], float], ...] = ()
     applies: Callable[[Axis, Scales], bool] = lambda axis, scales: True
     channels: tuple[str, ...] = ("sense",)
+    of_axis: bool = False
+    coupled: bool = False
+
+    @property
+    def on_channel(self) -> bool:
+        """Whether the effect acts on a recorded channel, behind all that the mirror does."""
+        return not (self.output is None and self.clock is None and self.corners is None)
+
+    def passed(self, signal: Array, p: Sequence[float], view: View) -> Array:
+        """``signal`` (n,) of the channel that the effect acts on, as it leaves the effect."""
+        if self.output is not None:
+            signal = self.output(signal, p, view)
+        if self.clock is not None:
+            signal = shifted(signal, (self.clock(view.time, p) - view.time) / view.step)
+        for corner in self.corners(p) if self.corners is not None else ():
+            signal = section(signal, corner, view.step)
+        return signal
 
     def values(self, x: Sequence[float], scales: Scales) -> tuple[float, ...]:
         """Physical values of all parameters from the free ones' ``x``."""
