@@ -38,19 +38,26 @@ class Screened:
 
 
 def all_candidates(device: Device, model: Model, terms: Iterable[Term]) -> list[Candidate]:
-    """Every term on every axis and channel that could show it."""
+    """Every term on every axis and channel that could show it; one of a shared readout stands with the first axis."""
     found = []
     for axis in model.axes:
         scales = model.scales(axis)
         kinds = {output.kind for run in model.runs for output in run.outputs if axis in output.axes}
+        repeated = device.readout is not None and axis != model.axes[0]
         for term in terms:
             if term.applies(device.axis(axis), scales):
                 found += [
                     Candidate(term, axis, channel)
                     for channel in term.channels
-                    if term.output is None or channel.partition(":")[0] in kinds
+                    if not (term.on_channel and channel.partition(":")[0] not in kinds)
+                    and not (repeated and channel.startswith("sense") and _of_readout(term))
                 ]
     return found
+
+
+def _of_readout(term: Term) -> bool:
+    """Whether a term changes what a readout gives, whichever axis it sees."""
+    return term.stage in ("readout", "timing") and not term.of_axis
 
 
 def starts(candidate: Candidate) -> list[tuple[float, ...]]:
