@@ -14,7 +14,9 @@ from scanner.errors import BadInput
 Array = NDArray[np.float64]
 
 _CYCLES = 4  # of the drive, a block: a sweep of an eighth of the frequency each way is followed
-_CHUNK_BLOCKS = 4096
+_CHUNK = 1 << 17  # samples read at a time: they stay in the cache
+_MOST = 1 << 18  # samples in which a line is looked for
+_FEW_PERIODS = 5.0
 _QUIET = 0.1  # of the largest amplitude: below it the drive counts as off and its phase goes on as it was
 
 
@@ -55,7 +57,7 @@ def absolute(frequency: float, start: float, end: float) -> Reference:
 
 
 def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> Reference:
-    """The reference from a recorded drive voltage.
+    """The reference from a recorded drive voltage; through a gap (NaN) in it the phase runs straight.
 
     Args:
         drive: its channel.
@@ -75,14 +77,16 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> Reference:
             hint="record for longer",
         )
     times, phasors = [], []
-    for first in range(0, drive.size - block + 1, block * _CHUNK_BLOCKS):
-        values = drive.read(first, min(first + block * _CHUNK_BLOCKS, drive.size))
+    chunk = block * max(1, _CHUNK // block)
+    for first in range(0, drive.size - block + 1, chunk):
+        values = drive.read(first, min(first + chunk, drive.size))
         if values.size >= block:
             t, z = block_phasors(values, drive.sample_rate, drive.start + first / drive.sample_rate, f, block)
             times.append(t)
             phasors.append(z)
     time, z = np.concatenate(times), np.concatenate(phasors)
-    on = np.abs(z) > _QUIET * np.abs(z).max()
+    size = np.nan_to_num(np.abs(z))
+    on = size > _QUIET * size.max()
     time, z = (time[on], z[on]) if on.sum() >= 2 else (time, z)
     slow = unwrapped(np.angle(z * np.exp(-2j * np.pi * f * time)))
     share = 0.5 if kind == "half-drive" else 1.0
@@ -92,21 +96,31 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> Reference:
 def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
     """Frequency of the strongest line in (low, high) over the first ``window`` seconds (at most 2^18 samples) [Hz].
 
+    A few periods of ``low`` are looked at first: they are enough where the line is there from the beginning.
+
     Raises:
         BadInput: no line stands out there.
     """
-    n = min(channel.size, 1 << 18, round((window or np.inf) * channel.sample_rate) if window else 1 << 18)
-    values = channel.read(0, n)
-    values = values - values.mean()
+    most = min(channel.size, _MOST, round(window * channel.sample_rate) if window else _MOST)
+    few = round(min(most, _FEW_PERIODS * channel.sample_rate / low)) if low > 0.0 else most
+    for n in (few, most):
+        found = _strongest(channel.read(0, n), channel.sample_rate, low, high)
+        if found is not None:
+            return found
+    raise BadInput("holds no oscillation", file=channel.file, channel=channel.name, hint="check that it was recorded")
+
+
+def _strongest(values: Array, rate: float, low: float, high: float) -> float | None:
+    """Frequency of the strongest line in (low, high) [Hz]; None where none stands out."""
+    n = values.size
+    values = np.nan_to_num(values - np.nanmean(values)) if np.isfinite(values).any() else np.zeros(n)
     spectrum = np.abs(np.fft.rfft(values * np.hanning(n), 4 * n))
-    frequency = np.fft.rfftfreq(4 * n, 1.0 / channel.sample_rate)
-    spectrum[(frequency <= max(low, 2.0 * channel.sample_rate / n)) | (frequency >= high)] = 0.0
+    frequency = np.fft.rfftfreq(4 * n, 1.0 / rate)
+    spectrum[(frequency <= max(low, 2.0 * rate / n)) | (frequency >= high)] = 0.0
     peak = int(spectrum[1:-1].argmax()) + 1
     rest = np.median(spectrum[spectrum > 0.0]) if (spectrum > 0.0).any() else 0.0
     if not spectrum[peak] > 10.0 * rest:
-        raise BadInput(
-            "holds no oscillation", file=channel.file, channel=channel.name, hint="check that it was recorded"
-        )
+        return None
     around = np.log(np.maximum(spectrum[peak - 1 : peak + 2], 1e-300))
     shift = 0.5 * (around[0] - around[2]) / (around[0] - 2 * around[1] + around[2])
     return float(frequency[peak] + shift * frequency[1])

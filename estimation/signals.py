@@ -68,11 +68,15 @@ def senses(recording: Recording, device: Device, gaps_ok: bool = False) -> list[
     return found
 
 
-def drive_voltage(recording: Recording, axis: str) -> Channel | None:
-    """The voltage on one axis's combs: its drive, else its bias during a free decay, else None for none recorded."""
+def drive_voltage(recording: Recording, axis: str, gaps_ok: bool = False) -> Channel | None:
+    """The voltage on one axis's combs: its drive, else its bias during a free decay, else None for none recorded.
+
+    Args:
+        gaps_ok: samples may be missing (NaN).
+    """
     for name in (f"drive_{axis}", f"bias_{axis}"):
         if name in recording:
-            check_signal(recording[name], constant_ok=True)
+            check_signal(recording[name], constant_ok=True, gaps_ok=gaps_ok)
             return recording[name]
     return None
 
@@ -92,7 +96,7 @@ def reference_of(
     own = device.axis(axis)
     if f"drive_{axis}" in recording:
         drive = recording[f"drive_{axis}"]
-        check_signal(drive)
+        check_signal(drive, gaps_ok=True)
         low = 0.1 * own.resonance if own.mechanics else 0.0
         if own.require_drive().kind == "linear":
             return drive_reference(drive, "drive", low)

@@ -138,7 +138,7 @@ def settle_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool]
         elif turn:
             sign = f"known: --flip-{name}"
         if turn:
-            axis = replace(axis, phase=axis.phase + np.pi, angle=axis.angle.turned())
+            axis = axis.turned()
         axes[name] = replace(axis, sign=sign)
     return replace(motion, axes=axes)
 

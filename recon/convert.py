@@ -42,15 +42,16 @@ CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "of
 Plan = Mapping[str, Any]
 
 
-def open_any(path: Path, mapping: Path | Plan | None = None) -> Recording:
+def open_any(path: Path, mapping: Path | Plan | None = None, growing: bool = False) -> Recording:
     """The recording in a file of ours, or, with a mapping, the one that it makes of an instrument's file.
 
-    Nothing is read before it is asked for; close it, or use it in a ``with`` statement.
+    Nothing is read before it is asked for; close it, or use it in a ``with`` statement. A file of ours may be
+    ``growing``, as :meth:`Recording.open` has it.
 
     Raises:
         BadInput: as :meth:`Recording.open` or :func:`convert`.
     """
-    return Recording.open(path) if mapping is None else convert(path, mapping)
+    return Recording.open(path, growing) if mapping is None else convert(path, mapping)
 
 
 def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, Any]:

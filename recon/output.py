@@ -20,6 +20,14 @@ from scanner.motion import Motion
 CHUNK = 1 << 20  # samples written at a time
 
 
+def check_folder(folder: Path) -> None:
+    """Refuse a folder for output that is a file, or that should stand in a folder that does not exist (BadInput)."""
+    if folder.exists() and not folder.is_dir():
+        raise BadInput("is a file where a folder should be", file=folder, hint="name another with -o")
+    if not folder.parent.is_dir():
+        raise BadInput("the folder to write into does not exist", file=folder.parent, hint="create it")
+
+
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
     """A folder to write into, beside ``folder``; its files take their places in ``folder`` when the block ends well.
@@ -29,10 +37,7 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
     Raises:
         BadInput: ``folder`` is a file, or the folder that it should stand in does not exist.
     """
-    if folder.exists() and not folder.is_dir():
-        raise BadInput("is a file where a folder should be", file=folder, hint="name another with -o")
-    if not folder.parent.is_dir():
-        raise BadInput("the folder to write into does not exist", file=folder.parent, hint="create it")
+    check_folder(folder)
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
     try:
         yield beside

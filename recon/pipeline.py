@@ -20,6 +20,7 @@ from recon.mapping import Grid, Picture, accumulate, mean_picture
 from recon.registration import PhaseError, phase_error
 from recon.score import AxisError, Truth, axis_error
 from recon.slow_mapping import accumulate_slow
+from recon.trouble import Ranges, Trouble, samples, told, troubles, unknown, without
 from scanner.channel import Channel, check_signal
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
@@ -66,6 +67,8 @@ class Reconstruction:
         seen: phase error of each time slice as forward and backward sweeps show it.
         errors: estimate against truth by axis; empty without a truth.
         truth: None without one.
+        trouble: what is wrong with the recording. dropped: samples of which no one can say where they belong.
+        affected: pixels that hold samples from a stretch of trouble, shape (height, width).
         notes: what a reader has to know, a line each.
         seconds: taken, without writing.
         recorded: length of the intensity [s].
@@ -79,6 +82,9 @@ class Reconstruction:
     seen: list[PhaseError]
     errors: Mapping[str, AxisError]
     truth: Truth | None
+    trouble: list[Trouble]
+    dropped: int
+    affected: NDArray[np.bool_]
     notes: list[str]
     seconds: float
     recorded: float
@@ -104,7 +110,7 @@ def reconstruct(
     began = time.perf_counter()
     with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=quiet or None) as progress:
         intensity = recording.require("intensity", "a picture needs it")
-        check_signal(intensity)
+        check_signal(intensity, gaps_ok=True)
         device = device_of(recording, Device.load(options.device) if options.device else None)
         for axis in AXES:
             device.axis(axis)
@@ -113,8 +119,12 @@ def reconstruct(
         motion = estimate(recording, device, method, options.flips)
         progress.update()
         progress.set_postfix_str("mapping")
-        grid, notes = _grid(device, motion, options)
-        picture = _mapped(motion, intensity, grid)
+        grid, notes = field_of(device, motion, options)
+        trouble = troubles(recording)
+        lost = samples(unknown(motion, trouble), intensity)
+        picture = mapped(motion, intensity, grid, lost)
+        touched = samples(((each.start, each.stop) for each in trouble), intensity)
+        affected = _visited(motion, without(touched, lost), grid)
         if not picture.coverage.any():
             raise DeviceInvalid(
                 "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"
@@ -129,6 +139,7 @@ def reconstruct(
     for axis in AXES:
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
+    notes += told(trouble)
     return Reconstruction(
         motion=motion,
         picture=picture,
@@ -137,6 +148,9 @@ def reconstruct(
         seen=seen,
         errors=errors,
         truth=truth,
+        trouble=trouble,
+        dropped=sum(stop - first for first, stop in lost),
+        affected=affected,
         notes=notes,
         seconds=time.perf_counter() - began,
         recorded=intensity.size / intensity.sample_rate,
@@ -144,7 +158,8 @@ def reconstruct(
     )
 
 
-def _grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
+def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
+    """The pixels over the device's field of view, else over the motion's own, which a note then says."""
     if device.scan is not None:
         return Grid(*options.pixels, device.scan.half_angle_x, device.scan.half_angle_y), []
     half = {axis: float(np.max(motion.axes[axis].amplitude)) for axis in AXES}
@@ -154,13 +169,22 @@ def _grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[
     return Grid(*options.pixels, half["x"], half["y"]), [note]
 
 
-def _mapped(motion: Motion, intensity: Channel, grid: Grid) -> Picture:
-    """The picture of all samples, a chunk at a time: memory does not grow with the recording."""
+def mapped(motion: Motion, intensity: Channel, grid: Grid, lost: Ranges, begin: int = 0) -> Picture:
+    """The picture, a chunk at a time: memory does not grow with the recording.
+
+    Args:
+        motion: its angles on the intensity's clock.
+        lost: samples (first, stop) that belong to no pixel. begin: first sample that is mapped.
+    """
     x, y = (motion.axes[axis].angle for axis in AXES)
     sums = counts = None
-    for first in range(0, intensity.size, CHUNK):
+    for first in range(begin, intensity.size, CHUNK):
         stop = min(first + CHUNK, intensity.size)
         seen = intensity.read(first, stop)
+        if intensity.raw.dtype.kind == "f":
+            seen[np.isinf(seen)] = np.nan  # which is left out
+        for low, high in lost:
+            seen[max(low - first, 0) : max(high - first, 0)] = np.nan
         if isinstance(x, SlowAngle) and isinstance(y, SlowAngle) and seen.ndim == 1:
             sums, counts = accumulate_slow(x, y, first, seen, grid, sums, counts)
         else:
@@ -170,14 +194,25 @@ def _mapped(motion: Motion, intensity: Channel, grid: Grid) -> Picture:
     return mean_picture(sums, counts, grid)
 
 
-def _slow_period(motion: Motion) -> float:
+def _visited(motion: Motion, ranges: Ranges, grid: Grid) -> NDArray[np.bool_]:
+    """Pixels that the beam passed over during ranges of samples, shape (height, width)."""
+    x, y = (motion.axes[axis].angle for axis in AXES)
+    counts = np.zeros((grid.height, grid.width), np.uint32)
+    for low, high in ranges:
+        for first in range(low, high, CHUNK):
+            part = first, min(first + CHUNK, high)
+            accumulate(x.read(*part), y.read(*part), np.zeros(part[1] - part[0]), grid, counts=counts)
+    return counts > 0
+
+
+def slow_period(motion: Motion) -> float:
     """Of the slower axis [s]."""
     return 1.0 / min(float(np.median(axis.frequency)) for axis in motion.axes.values())
 
 
 def _windows(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
     """Samples (first, stop) in which sweeps are registered: all of a short recording, three parts of a long one."""
-    whole = round(REGISTERED * _slow_period(motion) * intensity.sample_rate)
+    whole = round(REGISTERED * slow_period(motion) * intensity.sample_rate)
     if intensity.size <= whole:
         return [(0, intensity.size)]
     part = whole // 3
@@ -188,7 +223,7 @@ def _register(motion: Motion, intensity: Channel, grid: Grid, first: int, stop: 
     x, y = (motion.axes[axis].angle for axis in AXES)
     time = x.start + np.arange(first, stop) / x.sample_rate
     swing_x, swing_y = (np.interp(time, motion.axes[axis].time, motion.axes[axis].amplitude) for axis in AXES)
-    slices = max(1, round((stop - first) / x.sample_rate / _slow_period(motion) / SLICE))
+    slices = max(1, round((stop - first) / x.sample_rate / slow_period(motion) / SLICE))
     places, seen = (x.read(first, stop), y.read(first, stop)), intensity.read(first, stop)
     errors = phase_error(*places, seen, x.sample_rate, grid, swing_x, swing_y, slices)
     return [replace(error, time=error.time + first / x.sample_rate) for error in errors]

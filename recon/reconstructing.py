@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +18,35 @@ from recon.summary import summarise
 from recon.views import save_picture
 
 
-def reconstruct_file(path: Path, output: Path, options: Options, mapping: Path | None = None) -> dict[str, Any]:
+def reconstruct_file(
+    path: Path,
+    output: Path,
+    options: Options,
+    mapping: Path | None = None,
+    quiet: bool = False,
+    live: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """``reconstruct`` a file and write everything into the folder ``output``; returns the summary.
 
     Args:
         mapping: what makes an instrument's file a recording, see :func:`recon.convert.open_any`.
+        quiet: no progress.
+        live: what following the file amounted to, for the summary. Its writer may have it open still; a truth is not
+            looked for.
     """
-    with open_any(path, mapping) as recording, replacing_folder(output) as folder:
-        result = reconstruct(recording, options, truth_of(path) if mapping is None else None)
-        summary = finite(summarise(result) | {"output": str(output), "recording": str(path)})
+    growing = live is not None
+    with open_any(path, mapping, growing) as recording, replacing_folder(output) as folder:
+        result = reconstruct(recording, options, None if mapping or growing else truth_of(path), quiet)
+        said = {"output": str(output), "recording": str(path)} | ({"live": live} if live else {})
+        summary = finite(summarise(result) | said)
         write_tiff(folder / "image.tif", result.picture.image)
         write_tiff(folder / "coverage.tif", result.picture.coverage)
         if options.fill_radius:
             image, mask = fill_holes(result.picture, options.fill_radius)
             write_tiff(folder / "filled.tif", image)
             write_tiff(folder / "fill.tif", mask.astype(np.uint8))
+        if result.trouble:
+            write_tiff(folder / "affected.tif", result.affected.astype(np.uint8))
         write_motion(folder / "motion.h5", result.motion)
         write_json(folder / "summary.json", summary)
         save_picture(folder / "image.png", result.picture)

@@ -98,19 +98,23 @@ class Channel:
         Raises:
             BadInput: the file does not give the samples back (truncated, damaged, a filter that is not installed).
         """
-        low, high, _ = slice(first, stop).indices(self.size)
-        try:
-            values = self.raw[self.first + low : self.first + max(low, high)].astype(np.float64)
-        except BadInput:
-            raise
-        except DAMAGE as error:
-            hint = "the file is damaged or truncated; copy it again"
-            raise BadInput(f"samples cannot be read: {error}", file=self.file, channel=self.name, hint=hint) from None
+        values = self.stored(first, stop).astype(np.float64)
         if self.gain != 1.0:
             values *= self.gain
         if self.offset != 0.0:
             values += self.offset
         return values
+
+    def stored(self, first: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """The same samples in the type and scale they are stored in; not to be written to. Raises as :meth:`read`."""
+        low, high, _ = slice(first, stop).indices(self.size)
+        try:
+            return self.raw[self.first + low : self.first + max(low, high)]
+        except BadInput:
+            raise
+        except DAMAGE as error:
+            hint = "the file is damaged or truncated; copy it again"
+            raise BadInput(f"samples cannot be read: {error}", file=self.file, channel=self.name, hint=hint) from None
 
     def time(self, first: int = 0, stop: int | None = None) -> Array:
         """Times of the samples that :meth:`read` gives, shape (n,) [s]."""
@@ -171,22 +175,26 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
         gaps_ok: samples that are not finite are missing, and that is fine.
 
     Raises:
-        BadInput: a sample that is not finite (with the time of the first one) or no measurement, or a signal that never
-            changes.
+        BadInput: a sample that is not finite (with the time of the first one) or no measurement, no sample at all that
+            is, or a signal that never changes.
     """
     low, high = np.inf, -np.inf
     for first in range(0, signal.size, CHUNK):
-        values = signal.read(first, first + CHUNK)
-        finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if gaps_ok:
+        values = signal.stored(first, first + CHUNK)
+        if values.dtype.kind == "f" and not (finite := np.isfinite(values).reshape(len(values), -1).all(axis=1)).all():
+            if not gaps_ok:
+                index = first + int(np.argmin(finite))
+                what = f"sample {index} at {signal.start + index / signal.sample_rate:.9g} s is not finite"
+                hint = "cut the recording there or repair the sample"
+                raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
             values = values[finite]
-        elif not finite.all():
-            index = first + int(np.argmin(finite))
-            what = f"sample {index} at {signal.start + index / signal.sample_rate:.9g} s is not finite"
-            hint = "cut the recording there or repair the sample"
-            raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
-        low, high = min(low, values.min(initial=np.inf)), max(high, values.max(initial=-np.inf))
-    if np.isfinite(low) and max(-low, high) > LARGEST:
+        if values.size:
+            low, high = min(low, float(values.min())), max(high, float(values.max()))
+    if low > high:
+        hint = "check that it was recorded"
+        raise BadInput("holds no sample that can be used", file=signal.file, channel=signal.name, hint=hint)
+    low, high = sorted((signal.gain * low + signal.offset, signal.gain * high + signal.offset))
+    if max(-low, high) > LARGEST:
         what = f"reaches {max(-low, high):.3g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:

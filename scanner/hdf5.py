@@ -33,8 +33,11 @@ def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
         raise BadInput(f"cannot be read: {error}", file=path, channel=channel, hint="copy the file again") from None
 
 
-def open_hdf5(path: Path) -> h5py.File:
+def open_hdf5(path: Path, growing: bool = False) -> h5py.File:
     """The file, for reading.
+
+    Args:
+        growing: another program may be writing it at the same time (HDF5's single writer, multiple readers).
 
     Raises:
         BadInput: it is not there, empty, no HDF5, or cut short.
@@ -45,7 +48,7 @@ def open_hdf5(path: Path) -> h5py.File:
     if path.stat().st_size == 0:
         raise BadInput("the file is empty", file=path, hint="copy it again")
     try:
-        return h5py.File(path, "r")
+        return h5py.File(path, "r", swmr=growing)
     except PermissionError:
         raise BadInput("may not be read", file=path, hint="check its permissions") from None
     except OSError as error:

@@ -65,6 +65,10 @@ class AxisMotion:
     reference: str = "half-drive"
     sign: str = "ambiguous"
 
+    def turned(self) -> AxisMotion:
+        """The same motion with the other sign."""
+        return replace(self, phase=self.phase + np.pi, angle=self.angle.turned())
+
 
 @dataclass(frozen=True)
 class Motion:

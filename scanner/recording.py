@@ -56,15 +56,19 @@ class Recording:
     _file: Closeable | None = None
 
     @classmethod
-    def open(cls, path: str | Path) -> Recording:
+    def open(cls, path: str | Path, growing: bool = False) -> Recording:
         """The recording in an HDF5 file; close it, or use it in a ``with`` statement.
+
+        Args:
+            path: of the file.
+            growing: another program may be writing it; what it has written by now is the recording.
 
         Raises:
             BadInput: no such file, no HDF5, truncated, another format or version, no channels, or a channel that
                 :func:`scanner.channel.checked_channel` refuses. Links and storage outside the file are refused too.
         """
         path = Path(path)
-        file = open_hdf5(path)
+        file = open_hdf5(path, growing)
         try:
             with undamaged(path):
                 attrs = attributes(file)

@@ -195,7 +195,7 @@ BAD = {
     "no intensity": (delete("intensity"), ["intensity", "is not in the recording", "sense"]),
     "no sense": (delete("sense"), ["sense_x", "is not in the recording"]),
     "unknown unit": (attribute("sense", "unit", "bananas"), ["sense", "bananas", "accepted units: V"]),
-    "NaN": (put("intensity", slice(40, 41), np.nan), ["intensity", "sample 40", "not finite"]),
+    "NaN": (put("intensity", slice(None), np.nan), ["intensity", "no sample that can be used"]),
     "constant": (put("sense", slice(None), 1.5), ["sense", "stays at 1.5 V"]),
     "negative rate": (attribute("drive_x", "sample_rate", -5e6), ["drive_x", "sample_rate"]),
     "another version": (lambda file: file.attrs.__setitem__("version", 7), ["version 7"]),

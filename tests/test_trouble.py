@@ -1,0 +1,128 @@
+"""Recordings with trouble that can be lived with: reconstructed, the trouble named, the pixels marked."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from worlds import imaging, separate_electrodes
+
+from recon.cli import main
+from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.score import told_truth
+from recon.trouble import Trouble, samples, troubles, without
+from scanner.recording import Recording
+
+RATE = 5e6
+
+
+def damaged(**changes: object) -> Recording:
+    """The 20 ms scan, each channel named in ``changes`` replaced: by an array, or (array, start)."""
+    recording, _ = imaging()
+    channels = {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
+    for name, change in changes.items():
+        values, start = change if isinstance(change, tuple) else (change, 0.0)
+        channels[name] = (values, channels.get(name, (0, "V"))[1], RATE, start)
+    return Recording.from_arrays(channels, recording.device)
+
+
+def values(name: str) -> np.ndarray:
+    return imaging()[0][name].read()
+
+
+def with_gap(name: str, first: int, stop: int, value: float = np.nan) -> np.ndarray:
+    signal = values(name)
+    signal[first:stop] = value
+    return signal
+
+
+def of(recording: Recording) -> Reconstruction:
+    return reconstruct(recording, Options(pixels=(100, 100)), told_truth(imaging()[1]), quiet=True)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Reconstruction:
+    return of(imaging()[0])
+
+
+def test_a_whole_recording_has_no_trouble(whole: Reconstruction) -> None:
+    assert whole.trouble == []
+    assert whole.dropped == 0
+    assert not whole.affected.any()
+
+
+def test_intensities_that_are_missing_poison_no_pixel(whole: Reconstruction) -> None:
+    signal = with_gap("intensity", 20_000, 25_000)
+    signal[60_000] = np.inf
+    result = of(damaged(intensity=signal))
+    assert result.trouble == [
+        Trouble("intensity", "gap", 20_000 / RATE, 25_000 / RATE),
+        Trouble("intensity", "gap", 60_000 / RATE, 60_001 / RATE),
+    ]
+    lost = whole.picture.coverage.astype(int) - result.picture.coverage
+    assert 0 < lost.sum() <= 5001  # the beam leaves the field at the turns
+    assert np.array_equal(result.affected, lost > 0)
+    both = (result.picture.coverage > 0) & ~result.affected
+    np.testing.assert_array_equal(result.picture.image[both], whole.picture.image[both])
+
+
+def test_a_gap_in_the_sense_signal_is_bridged_and_its_pixels_marked(whole: Reconstruction) -> None:
+    result = of(damaged(sense=with_gap("sense", 40_000, 50_000)))  # 2 ms of 20
+    assert result.trouble == [Trouble("sense", "gap", 0.008, 0.01)]
+    assert result.dropped == 0
+    assert 0.3 < result.affected.mean() < 0.9
+    assert any("sense: gap for 2 ms" in note for note in result.notes)
+    for axis in "xy":
+        assert np.degrees(result.errors[axis].phase_rmse) < np.degrees(whole.errors[axis].phase_rmse) + 0.1
+
+
+def test_gaps_in_a_drive_leave_the_phase_where_it_was(whole: Reconstruction) -> None:
+    result = of(damaged(drive_x=with_gap("drive_x", 30_000, 33_000)))
+    assert [each.channel for each in result.trouble] == ["drive_x"]
+    assert np.degrees(result.errors["x"].phase_rmse) < np.degrees(whole.errors["x"].phase_rmse) + 0.05
+
+
+def test_a_clipped_sense_signal_is_named() -> None:
+    signal = values("sense")
+    top = np.quantile(signal, 0.97)
+    late = signal.copy()
+    late[50_000:70_000] = np.minimum(signal[50_000:70_000], top)
+    late[:50_000] = np.where(signal[:50_000] > top, top - 0.01, signal[:50_000])
+    late[70_000:] = np.where(signal[70_000:] > top, top - 0.01, signal[70_000:])
+    (found,) = troubles(damaged(sense=late))
+    assert (found.channel, found.kind) == ("sense", "clipped")
+    assert 0.0099 < found.start < found.stop < 0.0141
+
+
+def test_samples_of_which_no_one_can_say_where_the_mirror_was_are_dropped_and_counted() -> None:
+    recording, truth = separate_electrodes()
+    channels = {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
+    channels["intensity"] = (np.ones(60_000), "V", RATE, 0.0)
+    short = channels["sense_x"][0][:40_000]  # 8 ms of 12
+    channels["sense_x"] = (short, "V", RATE, 0.0)
+    channels["intensity"][0][::2] = 2.0
+    result = reconstruct(Recording.from_arrays(channels, recording.device), Options(), told_truth(truth), quiet=True)
+    assert result.trouble == [Trouble("sense_x", "missing", 0.008, 0.012)]
+    assert 0.6 * 20_000 < result.dropped < 20_000
+    assert result.picture.coverage.sum() <= 60_000 - result.dropped
+
+
+def test_the_folder_and_the_summary_say_so(tmp_path: Path) -> None:
+    damaged(intensity=with_gap("intensity", 20_000, 25_000)).write(tmp_path / "a.h5")
+    assert main(["reconstruct", str(tmp_path / "a.h5"), "-o", str(tmp_path / "out"), "--pixels", "100x100"]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["trouble"] == [{"channel": "intensity", "kind": "gap", "start": 0.004, "stop": 0.005}]
+    affected = tifffile.imread(tmp_path / "out" / "affected.tif")
+    assert affected.dtype == np.uint8
+    assert set(np.unique(affected)) == {0, 1}
+    assert summary["affected"] == pytest.approx(affected.mean())
+    with h5py.File(tmp_path / "out" / "motion.h5") as motion:
+        assert np.isfinite(motion["x/angle"][:]).all()
+
+
+def test_ranges() -> None:
+    intensity = imaging()[0]["intensity"]
+    assert samples([(0.01, 0.02), (-1.0, 1e-6), (0.0, 2e-6), (0.03, 0.04)], intensity) == [(0, 10), (50_000, 100_000)]
+    assert without([(0, 10), (20, 30)], [(5, 22), (28, 29)]) == [(0, 5), (22, 28), (29, 30)]
