@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 from typing import NoReturn
 
 COMMANDS = {
@@ -20,6 +21,7 @@ COMMANDS = {
     "blur-study": "phantoms, scans, drifts, noise, estimators, resolutions and p against each other, as one table",
     "info": "list what a recording or an instrument's file holds, with a mapping to start from",
     "convert": "turn an instrument's file into a recording",
+    "completion": "print a script by which bash, zsh or fish completes all this",
 }
 
 
@@ -46,13 +48,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             name, help=text, description=text[0].upper() + text[1:] + "." if asked_for else None
         )
         if asked_for:
-            module = importlib.import_module(f"recon.commands.{name.replace('-', '_')}")
-            module.add_arguments(command)
-            command.add_argument(
-                "--json", action="store_true", help="print the summary as JSON, and nothing else, on stdout"
-            )
+            module = add_command(name, command)
     args = parser.parse_args(given)
     return _run(module, args, f"{parser.prog} {args.command}")
+
+
+def add_command(name: str, parser: argparse.ArgumentParser) -> ModuleType:
+    """Add a command's arguments to its parser; returns its module."""
+    module = importlib.import_module(f"recon.commands.{name.replace('-', '_')}")
+    module.add_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else, on stdout")
+    return module
 
 
 def reconstruct_main() -> int:
@@ -60,12 +66,12 @@ def reconstruct_main() -> int:
     return main(["reconstruct", *sys.argv[1:]])
 
 
-def _run(module: object, args: argparse.Namespace, prog: str) -> int:
+def _run(module: ModuleType, args: argparse.Namespace, prog: str) -> int:
     from scanner.errors import BadInput
 
     try:
-        summary = module.run(args)  # type: ignore[attr-defined]
-        print(json.dumps(summary, indent=1) if args.json else _printable(module.tell(summary)))  # type: ignore[attr-defined]
+        summary = module.run(args)
+        print(json.dumps(summary, indent=1) if args.json else _printable(module.tell(summary)))
     except BadInput as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
