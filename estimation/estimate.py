@@ -46,20 +46,32 @@ ESTIMATORS: dict[str, tuple[str, Callable[[Recording, Device], Motion]]] = {
     "sine-ukf": ("UKF on the phase of a steady sine, position readouts (wang2019)", _by("sine_ukf", "sine_ukf_motion")),
     "tracker": ("block demodulation and a smoother on the slow flow of phase and amplitude", _tracker(False)),
     "tracker-causal": ("the same, each moment from what came before it", _tracker(True)),
+    "picture": (
+        "the slow flow under the drive; a reconstruction measures its phases in the picture (no sense signal needed)",
+        _by("tracker.driven", "drive_only"),
+    ),
     "sensor": ("angle channels or position readouts as they are", _by("steady", "sensor")),
 }
 
+MEASURED = ("sensor", "sine-ukf")
+"""Estimators whose angle is a sensor's, with whatever harmonics the motion has."""
+
 
 def default_estimator(recording: Recording, device: Device) -> str:
-    """``"sensor"`` where no capacitive readout was recorded, ``"tracker"`` where one was."""
-    if "sense" in recording:
-        return "tracker"
+    """By what was recorded: ``"tracker"`` for a capacitive readout, ``"picture"`` for drives and intensity alone.
+
+    ``"sensor"`` otherwise.
+    """
+    names = [f"{kind}_{axis}" for axis in device.axes for kind in ("sense", "angle")]
     capacitive = [
         name
         for name, axis in device.axes.items()
         if f"sense_{name}" in recording and axis.readout is not None and not isinstance(axis.readout, Position)
     ]
-    return "tracker" if capacitive else "sensor"
+    if "sense" in recording or capacitive:
+        return "tracker"
+    driven = "intensity" in recording and all(f"drive_{axis}" in recording for axis in device.axes)
+    return "picture" if driven and not any(name in recording for name in names) else "sensor"
 
 
 def estimate(
@@ -79,9 +91,15 @@ def estimate(
         BadInput: no such estimator, or the recording or the device does not serve it.
     """
     from estimation.steady import settle_signs
+    from estimation.terms import estimate_with_terms
 
     device = device_of(recording, device)
     method = method or default_estimator(recording, device)
     if method not in ESTIMATORS:
         raise BadInput(f"no estimator is named {method!r}", hint=f"there are {', '.join(ESTIMATORS)}")
-    return settle_signs(ESTIMATORS[method][1](recording, device), recording, flips or {})
+    run = ESTIMATORS[method][1]
+    if any(axis.terms for axis in device.axes.values()):
+        motion = estimate_with_terms(recording, device, run, modelled=method not in MEASURED)
+    else:
+        motion = run(recording, device)
+    return settle_signs(motion, recording, flips or {})

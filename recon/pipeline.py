@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,8 @@ from estimation.signals import device_of
 from estimation.tracker.angle import SlowAngle
 from recon import blur
 from recon.mapping import Grid, Picture, accumulate, mean_picture
-from recon.registration import PhaseError, phase_error
+from recon.picture_phase import refined
+from recon.registration import PhaseError, registered, slow_period
 from recon.score import AxisError, Truth, axis_error
 from recon.slow_mapping import accumulate_slow
 from recon.trouble import Ranges, Trouble, samples, told, troubles, unknown, without
@@ -30,7 +31,6 @@ from scanner.recording import Recording
 Array = NDArray[np.float64]
 
 AXES = ("x", "y")
-SLICE = 25  # periods of the slower axis registered as one: some 15 are needed, and in a long one a drift goes on
 REGISTERED = 800  # periods of the slower axis that are registered at the most
 CHUNK = 1 << 20  # samples mapped at a time
 
@@ -46,6 +46,7 @@ class Options:
         flips: axes whose sign is turned.
         fill_radius: holes up to this many pixels are filled, and marked as fill; 0 fills none.
         spot: standard deviation of the beam's spot [px], for the blur's account; the recording does not tell it.
+        frames: pictures of successive parts of the scan, as many; None for none. frame_time: or one for so long [s].
     """
 
     device: Path | None = None
@@ -55,6 +56,8 @@ class Options:
     flips: Mapping[str, bool] = field(default_factory=dict)
     fill_radius: int = 0
     spot: float | None = None
+    frames: int | None = None
+    frame_time: float | None = None
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,9 @@ def reconstruct(
         method = options.estimator or default_estimator(recording, device)
         progress.set_postfix_str(f"{method} (compiled once, at the first run)")
         motion = estimate(recording, device, method, options.flips)
+        motion, told_by_picture = refined(
+            recording, device, motion, intensity, field_of(device, motion, options)[0], options.flips
+        )
         progress.update()
         progress.set_postfix_str("mapping")
         grid, notes = field_of(device, motion, options)
@@ -132,10 +138,11 @@ def reconstruct(
         progress.update()
         progress.set_postfix_str("registration")
         windows = _windows(motion, intensity)
-        seen = [error for window in windows for error in _register(motion, intensity, grid, *window)]
+        seen = registered(motion, intensity, grid, windows)
         progress.update()
         errors = {axis: axis_error(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles} if truth else {}
         progress.update()
+    notes += told_by_picture
     for axis in AXES:
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
@@ -161,7 +168,8 @@ def reconstruct(
 def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
     """The pixels over the device's field of view, else over the motion's own, which a note then says."""
     if device.scan is not None:
-        return Grid(*options.pixels, device.scan.half_angle_x, device.scan.half_angle_y), []
+        scan = device.scan
+        return Grid(*options.pixels, scan.half_angle_x, scan.half_angle_y, scan.metres_per_radian), []
     half = {axis: float(np.max(motion.axes[axis].amplitude)) for axis in AXES}
     note = (
         f"the device states no [scan]: the field is the motion's own, {half['x']:.4g} x {half['y']:.4g} rad half angles"
@@ -169,17 +177,20 @@ def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, li
     return Grid(*options.pixels, half["x"], half["y"]), [note]
 
 
-def mapped(motion: Motion, intensity: Channel, grid: Grid, lost: Ranges, begin: int = 0) -> Picture:
+def mapped(
+    motion: Motion, intensity: Channel, grid: Grid, lost: Ranges, begin: int = 0, end: int | None = None
+) -> Picture:
     """The picture, a chunk at a time: memory does not grow with the recording.
 
     Args:
         motion: its angles on the intensity's clock.
-        lost: samples (first, stop) that belong to no pixel. begin: first sample that is mapped.
+        lost: samples (first, stop) that belong to no pixel. begin, end: samples that are mapped.
     """
     x, y = (motion.axes[axis].angle for axis in AXES)
     sums = counts = None
-    for first in range(begin, intensity.size, CHUNK):
-        stop = min(first + CHUNK, intensity.size)
+    end = intensity.size if end is None else end
+    for first in range(begin, end, CHUNK):
+        stop = min(first + CHUNK, end)
         seen = intensity.read(first, stop)
         if intensity.raw.dtype.kind == "f":
             seen[np.isinf(seen)] = np.nan  # which is left out
@@ -205,11 +216,6 @@ def _visited(motion: Motion, ranges: Ranges, grid: Grid) -> NDArray[np.bool_]:
     return counts > 0
 
 
-def slow_period(motion: Motion) -> float:
-    """Of the slower axis [s]."""
-    return 1.0 / min(float(np.median(axis.frequency)) for axis in motion.axes.values())
-
-
 def _windows(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
     """Samples (first, stop) in which sweeps are registered: all of a short recording, three parts of a long one."""
     whole = round(REGISTERED * slow_period(motion) * intensity.sample_rate)
@@ -217,13 +223,3 @@ def _windows(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
         return [(0, intensity.size)]
     part = whole // 3
     return [(first, first + part) for first in (0, (intensity.size - part) // 2, intensity.size - part)]
-
-
-def _register(motion: Motion, intensity: Channel, grid: Grid, first: int, stop: int) -> list[PhaseError]:
-    x, y = (motion.axes[axis].angle for axis in AXES)
-    time = x.start + np.arange(first, stop) / x.sample_rate
-    swing_x, swing_y = (np.interp(time, motion.axes[axis].time, motion.axes[axis].amplitude) for axis in AXES)
-    slices = max(1, round((stop - first) / x.sample_rate / slow_period(motion) / SLICE))
-    places, seen = (x.read(first, stop), y.read(first, stop)), intensity.read(first, stop)
-    errors = phase_error(*places, seen, x.sample_rate, grid, swing_x, swing_y, slices)
-    return [replace(error, time=error.time + first / x.sample_rate) for error in errors]

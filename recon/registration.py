@@ -18,7 +18,8 @@ which is solved for d by Gauss-Newton, the samples being remapped with each new 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numba
@@ -26,10 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.mapping import Grid
+from scanner.channel import Channel
 from scanner.errors import BadInput
+from scanner.motion import Motion
 
 Array = NDArray[np.float64]
 
+AXES = ("x", "y")
+SLICE = 25  # periods of the slower axis registered as one: some 15 are needed, and in a long one a drift goes on
 REACH = math.radians(15.0)  # errors looked for, either way; the directions' pictures still share 2/3 of the field there
 SEARCH_CELLS = 128  # of phase, across half a turn
 RESOLUTION = math.pi / SEARCH_CELLS / 4  # of the search; what is known no better than that is not known
@@ -140,6 +145,30 @@ def phase_error(
         PhaseError(float(t), *(Estimate(float(v), float(s)) for v, s in zip(values, sds, strict=True)))
         for t, values, sds in zip(times, value, sd, strict=True)
     ]
+
+
+def registered(motion: Motion, intensity: Channel, grid: Grid, parts: Iterable[tuple[int, int]]) -> list[PhaseError]:
+    """Phase errors of a motion in slices of SLICE periods of its slower axis.
+
+    Args:
+        motion: its angles on the intensity's clock.
+        parts: samples (first, stop) that share one picture.
+    """
+    x, y = (motion.axes[axis].angle for axis in AXES)
+    found = []
+    for first, stop in parts:
+        time = x.start + np.arange(first, stop) / x.sample_rate
+        swing_x, swing_y = (np.interp(time, motion.axes[axis].time, motion.axes[axis].amplitude) for axis in AXES)
+        slices = max(1, round((stop - first) / x.sample_rate / slow_period(motion) / SLICE))
+        places, seen = (x.read(first, stop), y.read(first, stop)), intensity.read(first, stop)
+        errors = phase_error(*places, seen, x.sample_rate, grid, swing_x, swing_y, slices)
+        found += [replace(error, time=error.time + first / x.sample_rate) for error in errors]
+    return found
+
+
+def slow_period(motion: Motion) -> float:
+    """Of the slower axis [s]."""
+    return 1.0 / min(float(np.median(axis.frequency)) for axis in motion.axes.values())
 
 
 def quadrature(theta: Array, amplitude: float | Array) -> Array:

@@ -170,8 +170,12 @@ def refused(arguments: list[str], out: Path, capsys: pytest.CaptureFixture) -> s
     return told.err
 
 
-def delete(name: str):
-    return lambda file: file.__delitem__(f"channels/{name}")
+def delete(*names: str):
+    def change(file: h5py.File) -> None:
+        for name in names:
+            del file[f"channels/{name}"]
+
+    return change
 
 
 def attribute(name: str, key: str, value):
@@ -193,7 +197,7 @@ def device_text(old: str, new: str):
 
 BAD = {
     "no intensity": (delete("intensity"), ["intensity", "is not in the recording", "sense"]),
-    "no sense": (delete("sense"), ["sense_x", "is not in the recording"]),
+    "no sense and no drive": (delete("sense", "drive_x"), ["sense_x", "is not in the recording"]),
     "unknown unit": (attribute("sense", "unit", "bananas"), ["sense", "bananas", "accepted units: V"]),
     "NaN": (put("intensity", slice(None), np.nan), ["intensity", "no sample that can be used"]),
     "constant": (put("sense", slice(None), 1.5), ["sense", "stays at 1.5 V"]),
@@ -249,7 +253,7 @@ def test_a_failed_run_leaves_older_results_alone(scan: Path, tmp_path: Path) -> 
     out = tmp_path / "out"
     main(["reconstruct", str(scan), "-o", str(out), "--estimator", "constant"])
     before = {p.name: p.read_bytes() for p in out.iterdir()}
-    assert main(["reconstruct", str(changed(scan, tmp_path, delete("sense"))), "-o", str(out)]) == 2
+    assert main(["reconstruct", str(changed(scan, tmp_path, delete("intensity"))), "-o", str(out)]) == 2
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
 
 

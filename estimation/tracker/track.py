@@ -93,10 +93,10 @@ def track(
     for sense in senses(recording, device, gaps_ok=True):
         even = is_capacitive(sense.readout)
         references = {name: reference_of(recording, device, name, sense.channel, even) for name in sense.axes}
-        prepared = with_phases(prepare(recording, device, sense, references), seen or {})
+        prepared = prepare(recording, device, sense, references)
         start, signs = signed(prepared, starting_belief(prepared, device))
-        walk = tuned_walk(prepared, start)
-        found = follow(prepared, start, walk, causal)
+        walk = tuned_walk(prepared, start)  # by the signal alone: it would bend the motion to each of a few phases seen
+        found = follow(with_phases(prepared, seen or {}), start, walk, causal)
         for i, name in enumerate(sense.axes):
             if not found.live[i]:
                 raise BadInput(
