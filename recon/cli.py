@@ -72,6 +72,7 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str) -> int:
     try:
         summary = module.run(args)
         print(json.dumps(summary, indent=1) if args.json else _printable(module.tell(summary)))
+        return int(summary.get("exit", 0))  # of many, some may have failed
     except BadInput as error:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
@@ -84,7 +85,6 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str) -> int:
     except KeyboardInterrupt:
         print(f"{prog}: interrupted; nothing was written", file=sys.stderr)
         return 1
-    return 0
 
 
 def _printable(text: str) -> str:

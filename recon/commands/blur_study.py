@@ -6,12 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-
-def _processes(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise ValueError
-    return value
+from recon.commands.reconstruct import at_least_one
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,16 +16,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
-    where.add_argument("--workers", type=_processes, metavar="N", help="processes on this machine (one a core)")
+    where.add_argument("--workers", type=at_least_one, metavar="N", help="processes on this machine (one a core)")
     parser.add_argument("--parquet", action="store_true", help="write the table as Parquet too")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.study.run import run_study
 
-    return run_study(
-        args.study, args.output, scheduler=args.scheduler, workers=args.workers, parquet=args.parquet
-    )
+    return run_study(args.study, args.output, scheduler=args.scheduler, workers=args.workers, parquet=args.parquet)
 
 
 def tell(summary: dict[str, Any]) -> str:

@@ -1,12 +1,15 @@
-"""``lissajous reconstruct REC`` = ``reconstruct-from-recording REC``: motion, picture, score, report."""
+"""``lissajous reconstruct REC...`` = ``reconstruct-from-recording REC...``: motion, picture, score, report."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recon.commands.simulate import positive
+
+if TYPE_CHECKING:
+    from recon.pipeline import Options
 
 
 def size(text: str) -> tuple[int, int]:
@@ -22,10 +25,36 @@ def size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def at_least_one(text: str) -> int:
+    """A whole number above zero, for argparse."""
+    value = int(text)
+    if value < 1:
+        raise ValueError
+    return value
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="the recording (.h5), or an instrument's file with --mapping")
+    parser.add_argument(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="REC",
+        help="the recording (.h5), or an instrument's file with --mapping; several at once go to a folder each",
+    )
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for pictures, motion, report"
+    )
+    several = parser.add_mutually_exclusive_group()
+    several.add_argument("--scheduler", metavar="ADDRESS", help="several: on the Dask cluster of this scheduler")
+    several.add_argument("--workers", type=at_least_one, metavar="N", help="several: processes here (one a core)")
+    several.add_argument(
+        "--follow", action="store_true", help="show the frames of a recording that is still being written, then all"
+    )
+    parser.add_argument(
+        "--frame-time", type=positive, metavar="S", help="follow: length of a frame (the scan's repeat)"
+    )
+    parser.add_argument(
+        "--quiet-time", type=positive, default=5.0, metavar="S", help="follow: end when nothing came for so long (5)"
     )
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
@@ -53,23 +82,39 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.pipeline import Options
     from recon.reconstructing import reconstruct_file
 
-    return reconstruct_file(
-        args.recording,
-        args.output,
-        Options(
-            device=args.device,
-            estimator=args.estimator,
-            pixels=args.pixels,
-            p=args.p,
-            flips={"x": args.flip_x, "y": args.flip_y},
-            fill_radius=args.fill,
-            spot=args.spot,
-        ),
-        args.mapping,
+    options = Options(
+        device=args.device,
+        estimator=args.estimator,
+        pixels=args.pixels,
+        p=args.p,
+        flips={"x": args.flip_x, "y": args.flip_y},
+        fill_radius=args.fill,
+        spot=args.spot,
     )
+    if len(args.recordings) > 1 or args.scheduler or args.workers:
+        return _many(args, options)
+    live = None
+    if args.follow:
+        from recon.follow import follow
+
+        times = {"frame_time": args.frame_time, "quiet_time": args.quiet_time}
+        live = follow(args.recordings[0], args.output, options, args.mapping, **times).summary()
+    return reconstruct_file(args.recordings[0], args.output, options, args.mapping, live=live)
+
+
+def _many(args: argparse.Namespace, options: Options) -> dict[str, Any]:
+    from recon.batch import reconstruct_files
+    from scanner.errors import BadInput
+
+    if args.follow:
+        raise BadInput("follows one recording", channel="--follow", hint="start one command for each")
+    where = {"scheduler": args.scheduler, "workers": args.workers}
+    return reconstruct_files(args.recordings, args.output, options, args.mapping, **where)
 
 
 def tell(summary: dict[str, Any]) -> str:
+    if "recordings" in summary:
+        return _tell_many(summary)
     lines = [f"{summary['output']}: {summary['estimator']}, {summary['samples']} samples, fill {summary['fill']:.1%}"]
     for axis in summary["axes"]:
         own = summary[axis]
@@ -81,5 +126,24 @@ def tell(summary: dict[str, Any]) -> str:
         if seen["sd"] is not None:
             line += f", the picture shows {seen['value']:+.3f}° ± {seen['sd']:.3f}°"
         lines.append(f"{line}; sign {own['sign']}")
+    if "live" in summary:
+        live = summary["live"]
+        line = f"  live: {live['frames']} frames of {1e3 * (live['frame_s'] or 0.0):.4g} ms, {live['dropped']} dropped"
+        if live["frames"]:
+            line += f", {live['latency_s']['median']:.2f} s late (at most {live['latency_s']['max']:.2f} s)"
+        lines.append(f"{line}; {live['ended']}")
+    lines += [f"  {note}" for note in summary["notes"]] if summary["trouble"] else []
     lines.append(f"  picture {summary['output']}/image.png, report {summary['output']}/report.html")
     return "\n".join(lines)
+
+
+def _tell_many(summary: dict[str, Any]) -> str:
+    rows = summary["recordings"]
+    lines = [f"{summary['output']}: {len(rows) - summary['failed']} of {len(rows)} recordings reconstructed"]
+    for each in rows:
+        if each["failed"]:
+            lines.append(f"  failed: {each['failed']}")
+        else:
+            held = ", ".join(f"{axis} {share:.1%}" for axis, share in each["within_bound"].items())
+            lines.append(f"  {each['output']}: fill {each['fill']:.1%}, within the bound {held}")
+    return "\n".join([*lines, f"  table {summary['output']}/summary.json, page {summary['output']}/index.html"])

@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import errno
 import json
-import multiprocessing
 import os
 import shutil
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from tqdm import tqdm
 
-from recon.output import finite, replacing_folder, write_json
+from recon.executors import executor_of
+from recon.output import check_folder, finite, replacing_folder, write_json
 from recon.study.plan import Job, jobs, key, read_study, remaining
 from recon.study.table import columns, require_parquet, rows, statistics, write_csv, write_parquet
 from recon.study.world import do
@@ -58,7 +56,7 @@ def run_study(
         require_parquet()
     everything = list(jobs(study))
     # The pool comes first: a scheduler that does not answer leaves no folder behind.
-    pool = _cluster(scheduler) if scheduler else _processes(workers)
+    pool = executor_of(scheduler, workers)
     with _telling(output), pool as executor, _journal(_folder(output) / JOURNAL) as (file, done):
         before = len(done)
         left = remaining(everything, done)
@@ -91,10 +89,7 @@ def run_study(
 
 def _folder(output: Path) -> Path:
     """The folder, made where it is not there yet."""
-    if output.exists() and not output.is_dir():
-        raise BadInput("is a file where a folder should be", file=output, hint="name another with -o")
-    if not output.parent.is_dir():
-        raise BadInput("the folder to write into does not exist", file=output.parent, hint="create it")
+    check_folder(output)
     output.mkdir(exist_ok=True)
     return output
 
@@ -163,50 +158,3 @@ def _work(executor: Executor, left: Sequence[Job], done: dict[str, Record], file
             os.fsync(file.fileno())
             done.update((key(each["cell"]), each) for each in records)
             bar.update(len(records))
-
-
-@contextmanager
-def _processes(workers: int | None) -> Iterator[Executor]:
-    # Spawned, not forked: a fork of a process with threads (OpenCV's, a test's) can lock up.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _worker_begins)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _worker_begins() -> None:
-    """A worker leaves the interrupt to its parent, and ends when that is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-@contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
-    """A Dask cluster as an executor: its scheduler gives the jobs of a worker that died to the others."""
-    try:
-        from distributed import Client
-        from distributed.scheduler import KilledWorker
-    except ModuleNotFoundError:
-        raise BadInput("--scheduler needs Dask", hint="pip install 'lissajous[dask]'") from None
-    try:
-        client = Client(address, timeout=10, set_as_default=False)
-    except (OSError, ValueError) as error:
-        hint = "start one with: dask scheduler"
-        raise BadInput(f"no Dask scheduler answers at {address} ({error})", hint=hint) from None
-    with client:
-        executor = client.get_executor(pure=False)
-        try:
-            yield executor
-        except KilledWorker as error:
-            raise BrokenExecutor(str(error)) from None
-        finally:
-            executor.shutdown(wait=False)

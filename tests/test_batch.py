@@ -1,0 +1,83 @@
+"""Many recordings at once: a folder each, a table of all, and one that fails stops no other."""
+
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from worlds import imaging
+
+from recon.batch import reconstruct_files
+from recon.cli import main
+from recon.commands.reconstruct import tell
+from recon.pipeline import Options
+
+OPTIONS = Options(estimator="constant", pixels=(60, 60))
+GIVEN = ["--estimator", "constant", "--pixels", "60x60"]
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two recordings of the same name in different folders, and one without an intensity."""
+    folder = tmp_path_factory.mktemp("scans")
+    paths = [folder / "monday" / "scan.h5", folder / "tuesday" / "scan.h5", folder / "blind.h5"]
+    for path, stop in zip(paths, (0.012, 0.016, 0.012), strict=True):
+        path.parent.mkdir(exist_ok=True)
+        imaging()[0].slice(0.0, stop).write(path)
+    with h5py.File(paths[2], "r+") as file:
+        del file["channels/intensity"]
+    return paths
+
+
+def test_a_bad_one_is_named_and_stops_no_other(
+    scans: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "all"
+    assert main(["reconstruct", *map(str, scans), "-o", str(out), *GIVEN, "--json"]) == 2
+    summary = json.loads(capsys.readouterr().out)
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert [Path(each["output"]).name for each in summary["recordings"]] == ["scan", "scan-2", "blind"]
+    assert [bool(each["failed"]) for each in summary["recordings"]] == [False, False, True]
+    assert "blind.h5: intensity: is not in the recording" in summary["recordings"][2]["failed"]
+    assert {path.name for path in out.iterdir()} == {"scan", "scan-2", "summary.json", "index.html"}
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert "scan-2/image.png" in page
+    assert "blind.h5" in page
+    assert main(["reconstruct", str(scans[1]), "-o", str(tmp_path / "alone"), *GIVEN]) == 0
+    for name in ("image.tif", "coverage.tif"):
+        ours, alone = tifffile.imread(out / "scan-2" / name), tifffile.imread(tmp_path / "alone" / name)
+        np.testing.assert_array_equal(ours, alone)
+    told = tell(summary).splitlines()
+    assert told[0].endswith("2 of 3 recordings reconstructed")
+    assert "scan: fill" in told[1]
+    assert told[3].startswith("  failed: ")
+
+
+def test_a_worker_that_is_killed_is_told_of(scans: list[Path], tmp_path: Path) -> None:
+    import multiprocessing
+
+    def kill() -> None:
+        while not (children := multiprocessing.active_children()):
+            time.sleep(0.01)
+        os.kill(children[0].pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    summary = reconstruct_files(scans[:2], tmp_path / "all", OPTIONS, workers=1)
+    killer.join()
+    assert summary["exit"] == 1
+    assert all("its worker was killed" in each["failed"] for each in summary["recordings"])
+
+
+def test_on_a_cluster(scans: list[Path], tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        summary = reconstruct_files(scans[:2], tmp_path / "all", OPTIONS, scheduler=cluster.scheduler_address)
+    assert summary["failed"] == 0
+    assert {path.name for path in (tmp_path / "all").iterdir()} == {"scan", "scan-2", "summary.json", "index.html"}
