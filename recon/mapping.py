@@ -24,6 +24,7 @@ class Grid:
     Attributes:
         width, height: pixels.
         half_angle_x, half_angle_y: the field's edge, mechanical angle [rad].
+        metres_per_radian: by which the beam moves over the sample [m/rad]; None where it is not known.
 
     Raises:
         BadInput: a size or an angle that is not positive and finite.
@@ -33,6 +34,7 @@ class Grid:
     height: int
     half_angle_x: float
     half_angle_y: float
+    metres_per_radian: float | None = None
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -41,6 +43,11 @@ class Grid:
             raise BadInput(
                 f"half angles of {self.half_angle_x} and {self.half_angle_y} rad", hint="give positive, finite angles"
             )
+
+    @property
+    def pixel_angle(self) -> tuple[float, float]:
+        """Width and height of a pixel, mechanical angle [rad]."""
+        return 2 * self.half_angle_x / self.width, 2 * self.half_angle_y / self.height
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.mapping import Grid, Picture
 from scanner.errors import BadInput
 from scanner.motion import Motion
 
@@ -73,12 +75,53 @@ def write_motion(path: Path, motion: Motion) -> None:
             angle.attrs.update({"unit": "rad", "sample_rate": axis.angle.sample_rate, "start": axis.angle.start})
 
 
-def write_tiff(path: Path, image: NDArray[Any]) -> None:
-    """A picture as TIFF, its values as they are; a last axis of detectors becomes planes."""
+def pixel_size(grid: Grid) -> tuple[float, float, str]:
+    """Width and height of a pixel and their unit: um on the sample where the scale is known, else rad of the mirror."""
+    scale, unit = (1.0, "rad") if grid.metres_per_radian is None else (1e6 * grid.metres_per_radian, "um")
+    width, height = grid.pixel_angle
+    return scale * width, scale * height, unit
+
+
+def write_tiff(path: Path, image: NDArray[Any], grid: Grid) -> None:
+    """A picture as TIFF, its values as they are, to scale (see :func:`pixel_size`) for ImageJ and what reads its files.
+
+    Args:
+        image: shape (height, width), or (height, width, detectors), whose detectors become channels.
+    """
     import tifffile
 
-    planes = image if image.ndim == 2 else np.moveaxis(image, -1, 0)
-    tifffile.imwrite(path, planes, photometric="minisblack")
+    width, height, unit = pixel_size(grid)
+    planes, axes = (image, "YX") if image.ndim == 2 else (np.moveaxis(image, -1, 0), "CYX")
+    if image.dtype == np.uint32:  # which tifffile does not take for ImageJ's, though ImageJ reads it
+        form: dict[str, Any] = {"description": f"ImageJ=1.11a\nunit={unit}\n", "metadata": None}
+    else:
+        form = {"imagej": True, "metadata": {"axes": axes, "unit": unit}}
+    tifffile.imwrite(
+        path, planes, photometric="minisblack", resolution=(1 / width, 1 / height), resolutionunit="NONE", **form
+    )
+
+
+def write_frames(path: Path, frames: Iterable[Picture], count: int, frame_time: float) -> None:
+    """A scan's frames as OME-TIFF, float32 with NaN where never visited; one frame at a time is in memory.
+
+    OME knows lengths but no angles: a pixel has a size where the scale of the sample is known, else none.
+
+    Args:
+        frames: as many as ``count``, at least one, of one shape. frame_time: from one to the next [s].
+    """
+    import tifffile
+
+    pictures = iter(frames)
+    first = next(pictures)
+    told: dict[str, Any] = {"TimeIncrement": frame_time, "TimeIncrementUnit": "s"}
+    if first.grid.metres_per_radian is not None:
+        width, height, _ = pixel_size(first.grid)
+        told |= {"PhysicalSizeX": width, "PhysicalSizeXUnit": "µm", "PhysicalSizeY": height, "PhysicalSizeYUnit": "µm"}
+    planes = (plane for each in chain([first], pictures) for plane in np.atleast_3d(each.image).transpose(2, 0, 1))
+    shape, axes = (count, *first.image.shape[2:], *first.image.shape[:2]), "TCYX" if first.image.ndim == 3 else "TYX"
+    tifffile.imwrite(
+        path, planes, shape=shape, dtype=np.float32, ome=True, photometric="minisblack", metadata={"axes": axes, **told}
+    )
 
 
 def write_json(path: Path, summary: Mapping[str, Any]) -> None:

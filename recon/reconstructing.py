@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from recon.convert import open_any
+from recon.frames import film
 from recon.mapping import fill_holes
 from recon.output import finite, replacing_folder, write_json, write_motion, write_tiff
 from recon.pipeline import Options, reconstruct
@@ -39,14 +40,17 @@ def reconstruct_file(
         result = reconstruct(recording, options, None if mapping or growing else truth_of(path), quiet)
         said = {"output": str(output), "recording": str(path)} | ({"live": live} if live else {})
         summary = finite(summarise(result) | said)
-        write_tiff(folder / "image.tif", result.picture.image)
-        write_tiff(folder / "coverage.tif", result.picture.coverage)
+        grid = result.picture.grid
+        write_tiff(folder / "image.tif", result.picture.image, grid)
+        write_tiff(folder / "coverage.tif", result.picture.coverage, grid)
         if options.fill_radius:
             image, mask = fill_holes(result.picture, options.fill_radius)
-            write_tiff(folder / "filled.tif", image)
-            write_tiff(folder / "fill.tif", mask.astype(np.uint8))
+            write_tiff(folder / "filled.tif", image, grid)
+            write_tiff(folder / "fill.tif", mask.astype(np.uint8), grid)
         if result.trouble:
-            write_tiff(folder / "affected.tif", result.affected.astype(np.uint8))
+            write_tiff(folder / "affected.tif", result.affected.astype(np.uint8), grid)
+        if options.frames or options.frame_time:
+            film(folder / "frames.ome.tif", result, recording["intensity"], options)
         write_motion(folder / "motion.h5", result.motion)
         write_json(folder / "summary.json", summary)
         save_picture(folder / "image.png", result.picture)

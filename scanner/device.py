@@ -161,10 +161,15 @@ class Position(Checked):
 
 @dataclass(frozen=True)
 class Scan(Checked):
-    """Field of view that fills the picture, as mechanical half angles [rad]."""
+    """Field of view that fills the picture, as mechanical half angles [rad].
+
+    Attributes:
+        metres_per_radian: by which the beam moves over the sample [m/rad]; where it is told pictures are to scale.
+    """
 
     half_angle_x: float = field(metadata=POSITIVE)
     half_angle_y: float = field(metadata=POSITIVE)
+    metres_per_radian: float | None = field(default=None, metadata=POSITIVE | CAN_BE_OFF)
 
 
 Readout = Amdm | Transimpedance | Position

@@ -33,6 +33,14 @@ def at_least_one(text: str) -> int:
     return value
 
 
+def at_least_one(text: str) -> int:
+    """A whole number above zero, for argparse."""
+    value = int(text)
+    if value < 1:
+        raise ValueError
+    return value
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
@@ -56,6 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quiet-time", type=positive, default=5.0, metavar="S", help="follow: end when nothing came for so long (5)"
     )
+    film = parser.add_mutually_exclusive_group()
+    film.add_argument("--frames", type=at_least_one, metavar="N", help="write N frames of the scan to frames.ome.tif")
+    film.add_argument("--frame-time", type=positive, metavar="S", help="or frames of S seconds")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
     parser.add_argument("--estimator", metavar="NAME", help="tracker, ukf, ekf, ...; else by what was recorded")
