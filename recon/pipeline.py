@@ -46,6 +46,7 @@ class Options:
         flips: axes whose sign is turned.
         fill_radius: holes up to this many pixels are filled, and marked as fill; 0 fills none.
         spot: standard deviation of the beam's spot [px], for the blur's account; the recording does not tell it.
+        frames: pictures of successive parts of the scan, as many; None for none. frame_time: or one for so long [s].
     """
 
     device: Path | None = None
@@ -55,6 +56,8 @@ class Options:
     flips: Mapping[str, bool] = field(default_factory=dict)
     fill_radius: int = 0
     spot: float | None = None
+    frames: int | None = None
+    frame_time: float | None = None
 
 
 @dataclass(frozen=True)
@@ -165,7 +168,8 @@ def reconstruct(
 def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
     """The pixels over the device's field of view, else over the motion's own, which a note then says."""
     if device.scan is not None:
-        return Grid(*options.pixels, device.scan.half_angle_x, device.scan.half_angle_y), []
+        scan = device.scan
+        return Grid(*options.pixels, scan.half_angle_x, scan.half_angle_y, scan.metres_per_radian), []
     half = {axis: float(np.max(motion.axes[axis].amplitude)) for axis in AXES}
     note = (
         f"the device states no [scan]: the field is the motion's own, {half['x']:.4g} x {half['y']:.4g} rad half angles"
@@ -173,17 +177,20 @@ def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, li
     return Grid(*options.pixels, half["x"], half["y"]), [note]
 
 
-def mapped(motion: Motion, intensity: Channel, grid: Grid, lost: Ranges, begin: int = 0) -> Picture:
+def mapped(
+    motion: Motion, intensity: Channel, grid: Grid, lost: Ranges, begin: int = 0, end: int | None = None
+) -> Picture:
     """The picture, a chunk at a time: memory does not grow with the recording.
 
     Args:
         motion: its angles on the intensity's clock.
-        lost: samples (first, stop) that belong to no pixel. begin: first sample that is mapped.
+        lost: samples (first, stop) that belong to no pixel. begin, end: samples that are mapped.
     """
     x, y = (motion.axes[axis].angle for axis in AXES)
     sums = counts = None
-    for first in range(begin, intensity.size, CHUNK):
-        stop = min(first + CHUNK, intensity.size)
+    end = intensity.size if end is None else end
+    for first in range(begin, end, CHUNK):
+        stop = min(first + CHUNK, end)
         seen = intensity.read(first, stop)
         if intensity.raw.dtype.kind == "f":
             seen[np.isinf(seen)] = np.nan  # which is left out

@@ -33,14 +33,6 @@ def at_least_one(text: str) -> int:
     return value
 
 
-def at_least_one(text: str) -> int:
-    """A whole number above zero, for argparse."""
-    value = int(text)
-    if value < 1:
-        raise ValueError
-    return value
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
@@ -58,15 +50,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     several.add_argument(
         "--follow", action="store_true", help="show the frames of a recording that is still being written, then all"
     )
-    parser.add_argument(
-        "--frame-time", type=positive, metavar="S", help="follow: length of a frame (the scan's repeat)"
+    film = parser.add_mutually_exclusive_group()
+    film.add_argument("--frames", type=at_least_one, metavar="N", help="write N frames of the scan to frames.ome.tif")
+    film.add_argument(
+        "--frame-time", type=positive, metavar="S", help="or frames of S seconds; follow: so long (the scan's repeat)"
     )
     parser.add_argument(
         "--quiet-time", type=positive, default=5.0, metavar="S", help="follow: end when nothing came for so long (5)"
     )
-    film = parser.add_mutually_exclusive_group()
-    film.add_argument("--frames", type=at_least_one, metavar="N", help="write N frames of the scan to frames.ome.tif")
-    film.add_argument("--frame-time", type=positive, metavar="S", help="or frames of S seconds")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
     parser.add_argument("--estimator", metavar="NAME", help="tracker, ukf, ekf, ...; else by what was recorded")
@@ -101,6 +92,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         flips={"x": args.flip_x, "y": args.flip_y},
         fill_radius=args.fill,
         spot=args.spot,
+        frames=args.frames,
+        frame_time=args.frame_time,
     )
     if len(args.recordings) > 1 or args.scheduler or args.workers:
         return _many(args, options)
