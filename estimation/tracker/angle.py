@@ -1,11 +1,12 @@
 """The angle at any sample from slow phase, amplitude and harmonics, without a sine for each sample.
 
 Time is cut into segments of SEGMENT samples. At a segment's ends phase, amplitude and harmonics are interpolated from
-the blocks; inside, the phase runs straight, so that a segment's phasors follow from its first by doubling.
+the blocks; inside, the phase runs straight, so that a segment's phasors follow from its first by turning.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,8 +20,9 @@ from scanner.motion import AngleTrack
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-SEGMENT = 128  # a power of two
-RAMP = np.arange(SEGMENT, dtype=np.float64)
+SEGMENT = 256  # samples over which the phase runs straight
+FINE = 64  # phasors turned together, a power of two that divides SEGMENT
+RAMP = np.arange(FINE, dtype=np.float64)
 PIECE = 1 << 20  # samples made at a time
 
 
@@ -45,24 +47,35 @@ class SlowMotion:
 
     def at(self, time: Array) -> tuple[Array, Complex]:
         """Phase u [rad] and lines [rad] at ``time``, shapes (n,) and (n, lines)."""
-        step = self.time[1] - self.time[0]
-        at = (time - self.time[0]) / step
-        k = np.clip(np.floor(at).astype(np.int64), 0, self.time.size - 2)
-        s = at - k
-        phase = _hermite(self.phase, self.phase_rate, k, s, step) + self.reference.phase(time)
-        amplitude = np.exp(_hermite(self.log, self.log_rate, k, s, step))
-        share = np.clip(s, 0.0, 1.0)[:, None]
-        return phase, (self.lines[k] * (1.0 - share) + self.lines[k + 1] * share) * amplitude[:, None]
+        own, lines = _between(time, self.time, self.phase, self.phase_rate, self.log, self.log_rate, self.lines)
+        return own + self.reference.phase(time), lines
 
 
-def _hermite(values: Array, slopes: Array, k: NDArray[np.int64], s: Array, step: float) -> Array:
+@njit(cache=True, error_model="numpy")
+def _between(time, knots, phase, phase_rate, log, log_rate, lines):  # type: ignore[no-untyped-def]
+    """Phase by cubics, amplitude by the exponential of cubics, harmonics over the amplitude by straight lines."""
+    step = knots[1] - knots[0]
+    out, out_lines = np.empty(time.size), np.empty((time.size, lines.shape[1]), np.complex128)
+    for i in range(time.size):
+        at = (time[i] - knots[0]) / step
+        k = int(min(max(math.floor(at), 0.0), knots.size - 2.0))
+        out[i] = _hermite(phase, phase_rate, k, at - k, step)
+        amplitude = math.exp(_hermite(log, log_rate, k, at - k, step))
+        share = min(max(at - k, 0.0), 1.0)
+        for n in range(lines.shape[1]):
+            out_lines[i, n] = (lines[k, n] * (1.0 - share) + lines[k + 1, n] * share) * amplitude
+    return out, out_lines
+
+
+@njit(cache=True)
+def _hermite(values, slopes, k, s, step):  # type: ignore[no-untyped-def]
     """Cubic through values and slopes, at fraction ``s`` behind knot ``k``; straight on beyond the ends."""
-    inside = np.clip(s, 0.0, 1.0)
+    inside = min(max(s, 0.0), 1.0)
     rest = 1.0 - inside
     a, b = values[k], values[k + 1]
     da, db = slopes[k] * step, slopes[k + 1] * step
     curve = rest**2 * ((1.0 + 2.0 * inside) * a + inside * da) + inside**2 * ((1.0 + 2.0 * rest) * b - rest * db)
-    return curve + (s - inside) * np.where(s < 0.0, da, db)
+    return curve + (s - inside) * (da if s < 0.0 else db)
 
 
 @dataclass(frozen=True)
@@ -83,22 +96,32 @@ class Segments:
 def segments(motion: SlowMotion, rate: float, start: float, count: int) -> Segments:
     """Segments that cover ``count`` samples from ``start`` [s] at ``rate`` [Hz]."""
     edges: Array = start + np.arange(-(-count // SEGMENT) + 1, dtype=np.float64) * (SEGMENT / rate)
-    phase, lines = motion.at(edges)
-    return Segments(
-        np.exp(1j * phase[:-1]), np.exp(1j * np.diff(phase) / SEGMENT), lines[:-1], np.diff(lines, axis=0) / SEGMENT
-    )
+    return Segments(*_cut(*motion.at(edges)))
+
+
+@njit(cache=True, error_model="numpy")
+def _cut(phase, lines):  # type: ignore[no-untyped-def]
+    """What ``Segments`` holds, from phase and lines at the segments' edges."""
+    size = phase.size - 1
+    first, turn = np.empty(size, np.complex128), np.empty(size, np.complex128)
+    for s in range(size):
+        step = (phase[s + 1] - phase[s]) / SEGMENT
+        first[s] = complex(math.cos(phase[s]), math.sin(phase[s]))
+        turn[s] = complex(math.cos(step), math.sin(step))
+    return first, turn, lines[:-1], (lines[1:] - lines[:-1]) / SEGMENT
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def segment_angles(first, turn, lines, line_steps, re, im, out):  # type: ignore[no-untyped-def]
-    """Angles of one segment into ``out`` (SEGMENT,) [rad]; ``re``, ``im`` (SEGMENT,) are room for its phasors.
+    """Angles of one segment into ``out`` (SEGMENT,) [rad]; ``re``, ``im`` (FINE,) are room for phasors.
 
     ``lines`` are harmonics 0, 1, 2, ...; three are 1, 3, 5. The amplitude runs straight over the segment, the small
-    harmonics keep the value of its middle.
+    harmonics keep the value of its middle. A sample's phasor is one of FINE that start at 1, turned by the one of its
+    stretch of FINE samples.
     """
-    re[0], im[0] = first.real, first.imag
+    re[0], im[0] = 1.0, 0.0
     done, far = 1, turn
-    while done < SEGMENT:  # each step turns all phasors there are at once, and so doubles them
+    while done < FINE:  # each step turns all phasors there are at once, and so doubles them
         a, b = far.real, far.imag
         next_re, next_im = re[done : 2 * done], im[done : 2 * done]
         for i in range(done):
@@ -106,33 +129,48 @@ def segment_angles(first, turn, lines, line_steps, re, im, out):  # type: ignore
             next_re[i], next_im[i] = x * a - y * b, x * b + y * a
         far *= far
         done *= 2
-    if lines.size == 3:
-        swing, swing_step = lines[0].imag, line_steps[0].imag
-        third, fifth = lines[1] + 0.5 * SEGMENT * line_steps[1], lines[2] + 0.5 * SEGMENT * line_steps[2]
-        r3, i3, r5, i5 = third.real, third.imag, fifth.real, fifth.imag
-        for i in range(SEGMENT):
-            x, y = re[i], im[i]
-            px, py = x * x - y * y, 2.0 * x * y
-            sx, sy = r3 + r5 * px - i5 * py, i3 + r5 * py + i5 * px
-            tx, ty = sx * px - sy * py, swing + RAMP[i] * swing_step + sx * py + sy * px
-            out[i] = x * tx - y * ty
-    else:
-        for i in range(SEGMENT):
-            out[i] = lines[0].real - (lines[1].imag + RAMP[i] * line_steps[1].imag) * im[i]
-        for n in range(2, lines.size):
-            line = lines[n] + 0.5 * SEGMENT * line_steps[n]
-            a, b = line.real, line.imag
-            for i in range(SEGMENT):
-                x, y = re[i], im[i]
-                px, py = x, y
-                for _ in range(n - 1):
-                    px, py = px * x - py * y, px * y + py * x
-                out[i] += a * px - b * py
+    a, b = first.real, first.imag
+    for at in range(0, SEGMENT, FINE):
+        part = out[at : at + FINE]
+        if lines.size == 3:
+            _odd_angles(a, b, lines, line_steps, at, re, im, part)
+        else:
+            _all_angles(a, b, lines, line_steps, at, re, im, part)
+        a, b = a * far.real - b * far.imag, a * far.imag + b * far.real
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def _odd_angles(a, b, lines, line_steps, at, re, im, out):  # type: ignore[no-untyped-def]
+    """Harmonics 1, 3, 5 by cos 3u = c (1 - 4 s^2), sin 3u = s (3 - 4 s^2), and so on: polynomials in s^2."""
+    third, fifth = lines[1] + 0.5 * SEGMENT * line_steps[1], lines[2] + 0.5 * SEGMENT * line_steps[2]
+    c0, c1, c2 = third.real + fifth.real, -4.0 * third.real - 12.0 * fifth.real, 16.0 * fifth.real
+    step = line_steps[0].imag
+    s0 = lines[0].imag + at * step + 3.0 * third.imag + 5.0 * fifth.imag
+    s1, s2 = -4.0 * third.imag - 20.0 * fifth.imag, 16.0 * fifth.imag
+    for i in range(FINE):
+        c, s = re[i] * a - im[i] * b, re[i] * b + im[i] * a
+        w = s * s
+        out[i] = c * (c0 + w * (c1 + w * c2)) - s * (s0 + RAMP[i] * step + w * (s1 + w * s2))
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def _all_angles(a, b, lines, line_steps, at, re, im, out):  # type: ignore[no-untyped-def]
+    for i in range(FINE):
+        s = re[i] * b + im[i] * a
+        out[i] = lines[0].real - (lines[1].imag + (at + RAMP[i]) * line_steps[1].imag) * s
+    for n in range(2, lines.size):
+        line = lines[n] + 0.5 * SEGMENT * line_steps[n]
+        for i in range(FINE):
+            c, s = re[i] * a - im[i] * b, re[i] * b + im[i] * a
+            px, py = c, s
+            for _ in range(n - 1):
+                px, py = px * c - py * s, px * s + py * c
+            out[i] += line.real * px - line.imag * py
 
 
 @njit(cache=True, error_model="numpy")
 def _angles(first, turn, lines, line_steps, out):  # type: ignore[no-untyped-def]
-    re, im, buffer = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(SEGMENT)
+    re, im, buffer = np.empty(FINE), np.empty(FINE), np.empty(SEGMENT)
     for s in range(first.size):
         at = s * SEGMENT
         segment_angles(first[s], turn[s], lines[s], line_steps[s], re, im, buffer)
