@@ -31,7 +31,7 @@ from scanner.recording import Recording
 Array = NDArray[np.float64]
 
 AXES = ("x", "y")
-REGISTERED = 800  # periods of the slower axis that are registered at the most
+REGISTERED = 400  # periods of the slower axis that are registered at the most
 CHUNK = 1 << 20  # samples mapped at a time
 
 
