@@ -1,0 +1,185 @@
+"""What a reconstruction costs against its length, its pixels and its axes, and 10 s of 5 MS/s from the disk.
+
+python -m benchmarks.scale [length|pixels|axes|disk|longest ...]
+
+A scan without drift repeats itself every 0.1 s, so one simulated period makes a recording of any length. The same
+noise comes back with it, which costs a tracker neither more nor less. Each case runs in a process of its own, whose
+peak memory is its own.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.tracker import track
+from phantoms.experiment import Experiment, run
+from recon.mapping import Grid
+from recon.pipeline import mapped
+from scanner.channel import checked_channel
+from scanner.device import Amdm, Device
+from scanner.recording import Recording
+
+RATE = 5e6
+PERIOD = 500_000  # samples in which 13840 and 3270 Hz both come round
+LENGTHS = (1_000_000, 10_000_000, 100_000_000)
+LONGEST = 1_000_000_000
+SIZE = 20_000_000  # samples for pixels and axes
+PIXELS = (100, 400, 1600)
+RESULTS = Path(__file__).with_name("scale.json")
+Results = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """One period's samples over and over, made when they are sliced, as a ``Channel`` wants them."""
+
+    period: NDArray[np.int16]
+    size: int
+
+    @property
+    def shape(self) -> tuple[int]:
+        return (self.size,)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return self.period.dtype
+
+    ndim = 1
+
+    def __getitem__(self, rows: slice) -> NDArray[np.int16]:
+        first, stop, _ = rows.indices(self.size)
+        turn = first % PERIOD
+        return np.tile(self.period, (turn + stop - first) // PERIOD + 1)[turn : turn + stop - first]
+
+
+def one_period(device: Device | None = None) -> Recording:
+    """0.1 s of the demo's scan once its motion has settled; by another device if one is given."""
+    experiment = Experiment(duration=0.2, drift={})
+    simulated, _ = run(experiment if device is None else replace(experiment, device=device), seed=1)
+    return simulated.slice(0.1, 0.2)
+
+
+def separate(device: Device) -> Device:
+    """The device with a readout for each axis."""
+    assert isinstance(device.readout, Amdm)
+    readout = replace(device.readout, b_cir=4.95)  # half the sum of two combs stays within the converter's range
+    return replace(device, axes={n: replace(a, readout=readout) for n, a in device.axes.items()}, readout=None)
+
+
+def repeated(period: Recording, size: int, axes: str = "xy") -> Recording:
+    """A recording of ``size`` samples of the same scan, int16, that takes no memory; of some axes only if so said."""
+    channels = {}
+    for name, channel in period.channels.items():
+        if name.rpartition("_")[2] in (*axes, name):
+            values = channel.read()
+            gain = float(np.abs(values).max()) / 32767
+            raw = Repeated(np.round(values / gain).astype(np.int16), size)
+            channels[name] = checked_channel(name, raw, unit="V", sample_rate=RATE, gain=gain)
+    return Recording(MappingProxyType(channels), period.attrs, None, period.device_toml)
+
+
+def costs(period: Path, size: int, axes: str = "xy", pixels: int = 400) -> Results:
+    """Seconds of each step on ``size`` samples, and the process's peak memory [MB]."""
+    grid = Grid(pixels, pixels, 0.18, 0.18)
+    done: Results = {}
+    with Recording.open(period) as one:
+        for samples in (PERIOD, size):  # the first compiles
+            recording = repeated(one, samples, axes)
+            assert recording.device is not None
+            device = replace(recording.device, axes={name: recording.device.axes[name] for name in axes})
+            began = time.perf_counter()
+            motion = track(recording, device)
+            done["track_s"] = time.perf_counter() - began
+            if axes == "xy":
+                began = time.perf_counter()
+                mapped(motion, recording["intensity"], grid, [])
+                done["map_s"] = time.perf_counter() - began
+    return done | {"peak_mb": peak_mb(resource.RUSAGE_SELF)}
+
+
+def peak_mb(who: int) -> float:
+    """Peak resident memory of this process, or of its children."""
+    return resource.getrusage(who).ru_maxrss / 1024
+
+
+def apart(function: Callable[..., Results], *arguments: Any) -> Results:
+    """A case in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def named(prefix: str, results: Results) -> Results:
+    return {f"{prefix}.{key}": value for key, value in results.items()}
+
+
+def length(folder: Path) -> Results:
+    period = written(one_period(), folder)
+    return {k: v for n in LENGTHS for k, v in named(f"length.{n:.0e}", apart(costs, period, n)).items()}
+
+
+def longest(folder: Path) -> Results:
+    return named(f"length.{LONGEST:.0e}", apart(costs, written(one_period(), folder), LONGEST))
+
+
+def pixels(folder: Path) -> Results:
+    period = written(one_period(), folder)
+    return {k: v for n in PIXELS for k, v in named(f"pixels.{n}", apart(costs, period, SIZE, "xy", n)).items()}
+
+
+def axes(folder: Path) -> Results:
+    period = written(one_period(separate(Experiment().device)), folder)
+    return {
+        k: v for each in ("x", "y", "xy") for k, v in named(f"axes.{each}", apart(costs, period, SIZE, each)).items()
+    }
+
+
+def disk(folder: Path) -> Results:
+    """10 s of two axes from the disk by the command itself; a tenth of it before, to compile."""
+    done: Results = {}
+    with Recording.open(written(one_period(), folder)) as period:
+        for seconds in (1, 10):
+            path = folder / f"{seconds}.h5"
+            repeated(period, round(seconds * RATE)).write(path)
+            began = time.perf_counter()
+            command = [sys.executable, "-m", "recon", "reconstruct", str(path), "-o", str(folder / "out")]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+            done = {"disk.seconds": time.perf_counter() - began, "disk.recorded_s": seconds}
+    return done | {"disk.peak_mb": peak_mb(resource.RUSAGE_CHILDREN)}
+
+
+def written(recording: Recording, folder: Path) -> Path:
+    path = folder / "period.h5"
+    recording.write(path)
+    return path
+
+
+def main(wanted: list[str]) -> None:
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    for part in (disk, length, pixels, axes, longest):
+        if not wanted or part.__name__ in wanted:
+            print(f"{part.__name__} ...", file=sys.stderr)
+            with tempfile.TemporaryDirectory() as folder:
+                found = part(Path(folder))
+            for key, value in found.items():
+                print(f"{key:28} {value:12.4g}")
+            results |= {key: float(f"{value:.4g}") for key, value in found.items()}
+            RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
