@@ -70,12 +70,15 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], in
         f"{result.motion.estimator}: {summary['samples']} samples of {result.recorded * 1e3:.4g} ms on {grid.width} × "
         f"{grid.height} pixels, {summary['fill']:.1%} of them visited; {result.seconds:.2f} s to compute."
     )
-    pictures = (
-        Figure(picture_uri(views.visible(result.picture)), f"picture ({result.motion.estimator})"),
-        Figure(
-            views.uri(views.png(views.coverage_image(result.picture.coverage))), "samples a pixel; blue: never visited"
-        ),
-    )
+    image = views.coloured(views.visible(result.picture))
+    coverage = views.coverage_image(result.picture.coverage)
+    pictures = [
+        Figure(views.uri(views.png(image)), f"picture ({result.motion.estimator})"),
+        Figure(views.uri(views.png(coverage)), "samples a pixel; blue: never visited"),
+    ]
+    if result.affected.any():
+        touched = views.png(views.marked(image, result.affected))
+        pictures.append(Figure(views.uri(touched), "orange: pixels that the trouble noted above touched"))
     sections = [
         Section("Picture", _fill_text(summary), figures=pictures, least="20rem", pixelated=True),
         Section(

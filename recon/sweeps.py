@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 
 from recon import views
 from recon.pipeline import AXES, REGISTERED, Reconstruction
+from recon.trouble import samples, unknown
 from scanner.channel import Channel
 from scanner.demodulate import block_length, block_phasors
 from scanner.motion import AxisMotion
+
+Array = NDArray[np.float64]
 
 SHOWN = 300_000  # samples that a page holds
 RUN = 32  # samples in succession: a run of them is kept and a stretch left out, where there are more
@@ -40,7 +43,10 @@ def sweeps(result: Reconstruction, intensity: Channel) -> dict[str, Any] | None:
         return None
     stride = max(RUN, math.ceil(RUN * count / SHOWN))
     kept = (np.arange(0, count - RUN + 1, stride)[:, None] + np.arange(RUN)).ravel()
-    codes, limits = _codes(intensity.read(first, first + count)[kept], views.contrast(result.picture.image))
+    seen = intensity.read(first, first + count).astype(np.float64)
+    for low, high in samples(unknown(result.motion, result.trouble), intensity):  # no place on the picture
+        seen[max(low - first, 0) : max(high - first, 0)] = np.nan
+    codes, limits = _codes(seen[kept], views.contrast(result.picture.image))
     grid = result.picture.grid
     scale = min(1.0, SIDE / max(grid.width, grid.height))
     half = {"x": grid.half_angle_x, "y": grid.half_angle_y}
@@ -94,9 +100,9 @@ def _slow(axis: AxisMotion, first: int, count: int) -> dict[str, Any]:
     }
 
 
-def _codes(seen: NDArray[Any], contrast: tuple[float, float]) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+def _codes(seen: Array, contrast: tuple[float, float]) -> tuple[NDArray[np.uint8], tuple[float, float]]:
     """Intensities, shape (n,) or (n, detectors), as bytes, and the picture's black and white in the same measure."""
-    values = np.asarray(seen if seen.ndim == 1 else seen.mean(-1), np.float64)
+    values = seen if seen.ndim == 1 else seen.mean(-1)
     present = np.isfinite(values)
     low, high = np.percentile(values[present], [0.05, 99.95]) if present.any() else (0.0, 1.0)
     gain = 254.0 / max(float(high - low), 1e-300)

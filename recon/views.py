@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 UNVISITED = "#20405f"  # pixels the beam never reached; no grey of a picture
+MARK = "#e08a1e"  # pixels that a stretch of trouble touched
 FILL_FOR_THE_EYE = 2  # pixels
 COLOURS = ("#2f6fb0", "#c8553d", "#3d8f5f", "#8a5fb0", "#b08a2f")
 
@@ -42,8 +43,20 @@ def coloured(image: NDArray[Any], limits: tuple[float, float] | None = None) -> 
     """Grey picture as RGB, shape (H, W, 3), with ``UNVISITED`` where there is no value."""
     grey = stretched(image, limits)
     rgb = np.repeat((255 * np.nan_to_num(grey)).astype(np.uint8)[..., None], 3, axis=2)
-    rgb[np.isnan(grey)] = [int(UNVISITED[i : i + 2], 16) for i in (1, 3, 5)]
+    rgb[np.isnan(grey)] = _rgb(UNVISITED)
     return rgb
+
+
+def _rgb(colour: str) -> NDArray[np.uint8]:
+    """Of #rrggbb."""
+    return np.frombuffer(bytes.fromhex(colour[1:]), np.uint8)
+
+
+def marked(rgb: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A picture, shape (H, W, 3), with the pixels of ``mask``, shape (H, W), halfway to ``MARK``."""
+    out = rgb.copy()
+    out[mask] = (out[mask].astype(np.uint16) + _rgb(MARK)) // 2
+    return out
 
 
 def png(image: NDArray[np.uint8]) -> bytes:

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from worlds import imaging
 import recon.sweeps
 from recon.mapping import Grid, accumulate
 from recon.pipeline import Options, Reconstruction, reconstruct
-from recon.report import Section, reconstruction_report, render
+from recon.report import Section, by_hand, reconstruction_report, render
 from recon.summary import summarise
 from recon.sweeps import NONE, sweeps
+from recon.trouble import Trouble, samples, unknown
+from recon.views import marked
 
 SCRIPT = Path(recon.sweeps.__file__).parent / "templates" / "sweeps.js"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -34,6 +37,11 @@ def result() -> Reconstruction:
 @pytest.fixture(scope="module")
 def data(result: Reconstruction) -> dict:
     return sweeps(result, imaging()[0]["intensity"])
+
+
+@pytest.fixture(scope="module")
+def page(result: Reconstruction) -> str:
+    return reconstruction_report(result, summarise(result), imaging()[0]["intensity"])
 
 
 def program(*names: str) -> str:
@@ -74,7 +82,7 @@ def own_maps(data: dict, size: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return maps
 
 
-def test_the_page_holds_the_scan_in_small(result: Reconstruction, data: dict) -> None:
+def test_the_page_holds_the_scan_in_small(page: str, data: dict) -> None:
     intensity = imaging()[0]["intensity"].read()
     assert (data["width"], data["height"]) == (200, 160)
     assert data["seconds"] == pytest.approx([0.0, 0.02])
@@ -84,7 +92,6 @@ def test_the_page_holds_the_scan_in_small(result: Reconstruction, data: dict) ->
     assert np.corrcoef(codes, intensity)[0, 1] > 0.999
     black, white = data["limits"]
     assert 1 <= black < white <= 255
-    page = reconstruction_report(result, summarise(result), imaging()[0]["intensity"])
     assert len(page) < 3e6
     assert "http" not in page.replace("http://www.w3.org", "")
     for axis in "xy":
@@ -120,9 +127,9 @@ def test_a_scan_too_short_for_a_slow_phase_has_no_sliders(
     monkeypatch.setattr(recon.sweeps, "READ", 5_000)
     intensity = imaging()[0]["intensity"]
     assert sweeps(result, intensity) is None
-    page = reconstruction_report(result, summarise(result), intensity)
-    assert "too short for the phase sliders" in page
-    assert "<canvas" not in page
+    section = by_hand(result, intensity)
+    assert section.sweeps is None
+    assert "too short" in section.text
 
 
 def test_the_script_maps_as_the_program_does(data: dict, tmp_path: Path) -> None:
@@ -175,9 +182,8 @@ document.getElementById("seen").textContent = JSON.stringify(seen);
 </script></body>"""
 
 
-def test_in_a_browser_the_colours_meet_at_the_estimate(result: Reconstruction, tmp_path: Path) -> None:
+def test_in_a_browser_the_colours_meet_at_the_estimate(result: Reconstruction, page: str, tmp_path: Path) -> None:
     chromium = program(*CHROMIUM)
-    page = reconstruction_report(result, summarise(result), imaging()[0]["intensity"])
     (tmp_path / "report.html").write_text(page.replace("</body>", LOOK), encoding="utf-8")
     done = subprocess.run(
         [chromium, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", "--window-size=360,800", "--dump-dom",
@@ -208,3 +214,24 @@ def test_text_from_a_recording_stays_text() -> None:
     assert "<b>" not in page
     assert "<i>" not in page
     assert "<img" not in page
+
+
+def test_trouble_is_marked_and_its_samples_have_no_place(result: Reconstruction) -> None:
+    intensity = imaging()[0]["intensity"]
+    affected = np.zeros((160, 200), bool)
+    affected[:80] = True
+    gap = [Trouble("sense", "gap", 0.005, 0.010)]
+    x = result.motion.axes["x"]
+    lost_x = replace(x, phase_sd=np.where((x.time > 0.006) & (x.time < 0.009), 10.0, x.phase_sd))
+    motion = replace(result.motion, axes={**result.motion.axes, "x": lost_x})
+    troubled = replace(result, motion=motion, trouble=gap, affected=affected)
+    codes = unpacked(sweeps(troubled, intensity)["intensity"], np.uint8)
+    lost = samples(unknown(troubled.motion, gap), intensity)
+    assert lost
+    expected = np.concatenate([np.arange(*each) for each in lost])
+    assert np.array_equal(np.flatnonzero(codes == NONE), expected)
+    assert "the trouble noted above" in reconstruction_report(troubled, summarise(troubled), intensity)
+    grey = np.full((160, 200, 3), 100, np.uint8)
+    shown = marked(grey, affected)
+    assert np.array_equal(shown[80:], grey[80:])
+    assert np.all(shown[:80] == (np.array([0xE0, 0x8A, 0x1E]) + 100) // 2)
