@@ -97,7 +97,7 @@ def estimate_with_terms(recording: Recording, device: Device, run: Estimator, mo
                      _linearised(bare, swings))  # fmt: skip
     axes = {name: _finished(axis, motion, swings, name) for name, axis in motion.axes.items()}
     axes = {name: _on_recorded_reference(axis, recording, told, bare, name) for name, axis in axes.items()}
-    return replace(motion, axes=axes, info={**motion.info, "notes": _notes(left)})
+    return replace(motion, axes=axes, notes=_notes(left))
 
 
 def folded(device: Device, added: Mapping[str, Sequence[Added]]) -> Device:
@@ -415,7 +415,7 @@ def _on_recorded_reference(axis: AxisMotion, recording: Recording, told: Recordi
     return replace(axis, phase=axis.phase + pulled - recorded)
 
 
-def _notes(left: Left) -> list[str]:
+def _notes(left: Left) -> tuple[str, ...]:
     """How the terms were taken, where that is not by their own law."""
     notes = []
     for name, terms in left.items():
@@ -424,4 +424,4 @@ def _notes(left: Left) -> list[str]:
                 notes.append(f"{each.term.effect} of {name}: as the stiffness, damping and harmonics at the amplitude")
             if each.term.bell is not None:
                 notes.append(f"{each.term.effect} of {name}: in what is sensed; its pull as the nominal comb's")
-    return notes
+    return tuple(notes)

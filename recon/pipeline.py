@@ -22,6 +22,7 @@ from recon.registration import PhaseError, registered, slow_period
 from recon.score import AxisError, Truth, axis_error
 from recon.slow_mapping import accumulate_slow
 from recon.trouble import Ranges, Trouble, samples, told, troubles, unknown, without
+from recon.undo import placed, with_light
 from scanner.channel import Channel, check_signal
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
@@ -115,6 +116,8 @@ def reconstruct(
         intensity = recording.require("intensity", "a picture needs it")
         check_signal(intensity, gaps_ok=True)
         device = device_of(recording, Device.load(options.device) if options.device else None)
+        recording = with_light(recording, device)
+        intensity = recording["intensity"]
         for axis in AXES:
             device.axis(axis)
         method = options.estimator or default_estimator(recording, device)
@@ -126,11 +129,12 @@ def reconstruct(
         progress.update()
         progress.set_postfix_str("mapping")
         grid, notes = field_of(device, motion, options)
+        beam = placed(motion, device, recording.start)
         trouble = troubles(recording)
         lost = samples(unknown(motion, trouble), intensity)
-        picture = mapped(motion, intensity, grid, lost)
+        picture = mapped(beam, intensity, grid, lost)
         touched = samples(((each.start, each.stop) for each in trouble), intensity)
-        affected = _visited(motion, without(touched, lost), grid)
+        affected = _visited(beam, without(touched, lost), grid)
         if not picture.coverage.any():
             raise DeviceInvalid(
                 "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"
@@ -138,11 +142,11 @@ def reconstruct(
         progress.update()
         progress.set_postfix_str("registration")
         windows = _windows(motion, intensity)
-        seen = registered(motion, intensity, grid, windows)
+        seen = registered(beam, intensity, grid, windows)
         progress.update()
         errors = {axis: axis_error(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles} if truth else {}
         progress.update()
-    notes += told_by_picture
+    notes += told_by_picture + list(motion.notes)
     for axis in AXES:
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")

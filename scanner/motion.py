@@ -78,8 +78,10 @@ class Motion:
         axes: ``"x"`` and, for two axes, ``"y"``.
         estimator: name of the estimator that made it.
         info: further facts worth reporting (tuned noise, log-likelihood, ...), JSON-serialisable.
+        notes: what a reader has to know, a line each.
     """
 
     axes: Mapping[str, AxisMotion]
     estimator: str
     info: Mapping[str, object] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()

@@ -111,4 +111,4 @@ def test_a_torque_s_lines_are_its_describing_function() -> None:
 def test_what_is_not_taken_by_its_own_law_is_said() -> None:
     recording, _ = recorded("quadratic-stiffness")
     motion = estimate(recording, stated(devices.load("imaging"), "quadratic-stiffness"), "tracker")
-    assert "quadratic-stiffness of x" in str(motion.info["notes"])
+    assert "quadratic-stiffness of x" in motion.notes[0]
