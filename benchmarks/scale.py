@@ -1,6 +1,6 @@
 """What a reconstruction costs against its length, its pixels and its axes, and 10 s of 5 MS/s from the disk.
 
-python -m benchmarks.scale [length|pixels|axes|disk|longest ...]
+python -m benchmarks.scale [disk|live|length|pixels|axes|longest ...]
 
 A scan without drift repeats itself every 0.1 s, so one simulated period makes a recording of any length. The same
 noise comes back with it, which costs a tracker neither more nor less. Each case runs in a process of its own, whose
@@ -23,13 +23,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.tracker import track
 from phantoms.experiment import Experiment, run
 from recon.mapping import Grid
-from recon.pipeline import mapped
+from recon.pipeline import Options, mapped
 from scanner.channel import checked_channel
 from scanner.device import Amdm, Device
 from scanner.recording import Recording
@@ -40,6 +41,7 @@ LENGTHS = (1_000_000, 10_000_000, 100_000_000)
 LONGEST = 1_000_000_000
 SIZE = 20_000_000  # samples for pixels and axes
 PIXELS = (100, 400, 1600)
+LIVE_S, FRAME_S, WRITTEN_EVERY = 6.0, 0.1, 0.01
 RESULTS = Path(__file__).with_name("scale.json")
 Results = dict[str, float]
 
@@ -112,6 +114,12 @@ def costs(period: Path, size: int, axes: str = "xy", pixels: int = 400) -> Resul
     return done | {"peak_mb": peak_mb(resource.RUSAGE_SELF)}
 
 
+def processor_s() -> float:
+    """Of all children that have ended [s]: what a busy machine does not lengthen."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def peak_mb(who: int) -> float:
     """Peak resident memory of this process, or of its children."""
     return resource.getrusage(who).ru_maxrss / 1024
@@ -155,11 +163,52 @@ def disk(folder: Path) -> Results:
         for seconds in (1, 10):
             path = folder / f"{seconds}.h5"
             repeated(period, round(seconds * RATE)).write(path)
-            began = time.perf_counter()
+            began, before = time.perf_counter(), processor_s()
             command = [sys.executable, "-m", "recon", "reconstruct", str(path), "-o", str(folder / "out")]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-            done = {"disk.seconds": time.perf_counter() - began, "disk.recorded_s": seconds}
+            done = {"disk.seconds": time.perf_counter() - began, "disk.cpu_s": processor_s() - before}
     return done | {"disk.peak_mb": peak_mb(resource.RUSAGE_CHILDREN)}
+
+
+def live(folder: Path) -> Results:
+    """LIVE_S seconds followed while another process writes them as fast as they would be recorded."""
+    from recon.follow import follow
+
+    period, path = written(one_period(), folder), folder / "growing.h5"
+    with Recording.open(period) as one:
+        short = folder / "short.h5"
+        repeated(one, PERIOD).write(short)
+    follow(short, folder / "warm", Options(), frame_time=FRAME_S / 2, quiet_time=0.1)
+    writer = multiprocessing.get_context("spawn").Process(target=record, args=(period, path))
+    writer.start()
+    seen = follow(path, folder / "out", Options(), frame_time=FRAME_S, quiet_time=30.0)
+    writer.join()
+    told = seen.summary()
+    done = {"live.frames": seen.frames, "live.dropped": seen.dropped, "live.frame_s": seen.frame_s}
+    return done | {f"live.latency_{key}_s": told["latency_s"][key] for key in ("median", "max")}
+
+
+def record(period: Path, path: Path) -> None:
+    """Write a recording (HDF5, SWMR) in real time."""
+    with Recording.open(period) as one, h5py.File(path, "w", libver="latest") as file:
+        whole = repeated(one, round(LIVE_S * RATE))
+        file.attrs.update({"format": "lissajous-recording", "version": 1})
+        file.create_group("device").attrs["toml"] = whole.device_toml
+        group = file.create_group("channels")
+        for channel in whole.channels.values():
+            dataset = group.create_dataset(channel.name, (0,), np.int16, maxshape=(None,), chunks=(1 << 16,))
+            dataset.attrs.update({"unit": "V", "sample_rate": RATE, "gain": channel.gain})
+        file.swmr_mode = True
+        began = time.perf_counter()
+        there = 0
+        while there < round(LIVE_S * RATE):
+            stop = min(round((time.perf_counter() - began) * RATE), round(LIVE_S * RATE))
+            for channel in whole.channels.values():
+                group[channel.name].resize((stop,))
+                group[channel.name][there:stop] = channel.stored(there, stop)
+                group[channel.name].flush()
+            there = stop
+            time.sleep(WRITTEN_EVERY)
 
 
 def written(recording: Recording, folder: Path) -> Path:
@@ -170,7 +219,7 @@ def written(recording: Recording, folder: Path) -> Path:
 
 def main(wanted: list[str]) -> None:
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    for part in (disk, length, pixels, axes, longest):
+    for part in (disk, live, length, pixels, axes, longest):
         if not wanted or part.__name__ in wanted:
             print(f"{part.__name__} ...", file=sys.stderr)
             with tempfile.TemporaryDirectory() as folder:
