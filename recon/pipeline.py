@@ -32,7 +32,7 @@ from scanner.recording import Recording
 Array = NDArray[np.float64]
 
 AXES = ("x", "y")
-REGISTERED = 400  # periods of the slower axis that are registered at the most
+REGISTERED = 200  # periods of the slower axis that are registered at the most: as many as a scan of 60 ms has
 CHUNK = 1 << 20  # samples mapped at a time
 
 
