@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recon.convert import open_any
 from recon.output import replacing_folder
 from scanner.device import Device
+from scanner.recording import Recording
+
+if TYPE_CHECKING:
+    from estimation.mismatch.diagnosis import Diagnosis
+
+Progress = Callable[[str], None]
 
 
 def diagnose_files(
@@ -32,7 +39,6 @@ def diagnose_files(
     """
     from tqdm import tqdm
 
-    from estimation.mismatch.diagnosis import diagnose
     from recon.diagnosis_report import diagnosis_report
     from scanner.terms import register
 
@@ -43,7 +49,7 @@ def diagnose_files(
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = Device.load(device) if device is not None else None
         with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
-            diagnosis = diagnose(recordings, nominal, bar.set_description_str)
+            diagnosis = diagnose_all(recordings, nominal, bar.set_description_str)
         content = diagnosis.to_json()
         names = [recording.name for recording in recordings]
         with replacing_folder(output) as folder:
@@ -53,3 +59,50 @@ def diagnose_files(
             (folder / "device.toml").write_text(diagnosis.device.to_toml(), encoding="utf-8")
             (folder / "report.html").write_text(diagnosis_report(diagnosis, names), encoding="utf-8")
     return content | {"output": str(output), "seconds": time.perf_counter() - began}
+
+
+def diagnose_all(
+    recordings: Sequence[Recording], device: Device | None = None, say: Progress = lambda text: None
+) -> Diagnosis:
+    """Drive to readout against the device, then the optics of every recording with an intensity against themselves.
+
+    A device that states no mechanics predicts no motion: of its recordings the optics alone are judged.
+
+    Raises:
+        BadInput: as ``estimation.mismatch.diagnosis.diagnose``.
+    """
+    from estimation.mismatch.diagnosis import Diagnosis, diagnose
+
+    nominal = device or recordings[0].device
+    pictures = [recording for recording in recordings if "intensity" in recording]
+    if nominal is None or not pictures or any(axis.mechanics for axis in nominal.axes.values()):
+        diagnosis = diagnose(recordings, device, say)
+    else:
+        diagnosis = Diagnosis("consistent", (), None, nominal, None)
+    for recording in pictures:
+        if set(diagnosis.device.axes) == {"x", "y"}:
+            say(f"optics of {recording.name}")
+            diagnosis = with_optics(diagnosis, recording)
+    return diagnosis
+
+
+def with_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:
+    """The diagnosis with what the picture of one recording says of the optics of the device as improved so far."""
+    from estimation.estimate import estimate
+    from recon.optics import judge_optics
+    from recon.undo import placed, with_light
+
+    device = diagnosis.device
+    lit = with_light(recording, device)
+    motion = placed(estimate(lit, device), device, lit.start)
+    judged = judge_optics(motion, lit["intensity"], device)
+    axes = {
+        name: replace(axis, terms={**axis.terms, **judged.terms.get(name, {})}) for name, axis in device.axes.items()
+    }
+    return replace(
+        diagnosis,
+        verdict="mismatch" if judged.findings else diagnosis.verdict,
+        findings=(*diagnosis.findings, *judged.findings),
+        device=replace(device, axes=axes),
+        optics=(*diagnosis.optics, {"recording": recording.name, "effects": judged.to_json()}),
+    )

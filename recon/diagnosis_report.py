@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from estimation.mismatch.diagnosis import Diagnosis, Finding
-from estimation.mismatch.search import Round
+from estimation.mismatch.search import Round, Search
 from estimation.mismatch.sensitivity import APART, visibility
 from recon import views
 from recon.report import Figure, Section, Table, render
@@ -24,12 +24,9 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     """One diagnosis as a page."""
     lead = f"{', '.join(names)}: {diagnosis.verdict}. {_headline(diagnosis)}"
     sections = [_overview(diagnosis), *(_finding_section(f, i) for i, f in enumerate(diagnosis.findings))]
-    sections.append(_residuals(diagnosis))
-    if diagnosis.search.rounds:
-        text = "Distances in -2 log evidence: 10 over nothing is certain, a lead of 6 over the next names alone."
-        rows = evidence_table(diagnosis.search.rounds)
-        sections.append(Section("Candidates", text, Table(["effect", "behind", "over nothing"], rows)))
-    sections += [_visible(diagnosis), _nominal(diagnosis)]
+    if diagnosis.search is not None:
+        sections += _motion_sections(diagnosis, diagnosis.search)
+    sections += [_optics(table) for table in diagnosis.optics]
     notes = [diagnosis.unexplained] if diagnosis.unexplained else []
     return render("Diagnosis", lead, sections, notes)
 
@@ -82,8 +79,31 @@ def _curve_figure(curve: Any) -> Figure:
     return _figure(draw, f"the law that the free correction measured, with its 95 % band; in short: {curve['formula']}")
 
 
-def _residuals(diagnosis: Diagnosis) -> Section:
-    found = diagnosis.search
+def _motion_sections(diagnosis: Diagnosis, found: Search) -> list[Section]:
+    """From the drive to the readout: what was compared with a prediction."""
+    sections = [_residuals(found)]
+    if found.rounds:
+        text = "Distances in -2 log evidence: 10 over nothing is certain, a lead of 6 over the next names alone."
+        rows = evidence_table(found.rounds)
+        sections.append(Section("Candidates", text, Table(["effect", "behind", "over nothing"], rows)))
+    return [*sections, _visible(found), _nominal(diagnosis)]
+
+
+def _optics(table: Mapping[str, Any]) -> Section:
+    """What the picture of one recording can tell of the optics."""
+    rows = [
+        [f"{e['effect']}, {e['axis']}", f"{e['sigma']:.1f}", "told" if e["told"] else "this recording cannot tell"]
+        for e in table["effects"]
+    ]
+    text = (
+        f"{table['recording']}: no picture is known beforehand, so samples of one place must agree, whenever and "
+        "whichever way the beam passed. Size of every effect of natural size, in standard deviations. A field that "
+        "bends, or a swing that is wrong, changes every picture alike: a known target is needed."
+    )
+    return Section("Optics", text, Table(["effect", "σ", ""], rows))
+
+
+def _residuals(found: Search) -> Section:
     figures = []
     first = 0
     for run, whiteners in zip(found.comparison.runs, found.comparison.whiteners, strict=True):
@@ -137,9 +157,9 @@ def _nominal(diagnosis: Diagnosis) -> Section:
     return Section("Nominal values", text, Table(["value", "pull"], rows))
 
 
-def _visible(diagnosis: Diagnosis) -> Section:
+def _visible(search: Search) -> Section:
     """The map of what these recordings can tell, as a picture."""
-    found = visibility(diagnosis.search.comparison, diagnosis.search.final, catalogue().values())
+    found = visibility(search.comparison, search.final, catalogue().values())
 
     def draw(axes: Axes) -> None:
         place = np.arange(len(found))

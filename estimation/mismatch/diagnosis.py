@@ -76,15 +76,17 @@ class Diagnosis:
         findings: in order of weight.
         unexplained: what is left in words, None where nothing is.
         device: improved: nominal values as fitted, terms added.
-        search: all fits behind it.
+        search: all fits behind it; None where the device states no mechanics that could be predicted.
+        optics: what the recordings with an intensity can tell of the optics, a table of each.
     """
 
     verdict: str
     findings: tuple[Finding, ...]
     unexplained: str | None
     device: Device
-    search: Search
+    search: Search | None
     nominal: Mapping[str, Any] = field(default_factory=dict)
+    optics: tuple[Mapping[str, Any], ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """The content of diagnosis.json."""
@@ -97,6 +99,7 @@ class Diagnosis:
             ],
             "unexplained": self.unexplained,
             "nominal": dict(self.nominal),
+            "optics": list(self.optics),
         }
 
 
