@@ -29,13 +29,13 @@ COLOURS = ("#2f6fb0", "#c8553d", "#3d8f5f", "#8a5fb0", "#b08a2f")
 def stretched(image: NDArray[Any], limits: tuple[float, float] | None = None) -> Array:
     """Values in [0, 1] between the 0.5 and 99.5 percentiles, or ``limits``; NaN stays, detectors are averaged."""
     values = np.asarray(image if image.ndim == 2 else image.mean(-1), np.float64)
-    low, high = limits or contrast(values)
+    low, high = limits or contrast(image)
     return np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0)
 
 
 def contrast(image: NDArray[Any]) -> tuple[float, float]:
-    """The 0.5 and 99.5 percentiles of the visited pixels."""
-    low, high = np.nanpercentile(image, [0.5, 99.5])
+    """The 0.5 and 99.5 percentiles of the visited pixels; detectors are averaged."""
+    low, high = np.nanpercentile(image if image.ndim == 2 else image.mean(-1), [0.5, 99.5])
     return float(low), float(high)
 
 

@@ -235,3 +235,15 @@ def test_trouble_is_marked_and_its_samples_have_no_place(result: Reconstruction)
     shown = marked(grey, affected)
     assert np.array_equal(shown[80:], grey[80:])
     assert np.all(shown[:80] == (np.array([0xE0, 0x8A, 0x1E]) + 100) // 2)
+
+
+def test_several_detectors_are_averaged(result: Reconstruction, data: dict) -> None:
+    intensity = imaging()[0]["intensity"]
+    values = intensity.read()
+    raw = np.stack([values + 0.3, values - 0.3], 1)
+    pair = replace(intensity, raw=raw, first=0, stop=values.size, gain=1.0, offset=0.0)
+    image = result.picture.image[..., None] + np.array([0.3, -0.3], np.float32)
+    several = sweeps(replace(result, picture=replace(result.picture, image=image)), pair)
+    codes, own = (unpacked(each["intensity"], np.uint8).astype(int) for each in (several, data))
+    assert np.abs(codes - own).max() <= 1
+    assert several["limits"] == pytest.approx(data["limits"], abs=0.1)
