@@ -19,16 +19,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from estimation.estimate import default_estimator, estimate
+from estimation.estimate import estimate
 from estimation.signals import device_of
 from estimation.tracker.angle import SlowAngle
 from recon import blur
 from recon.convert import open_any
 from recon.mapping import Grid, Picture
 from recon.output import check_folder, write_tiff
-from recon.pipeline import Options, field_of, mapped
+from recon.pipeline import Options, field_of, mapped, moved
 from recon.registration import slow_period
 from recon.trouble import samples, troubles, unknown
+from recon.undo import placed, with_light
 from recon.views import save_picture
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -176,16 +177,17 @@ def show(
     Raises:
         BadInput: no motion can be told there.
     """
+    device = device_of(recording, Device.load(options.device) if options.device else None)
     lead = BEFORE * slow_period(before.motion) if before else 0.0
-    part = recording.slice(start - lead, stop)
-    device = device_of(part, Device.load(options.device) if options.device else None)
-    motion = estimate(part, device, options.estimator or default_estimator(part, device), options.flips)
+    part = with_light(recording, device).slice(start - lead, stop)
+    motion, _ = moved(part, device, options)
     if before:
         motion = continued(motion, before.motion)
     grid = before.grid if before else field_of(device, motion, options)[0]
     intensity = part.require("intensity", "a picture needs it")
     begin = max(0, round((start - intensity.start) * intensity.sample_rate))
-    picture = mapped(motion, intensity, grid, samples(unknown(motion, troubles(part)), intensity), begin)
+    beam = placed(motion, device, recording.start)
+    picture = mapped(beam, intensity, grid, samples(unknown(motion, troubles(part)), intensity), begin)
     _replace_pictures(output, picture)
     return Shown(motion, grid)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -120,12 +120,9 @@ def reconstruct(
         intensity = recording["intensity"]
         for axis in AXES:
             device.axis(axis)
-        method = options.estimator or default_estimator(recording, device)
-        progress.set_postfix_str(f"{method} (compiled once, at the first run)")
-        motion = estimate(recording, device, method, options.flips)
-        motion, told_by_picture = refined(
-            recording, device, motion, intensity, field_of(device, motion, options)[0], options.flips
-        )
+        options = replace(options, estimator=options.estimator or default_estimator(recording, device))
+        progress.set_postfix_str(f"{options.estimator} (compiled once, at the first run)")
+        motion, told_of_motion = moved(recording, device, options)
         progress.update()
         progress.set_postfix_str("mapping")
         grid, notes = field_of(device, motion, options)
@@ -146,7 +143,7 @@ def reconstruct(
         progress.update()
         errors = {axis: axis_error(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles} if truth else {}
         progress.update()
-    notes += told_by_picture + list(motion.notes)
+    notes += told_of_motion
     for axis in AXES:
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
@@ -167,6 +164,14 @@ def reconstruct(
         recorded=intensity.size / intensity.sample_rate,
         name=recording.name,
     )
+
+
+def moved(recording: Recording, device: Device, options: Options) -> tuple[Motion, list[str]]:
+    """The estimator's motion, refined by the picture where that helps, and what a reader has to know of it."""
+    motion = estimate(recording, device, options.estimator, options.flips)
+    grid, _ = field_of(device, motion, options)
+    motion, notes = refined(recording, device, motion, recording["intensity"], grid, options.flips)
+    return motion, notes + list(motion.notes)
 
 
 def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
