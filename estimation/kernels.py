@@ -32,7 +32,7 @@ from numba import njit
 from estimation.model import axis_step, comb
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={{"arcp", "contract"}})
 def {name}(y, voltage, parameters, sections, measure, noise, x, P, theta, track, stats, stride):
 '''
 
@@ -57,7 +57,7 @@ def _assemble(name: str, axes: int, sections: int, body: list[str]) -> str:
         *(f"q{a}_{i} = noise[{a}, {i}]" for a in range(axes) for i in range(3)),
         *(f"x{i} = x[{i}]" for i in range(n)),
         *(f"p{i}_{j} = P[{i}, {j}]" for i in range(n) for j in range(i, n)),
-        "count, chi2, logdet = 0, 0.0, 0.0",
+        "count, chi2, logdet, spread = 0, 0.0, 0.0, 1.0",
         "for i in range(y.size):",
     ]
     tail = [
@@ -76,7 +76,7 @@ def _assemble(name: str, axes: int, sections: int, body: list[str]) -> str:
         *(f"P[{i}, {j}] = {symmetric('p', i, j)}" for i in range(n) for j in range(n)),
         "stats[0] += count",
         "stats[1] += chi2",
-        "stats[2] += logdet",
+        "stats[2] += logdet + math.log(spread) + count * math.log(R)",
     ]
     loop = [f"    {line}" for line in body + tail]
     return HEAD.format(name=name) + "\n".join(f"    {line}" for line in before + loop + after) + "\n"
@@ -97,7 +97,10 @@ def _noise(axes: int, sections: int) -> Matrix:
 
 
 def _gain_and_update(n: int, covariance: list[str], r: str) -> list[str]:
-    """Lines that weigh the innovation ``r`` in, given h{i} = (P H')_i and ``hph``."""
+    """Lines that weigh the innovation ``r`` in, given h{i} = (P H')_i and ``hph``.
+
+    The innovations' variances over R, all above 1, are multiplied together: one logarithm for many of them.
+    """
     return [
         f"r = {r}",
         "if r == r:",
@@ -105,10 +108,14 @@ def _gain_and_update(n: int, covariance: list[str], r: str) -> list[str]:
             f"    {line}"
             for line in [
                 "S = hph + R",
+                "weight = 1.0 / S",
                 "count += 1",
-                "chi2 += r * r / S",
-                "logdet += math.log(S)",
-                *(f"k{i} = h{i} / S" for i in range(n)),
+                "chi2 += r * r * weight",
+                "spread *= S / R",
+                "if spread > 1e150:",
+                "    logdet += math.log(spread)",
+                "    spread = 1.0",
+                *(f"k{i} = h{i} * weight" for i in range(n)),
                 *(f"x{i} += k{i} * r" for i in range(n)),
                 *covariance,
             ]

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from scanner.errors import BadInput
 
+BLOCK = 256  # samples whose pixels are found before they are added up
+OUTSIDE = 1 << 29  # beyond every index, and twice it is an int32 still
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -27,7 +30,7 @@ class Grid:
         metres_per_radian: by which the beam moves over the sample [m/rad]; None where it is not known.
 
     Raises:
-        BadInput: a size or an angle that is not positive and finite.
+        BadInput: a size or an angle that is not positive and finite, or more pixels than an index counts.
     """
 
     width: int
@@ -39,6 +42,8 @@ class Grid:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint="give at least 1x1")
+        if self.width * self.height >= OUTSIDE:
+            raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint=f"give fewer than {OUTSIDE}")
         if not all(math.isfinite(half) and half > 0 for half in (self.half_angle_x, self.half_angle_y)):
             raise BadInput(
                 f"half angles of {self.half_angle_x} and {self.half_angle_y} rad", hint="give positive, finite angles"
@@ -93,26 +98,53 @@ def pixel_index(angle: NDArray[Any] | float, half_angle: float, n: int) -> NDArr
     return _pixels(angle, half_angle, n)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def block_pixels(angles, half_angle, n, stride, out):  # type: ignore[no-untyped-def]
+    """``stride`` times the pixels of a block, OUTSIDE outside the field: `pixel_of` without a branch, for SIMD."""
+    for i in range(angles.size):
+        position = angles[i] / half_angle
+        pixel = max(math.ceil(0.5 * n * (position + 1.0)) - 1.0, 0.0)
+        out[i] = np.int32(pixel * stride) if abs(position) <= 1.0 else np.int32(OUTSIDE)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def add_block(columns, index, values, sums, counts):  # type: ignore[no-untyped-def]
+    """Add a block to flat sums and counts; ``index`` holds the rows times the width and is written over."""
+    for i in range(values.size):  # apart from the adding up, so that it is done side by side
+        index[i] = index[i] + columns[i] if values[i] == values[i] else OUTSIDE
+    for i in range(values.size):
+        if index[i] < OUTSIDE:
+            pixel = np.uint32(index[i])
+            counts[pixel] += np.uint32(1)
+            sums[pixel] += values[i]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _accumulate(theta_x, theta_y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
+    height, width = counts.shape
+    flat_sums, flat_counts = sums.reshape(-1), counts.reshape(-1)
+    columns, index = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    for at in range(0, theta_x.size, BLOCK):
+        block_pixels(theta_x[at : at + BLOCK], half_x, width, 1.0, columns)
+        block_pixels(theta_y[at : at + BLOCK], half_y, height, float(width), index)
+        add_block(columns, index, intensity[at : at + BLOCK], flat_sums, flat_counts)
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate_detectors(theta_x, theta_y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
     height, width = counts.shape
     for i in range(theta_x.size):
         column = pixel_of(theta_x[i], half_x, width)
         row = pixel_of(theta_y[i], half_y, height)
         if column < 0 or row < 0:
             continue
-        if intensity.ndim == 1:  # decided when compiled: one detector runs at twice the speed of a loop over one
-            if not np.isnan(intensity[i]):
-                counts[row, column] += 1
-                sums[row, column] += intensity[i]
-        else:
-            whole = True
+        whole = True
+        for d in range(intensity.shape[1]):
+            whole = whole and not np.isnan(intensity[i, d])
+        if whole:
+            counts[row, column] += 1
             for d in range(intensity.shape[1]):
-                whole = whole and not np.isnan(intensity[i, d])
-            if whole:
-                counts[row, column] += 1
-                for d in range(intensity.shape[1]):
-                    sums[row, column, d] += intensity[i, d]
+                sums[row, column, d] += intensity[i, d]
 
 
 def accumulate(
@@ -153,7 +185,8 @@ def accumulate(
     counts = np.zeros(shape[:2], np.uint32) if counts is None else counts
     if sums.shape != shape or counts.shape != shape[:2]:
         raise BadInput(f"sums of shape {sums.shape} and counts of {counts.shape} where {shape} is needed")
-    _accumulate(theta_x, theta_y, intensity, grid.half_angle_x, grid.half_angle_y, sums, counts)
+    kernel = _accumulate if intensity.ndim == 1 else _accumulate_detectors
+    kernel(theta_x, theta_y, intensity, grid.half_angle_x, grid.half_angle_y, sums, counts)
     return sums, counts
 
 

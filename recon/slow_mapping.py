@@ -6,7 +6,6 @@ only the adding up is done one at a time. Counts equal those of ``mapping.accumu
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numba
@@ -14,19 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.tracker.angle import FINE, SEGMENT, SlowAngle, segment_angles
-from recon.mapping import Grid
+from recon.mapping import Grid, add_block, block_pixels
 from scanner.errors import BadInput
-
-OUTSIDE = 1 << 29  # beyond every index, and twice it is an int32 still
-
-
-@numba.njit(cache=True, error_model="numpy", inline="always")
-def _pixels(angles, half_angle, n, stride, out):  # type: ignore[no-untyped-def]
-    """``stride`` times the pixels of one segment: ``mapping.pixel_of`` without a branch, OUTSIDE outside the field."""
-    for i in range(SEGMENT):
-        position = angles[i] / half_angle
-        pixel = max(math.ceil(0.5 * n * (position + 1.0)) - 1.0, 0.0)
-        out[i] = np.int32(pixel * stride) if abs(position) <= 1.0 else np.int32(OUTSIDE)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -37,17 +25,10 @@ def _accumulate(x, y, intensity, half_x, half_y, sums, counts):  # type: ignore[
     flat_sums, flat_counts = sums.reshape(-1), counts.reshape(-1)
     for s in range(x[0].size):
         segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, angles)
-        _pixels(angles, half_x, width, 1.0, columns)
+        block_pixels(angles, half_x, width, 1.0, columns)
         segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, angles)
-        _pixels(angles, half_y, height, float(width), index)
-        values = intensity[s * SEGMENT : (s + 1) * SEGMENT]
-        for i in range(values.size):  # apart from the adding up, so that it is done side by side
-            index[i] = index[i] + columns[i] if values[i] == values[i] else OUTSIDE
-        for i in range(values.size):
-            if index[i] < OUTSIDE:
-                pixel = np.uint32(index[i])
-                flat_counts[pixel] += np.uint32(1)
-                flat_sums[pixel] += values[i]
+        block_pixels(angles, half_y, height, float(width), index)
+        add_block(columns, index, intensity[s * SEGMENT : (s + 1) * SEGMENT], flat_sums, flat_counts)
 
 
 def accumulate_slow(

@@ -8,7 +8,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import binned_statistic_2d
 
 from recon.coverage import fill_against_time, time_for_fill
-from recon.mapping import Grid, Picture, accumulate, fill_factor, fill_holes, map_samples, mean_picture, pixel_index
+from recon.mapping import (
+    BLOCK,
+    Grid,
+    Picture,
+    accumulate,
+    fill_factor,
+    fill_holes,
+    map_samples,
+    mean_picture,
+    pixel_index,
+)
 from scanner.errors import BadInput
 
 patient = settings(deadline=None)  # the first call of a kernel compiles it
@@ -18,7 +28,7 @@ patient = settings(deadline=None)  # the first call of a kernel compiles it
 def scans(draw, detectors=()):
     """A grid and samples inside, outside and exactly on the edges of its pixels, some of them NaN."""
     grid = Grid(draw(st.integers(1, 9)), draw(st.integers(1, 9)), draw(st.sampled_from([0.16, 0.25, 1.0])), 0.5)
-    n = draw(st.integers(0, 60))
+    n = draw(st.integers(0, 2 * BLOCK + 60))  # from none to two blocks and a part
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     theta = []
     for pixels, half in ((grid.width, grid.half_angle_x), (grid.height, grid.half_angle_y)):
@@ -121,6 +131,8 @@ def test_samples_and_grids_that_make_no_picture_are_refused():
         accumulate(np.zeros(3), np.zeros(3), np.zeros(3), grid, np.zeros((4, 5)), np.zeros((4, 5), np.uint32))
     with pytest.raises(BadInput, match="0x4 pixels"):
         Grid(0, 4, 1.0, 1.0)
+    with pytest.raises(BadInput, match="30000x30000 pixels"):
+        Grid(30_000, 30_000, 1.0, 1.0)
     with pytest.raises(BadInput, match="positive, finite"):
         Grid(4, 4, np.nan, 1.0)
 
