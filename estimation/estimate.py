@@ -97,9 +97,8 @@ def estimate(
     method = method or default_estimator(recording, device)
     if method not in ESTIMATORS:
         raise BadInput(f"no estimator is named {method!r}", hint=f"there are {', '.join(ESTIMATORS)}")
-    run = ESTIMATORS[method][1]
-    if any(axis.terms for axis in device.axes.values()):
-        motion = estimate_with_terms(recording, device, run, modelled=method not in MEASURED)
-    else:
-        motion = run(recording, device)
-    return settle_signs(motion, recording, flips or {})
+
+    def run(recording: Recording, device: Device) -> Motion:
+        return settle_signs(ESTIMATORS[method][1](recording, device), recording, flips or {})
+
+    return estimate_with_terms(recording, device, run, modelled=method not in MEASURED)

@@ -69,7 +69,7 @@ class Swing:
 
 
 def estimate_with_terms(recording: Recording, device: Device, run: Estimator, modelled: bool = True) -> Motion:
-    """The motion by ``run``, an estimator that knows nominal devices only, of a device with terms.
+    """The motion by ``run``, an estimator that knows nominal devices only, of a device that may have terms.
 
     Args:
         modelled: its angle is that of a model; False where it is a sensor's, with whatever harmonics there are.
@@ -78,6 +78,8 @@ def estimate_with_terms(recording: Recording, device: Device, run: Estimator, mo
         BadInput: a term that nobody knows, or as ``run``.
     """
     added = {name: added_terms(axis) for name, axis in device.axes.items()}
+    if not any(added.values()):
+        return run(recording, device)
     bare = folded(device, added)
     left: Left = {name: tuple(_left(each, bare.sensed_axis(name)) for each in terms) for name, terms in added.items()}
     told = with_drives(with_clocks(recording, added), device, added)
