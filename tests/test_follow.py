@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+import wholes
 from worlds import imaging
 
 from recon.cli import main
@@ -178,3 +180,35 @@ def test_signs_go_on_from_frame_to_frame() -> None:
         for name in "xy":
             straight = first.axes[name].angle.motion.at(np.array([0.0101]))[0]
             assert np.cos(motion.axes[name].angle.motion.at(np.array([0.0101]))[0] - straight) > 0.9
+
+
+def test_an_instruments_file_that_grows_is_followed_through_its_mapping(tmp_path: Path) -> None:
+    wholes.recording(tmp_path / "whole.h5")
+    names = ("sense_x", "sense_y", "intensity")
+    with Recording.open(tmp_path / "whole.h5") as recording:
+        table = np.stack([recording["sense_x"].time(), *(recording[name].read() for name in names)], axis=1)
+        assert recording.device_toml is not None
+        device = re.sub(r"^\[", "[device.", recording.device_toml, flags=re.MULTILINE)
+    channels = (f'[channels.{name}]\nvariable = "{k + 1}"\nunit = "V"\n' for k, name in enumerate(names))
+    (tmp_path / "map.toml").write_text("".join(channels) + device, encoding="utf-8")
+    path = tmp_path / "scope.csv"
+
+    def write() -> None:
+        with path.open("w", encoding="utf-8") as file:
+            file.write("x-axis,1,2,3\nsecond,Volt,Volt,Volt\n")
+            for part in np.array_split(table, 4):
+                np.savetxt(file, part, "%.9g", delimiter=",")
+                file.flush()
+                time.sleep(0.3)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    mapping = ["--mapping", str(tmp_path / "map.toml")]
+    arguments = [*mapping, "--frame-time", "0.005", "--quiet-time", "1", *PIXELS]
+    assert main(["reconstruct", "--follow", str(path), "-o", str(tmp_path / "live"), *arguments]) == 0
+    writer.join()
+    assert main(["reconstruct", str(path), "-o", str(tmp_path / "offline"), *mapping, *PIXELS]) == 0
+    live = json.loads((tmp_path / "live" / "summary.json").read_text())["live"]
+    assert live["frames"] >= 1
+    assert live["frames"] + live["dropped"] == 4
+    same(tmp_path / "live", tmp_path / "offline")

@@ -1,12 +1,16 @@
 """Recordings with trouble that can be lived with: reconstructed, the trouble named, the pixels marked."""
 
 import json
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
 from worlds import imaging, separate_electrodes
 
 from recon.cli import main
@@ -126,3 +130,20 @@ def test_ranges() -> None:
     intensity = imaging()[0]["intensity"]
     assert samples([(0.01, 0.02), (-1.0, 1e-6), (0.0, 2e-6), (0.03, 0.04)], intensity) == [(0, 10), (50_000, 100_000)]
     assert without([(0, 10), (20, 30)], [(5, 22), (28, 29)]) == [(0, 5), (22, 28), (29, 30)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), max_size=6), st.integers(0, 2**32 - 1))
+def test_ranges_are_sets_of_samples(pairs: list[tuple[int, int]], seed: int) -> None:
+    intensity = imaging()[0]["intensity"]
+    others = np.random.default_rng(seed).integers(0, 41, (3, 2)).tolist()
+
+    def of_seconds(given: Iterable[Sequence[int]]) -> list[tuple[int, int]]:
+        return samples([(min(each) / RATE, max(each) / RATE) for each in given], intensity)
+
+    def members(ranges: list[tuple[int, int]]) -> set[int]:
+        return {i for first, stop in ranges for i in range(first, stop)}
+
+    a, b = of_seconds(pairs), of_seconds(others)
+    assert members(a) == {i for each in pairs for i in range(min(each), max(each))}
+    assert members(without(a, b)) == members(a) - members(b)
+    assert all(one[1] < two[0] for one, two in pairwise(a))
