@@ -1,7 +1,7 @@
 """`make bench`: how fast the parts are, each as a ratio to a named alternative in the same run.
 
-Writes benchmarks/results.json. These machines are noisy: every figure is the best of several repeats, and a ratio's two
-sides are measured in turn.
+Writes benchmarks/results.json; `speed.py filters mapping` measures these again and keeps the rest. These machines are
+noisy: every figure is the best of several repeats, in processor time but for the whole command.
 """
 
 from __future__ import annotations
@@ -14,61 +14,84 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numba
 import numpy as np
 from scipy.stats import binned_statistic_2d
 
 from estimation.filters import prepare, run_compiled
+from estimation.reference import absolute
 from estimation.reference_filters import run_reference
 from estimation.tracker import track
+from estimation.tracker.angle import SlowAngle, SlowMotion
 from phantoms.experiment import Experiment, run
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.mapping import Grid, accumulate, pixel_index
 from recon.slow_mapping import accumulate_slow
 from scanner import devices
+from scanner.device import Amdm
 
 RESULTS = Path(__file__).with_name("results.json")
 REFERENCE_STEPS = 1500
 DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
 
 
-def best(function: Callable[[], object], repeats: int = 5) -> float:
-    """Shortest time of several calls, after one that compiles [s]."""
+def best(function: Callable[[], object], repeats: int = 5, clock: Callable[[], float] = time.process_time) -> float:
+    """Shortest time of several calls, after one that compiles [s]; the processor's own, whatever else it has to do."""
     function()
     times = []
     for _ in range(repeats):
-        began = time.perf_counter()
+        began = clock()
         function()
-        times.append(time.perf_counter() - began)
+        times.append(clock() - began)
     return min(times)
 
 
 def filters() -> dict[str, float]:
-    """Compiled against filterpy, one axis of chen2020's scanner behind its two low-pass sections (4 states)."""
-    plan = Plan({"x": Sine(31400.0, 30.0, 30.0)}, 0.06)
-    recording, _ = simulate(devices.load("chen2020-driven"), plan)
-    problem = prepare(recording, recording.device)[0]
+    """Compiled against filterpy: the papers' state [theta, theta'], and chen2020's two low-pass sections beside it."""
+    device = devices.load("chen2020-driven")
+    readout = device.axis("x").require_readout()
+    assert isinstance(readout, Amdm)
+    bare = replace(device, axes={"x": replace(device.axis("x"), readout=replace(readout, lpf_hz=()))})
     heights = np.array([1e14])
     results = {}
-    for name in ("ekf", "ukf"):
-        compiled = (problem.signal.size - 1) / best(lambda name=name: run_compiled(problem, name, heights))
-        slow = (REFERENCE_STEPS - 1) / best(lambda name=name: run_reference(problem, name, heights, REFERENCE_STEPS), 3)
-        results |= {f"{name}.steps_per_s": compiled, f"{name}.ratio_filterpy": compiled / slow}
+    for state, world in (("", bare), (".with_sections", device)):
+        recording, _ = simulate(world, Plan({"x": Sine(31400.0, 30.0, 30.0)}, 0.06))
+        problem = prepare(recording, world)[0]
+        for name in ("ekf", "ukf"):
+            compiled = (problem.signal.size - 1) / best(partial(run_compiled, problem, name, heights))
+            reference = best(partial(run_reference, problem, name, heights, REFERENCE_STEPS), 3)
+            slow = (REFERENCE_STEPS - 1) / reference
+            results |= {f"{name}{state}.steps_per_s": compiled, f"{name}{state}.ratio_filterpy": compiled / slow}
     return results
 
 
+def steady(frequency: float, phase: float, size: int) -> SlowAngle:
+    """A steady motion of 0.185 rad with the small odd harmonics that a parametric drive adds."""
+    time = np.linspace(0.0, size / 5e6, 1000)
+    still, lines = np.zeros(time.size), np.tile([-1j, 1e-3, 1e-5j], (time.size, 1))
+    reference = absolute(frequency, time[0], time[-1])
+    slow = SlowMotion(reference, time, still + phase, still, still + np.log(0.185), still, lines)
+    return SlowAngle(slow, 5e6, 0.0, size)
+
+
 def mapping() -> dict[str, float]:
-    """A second of samples to 400 x 400, against np.bincount with indexing and scipy's binned_statistic_2d."""
-    t = np.arange(5_000_000) / 5e6
-    x, y = 0.185 * np.sin(2 * np.pi * 13840 * t), 0.185 * np.sin(2 * np.pi * 3270 * t + 1.0)
-    intensity = np.random.default_rng(0).random(t.size)
+    """A second of samples to 400 x 400, from the slow motion and from angles, against numpy's and scipy's ways.
+
+    np.bincount with indexing and binned_statistic_2d are given the angles; the slow motion makes its own.
+    """
+    size = 5_000_000
+    slow_x, slow_y = steady(13840.0, 0.0, size), steady(3270.0, 1.0, size)
+    x, y = slow_x.values, slow_y.values
+    intensity = np.random.default_rng(0).random(size).astype(np.float32)
     grid = Grid(400, 400, 0.18, 0.18)
-    own = best(lambda: accumulate(x, y, intensity, grid))
 
     def bincount() -> np.ndarray:
         column, row = pixel_index(x, 0.18, 400), pixel_index(y, 0.18, 400)
@@ -78,33 +101,46 @@ def mapping() -> dict[str, float]:
         np.bincount(index, intensity[inside], minlength=160_000)
         return counts
 
+    counts = bincount().reshape(400, 400)
+    for own in (accumulate(x, y, intensity, grid)[1], accumulate_slow(slow_x, slow_y, 0, intensity, grid)[1]):
+        if not np.array_equal(counts, own):
+            raise AssertionError("np.bincount counts otherwise")
+    column, row = pixel_index(x, 0.18, 400), pixel_index(y, 0.18, 400)
+    index = np.where((column >= 0) & (row >= 0), row * 400 + column, 0).astype(np.int32)
+    sums, visits = np.zeros(160_000), np.zeros(160_000, np.uint32)
     edges = np.linspace(-0.18, 0.18, 401)
-    counts = accumulate(x, y, intensity, grid)[1]
-    if not np.array_equal(bincount().reshape(400, 400), counts):
-        raise AssertionError("np.bincount counts otherwise")
-    binned = best(lambda: binned_statistic_2d(y, x, intensity, "sum", [edges, edges]), 1)
-    return {
-        "mapping.samples_per_s": t.size / own,
-        "mapping.ratio_bincount": best(bincount, 3) / own,
-        "mapping.ratio_binned_statistic_2d": binned / own,
+    seconds = {
+        "samples": best(lambda: accumulate(x, y, intensity, grid)),
+        "slow_samples": best(lambda: accumulate_slow(slow_x, slow_y, 0, intensity, grid)),
+        "scatter_samples": best(lambda: scatter(index, intensity, sums, visits)),
+        "bincount": best(bincount, 3),
+        "binned": best(lambda: binned_statistic_2d(y, x, intensity, "sum", [edges, edges]), 1),
     }
+    return {
+        **{f"mapping.{key}_per_s": size / seconds[key] for key in ("samples", "slow_samples", "scatter_samples")},
+        "mapping.ratio_bincount": seconds["bincount"] / seconds["samples"],
+        "mapping.ratio_binned_statistic_2d": seconds["binned"] / seconds["samples"],
+        "mapping.slow_ratio_bincount": seconds["bincount"] / seconds["slow_samples"],
+        "mapping.slow_ratio_binned_statistic_2d": seconds["binned"] / seconds["slow_samples"],
+    }
+
+
+@numba.njit
+def scatter(index, values, sums, counts):  # type: ignore[no-untyped-def]
+    """The least that any mapping has to do: add values whose pixels are known."""
+    for i in range(index.size):
+        pixel = np.uint32(index[i])
+        counts[pixel] += np.uint32(1)
+        sums[pixel] += values[i]
 
 
 def tracker() -> dict[str, float]:
-    """Tracker over two axes on one electrode, a second of it; mapping from its slow motion; the machine's memory."""
+    """Tracker over two axes on one electrode, a second of it; the machine's memory."""
     recording, _ = simulate(devices.load("imaging"), Plan(DRIVES, 1.0))
-    motion = track(recording, recording.device)
     size = recording["sense"].size
     seconds = best(lambda: track(recording, recording.device), 2)
-    x, y = (motion.axes[axis].angle for axis in "xy")
-    intensity = np.random.default_rng(0).random(size).astype(np.float32)
-    grid = Grid(400, 400, 0.18, 0.18)
     block = np.ones(50_000_000)
-    return {
-        "tracker.samples_per_s": size / seconds,
-        "mapping.slow_samples_per_s": size / best(lambda: accumulate_slow(x, y, 0, intensity, grid)),
-        "memory.read_gb_per_s": block.nbytes / best(block.sum) / 1e9,
-    }
+    return {"tracker.samples_per_s": size / seconds, "memory.read_gb_per_s": block.nbytes / best(block.sum) / 1e9}
 
 
 def pipeline() -> dict[str, float]:
@@ -114,17 +150,19 @@ def pipeline() -> dict[str, float]:
         recording, truth = run(Experiment(), seed=1)
         recording.write(scan, truth)
         command = [sys.executable, "-m", "recon", "reconstruct", str(scan), "-o", f"{folder}/out"]
-        wall = best(lambda: subprocess.run(command, check=True, capture_output=True), 3)
+        wall = best(lambda: subprocess.run(command, check=True, capture_output=True), 3, time.perf_counter)
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     return {"reconstruct.seconds": wall, "reconstruct.realtime_factor": 0.06 / wall, "reconstruct.peak_memory_mb": peak}
 
 
 def main() -> None:
-    results: dict[str, float] = {}
     # The pipeline first: the peak memory of a child counts what its parent held when it was forked.
-    for part in (pipeline, filters, mapping, tracker):
-        print(f"{part.__name__} ...", file=sys.stderr)
-        results |= part()
+    parts = {part.__name__: part for part in (pipeline, filters, mapping, tracker)}
+    wanted = sys.argv[1:] or list(parts)
+    results: dict[str, float] = {} if wanted == list(parts) else json.loads(RESULTS.read_text())
+    for name in wanted:
+        print(f"{name} ...", file=sys.stderr)
+        results |= parts[name]()
     RESULTS.write_text(json.dumps({key: float(f"{value:.4g}") for key, value in results.items()}, indent=1) + "\n")
     for key, value in results.items():
         print(f"{key:36} {value:14.4g}")
