@@ -16,7 +16,6 @@ from scanner.errors import BadInput
 from scanner.laws import amdm_voltage, capacitance, capacitance_slope, position_voltage, transimpedance_voltage
 from scanner.lowpass import lowpass, step_coefficients
 from scanner.terms import STAGES, Term, View, catalogue, shifted
-from scanner.trajectory import Bell, Torque, integrate
 
 Array = NDArray[np.float64]
 _NOTHING = np.empty(0)
@@ -139,6 +138,8 @@ def move(
         start: angle [rad] and rate [rad/s] at the first sample.
         other: angle of the other axis, shape (n, 3) [rad].
     """
+    from scanner.trajectory import Bell, Torque, integrate  # its kernels take half a second to load
+
     axis = with_constants(axis, added)
     voltage = pulling(axis, added, inputs)
     torques = [Torque(each.term.torque, each.values, each.hidden) for each in added if each.term.torque is not None]
@@ -262,6 +263,8 @@ def _comb_slope(path: Path) -> Array:
 
 
 def _extra(path: Path, derivative: int) -> Array | float:
+    from scanner.trajectory import Bell
+
     bells = [Bell(each.term.bell, each.values) for each in path.added if each.term.bell is not None]
     return sum((bell.along(path.angle, path.axis)[derivative] for bell in bells), start=0.0)
 
