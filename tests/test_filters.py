@@ -11,7 +11,7 @@ from estimation import estimate as registry
 from estimation.estimate import estimate
 from estimation.filters import PRINTED_TORQUE_NOISE, follow, prepare, run_compiled, torque_noise, tuned_heights
 from estimation.model import axis_step
-from estimation.reference_filters import measurement, process, process_jacobian, run_reference
+from estimation.reference_filters import measurement, measurement_jacobian, process, process_jacobian, run_reference
 from phantoms.forward import Plan, Start, simulate
 from phantoms.waveforms import Constant, Multisine, Sine
 from recon.score import axis_error
@@ -83,6 +83,23 @@ def test_compiled_ekf_equals_filterpy_over_a_whole_recording() -> None:
     problem = prepare(recording, recording.device)[0]
     states, _ = run_reference(problem, "ekf", HEIGHTS[:1])
     assert np.abs(run_compiled(problem, "ekf", HEIGHTS[:1]).theta[0] - states[:, 0]).max() < 1e-9
+
+
+def test_likelihood_gathers_the_logarithm_of_every_innovation_variance() -> None:
+    recording, _ = separate_electrodes(duration=0.003)
+    problem = prepare(recording, recording.device)[0]
+    model, heights, v = problem.model, np.array([1e20]), problem.voltage
+    q11, q12, q22 = torque_noise(model, heights)[0]
+    Q = np.diag([q11, q22, *[model.section_noise] * len(model.sections)])
+    Q[0, 1] = Q[1, 0] = q12
+    n, logs = 2000, []
+    states, covariances = run_reference(problem, "ekf", heights, n)
+    for i in range(1, n):
+        F = process_jacobian(model, states[i - 1], v[:, i - 1], v[:, i])
+        H = measurement_jacobian(model, process(model, states[i - 1], v[:, i - 1], v[:, i]))
+        logs.append(np.log((H @ (F @ covariances[i - 1] @ F.T + Q) @ H.T)[0, 0] + model.noise_var))
+    assert np.sum(logs) - (n - 1) * np.log(model.noise_var) > np.log(1e150)  # past where the product is taken apart
+    assert run_compiled(problem, "ekf", heights, n).logdet == pytest.approx(np.sum(logs), rel=1e-9)
 
 
 def test_jacobian_is_the_derivative_of_the_process() -> None:
