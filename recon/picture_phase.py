@@ -17,7 +17,7 @@ from estimation.steady import settle_signs
 from estimation.tracker import PhaseSeen, track
 from estimation.tracker.driven import drive_only
 from recon.mapping import Grid
-from recon.registration import PhaseError, registered, slow_period
+from recon.registration import SLICE, PhaseError, registered, slow_period
 from scanner.channel import Channel
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 AXES = ("x", "y")
 REGISTERED = 800  # periods of the slower axis that share one picture
 ROUNDS = 6
-REST = 0.2  # of its standard deviation: a phase that moves less has come to rest
+REST = 0.5  # of its least standard deviation: a phase that moves less has come to rest
 FINE = 0.1  # pixels at the middle of a line: a sense signal that tells the phase so well needs no help
 Smoother = Callable[[Mapping[str, PhaseSeen]], Motion]
 
@@ -40,8 +40,8 @@ def refined(
     """The motion with the phases that the picture shows, and a line for each axis on what it showed.
 
     Axes whose sense signal tells their phase to a tenth of a pixel stay as they are, and so do the motions of other
-    estimators than ``tracker`` and ``picture``. Where it tells less, the sense signal and the drive alone are each
-    smoothed together with the picture's phases, and what then knows an axis better is taken.
+    estimators than ``tracker`` and ``picture``. Where it tells less, the picture's phases are smoothed with it; where it
+    tells less than drive and picture do, without it.
 
     Args:
         motion: as ``estimate`` gave it with these ``flips``.
@@ -51,13 +51,15 @@ def refined(
     smoothers = _smoothers(recording, device, motion.estimator) if helped else {}
     if not smoothers:
         return motion, []
+    alone = {name: _rms(motion.axes[name].phase_sd) for name in helped}
     rounds, rest = 0, False
     by: dict[str, str] = {}
     while rounds < ROUNDS and not rest:
-        errors = registered(motion, intensity, grid, windows(motion, intensity))
+        # At first amplitudes are wrong too and change: what is taken at different times then shares no picture.
+        errors = registered(motion, intensity, grid, windows(motion, intensity, REGISTERED if rounds else SLICE))
         seen = {name: _seen(errors, motion.axes[name], name, flips.get(name, False)) for name in helped}
         found = {way: settle_signs(smooth(seen), recording, flips) for way, smooth in smoothers.items()}
-        by = {name: min(found, key=lambda way: _rms(found[way].axes[name].phase_sd)) for name in helped}
+        by = {name: _better(found, name, alone[name]) for name in helped}
         before, motion = motion, replace(motion, axes={**motion.axes, **{n: found[by[n]].axes[n] for n in helped}})
         rounds, rest = rounds + 1, all(_rests(before.axes[name], motion.axes[name]) for name in helped)
     told = {name: int(np.isfinite(seen[name].sd).sum()) for name in helped}
@@ -80,10 +82,10 @@ def _smoothers(recording: Recording, device: Device, estimator: str) -> dict[str
     return found
 
 
-def windows(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
-    """Samples (first, stop) of parts of the scan, each of which makes one picture; together all of it."""
-    longest = REGISTERED * slow_period(motion) * intensity.sample_rate
-    edges = np.linspace(0, intensity.size, int(np.ceil(intensity.size / longest)) + 1).round().astype(int)
+def windows(motion: Motion, intensity: Channel, periods: int) -> list[tuple[int, int]]:
+    """Samples (first, stop) of parts of the scan, of about so many periods of the slower axis at the most."""
+    parts = max(1, round(intensity.size / intensity.sample_rate / slow_period(motion) / periods))
+    edges = np.linspace(0, intensity.size, parts + 1).round().astype(int)
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
@@ -98,6 +100,13 @@ def _seen(errors: list[PhaseError], axis: AxisMotion, name: str, turned: bool) -
     return PhaseSeen(axis.time[nearest], own + value, sd)
 
 
+def _better(found: Mapping[str, Motion], name: str, alone: float) -> str:
+    """What to smooth an axis with, which the sense signal alone leaves with a standard deviation of ``alone`` [rad]."""
+    if "picture" in found and _rms(found["picture"].axes[name].phase_sd) < alone:
+        return "picture"
+    return "tracker" if "tracker" in found else "picture"
+
+
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
@@ -105,7 +114,7 @@ def _rms(values: Array) -> float:
 def _rests(before: AxisMotion, after: AxisMotion) -> bool:
     if before.time.size != after.time.size:  # the one smoother's blocks took over from the other's
         return False
-    return _rms(after.phase - before.phase) < REST * _rms(after.phase_sd)
+    return _rms(after.phase - before.phase) < REST * float(after.phase_sd.min())
 
 
 def _note(name: str, told: int, slices: int, unheard: bool) -> str:
