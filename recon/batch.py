@@ -12,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from recon.executors import executor_of
 from recon.output import check_folder, finite, replacing_folder, write_json
@@ -59,7 +60,7 @@ def reconstruct_files(
         rows: dict[Path, Row] = {}
         try:
             for job in tqdm(as_completed(jobs), "reconstruct", len(jobs), unit="recording", file=sys.stderr):
-                rows[jobs[job]] = _row(job)
+                rows[jobs[job]] = _row(job, jobs[job])
         except KeyboardInterrupt:
             why = f"interrupted; {len(rows)} of {len(paths)} recordings are done"
             raise InterruptedError(errno.EINTR, why, str(output)) from None
@@ -94,11 +95,11 @@ def _one(path: Path, folder: Path, options: Options, mapping: Path | None) -> Ro
     return {"failed": None} | {key: summary[key] for key in KEPT}
 
 
-def _row(job: Any) -> Row:
+def _row(job: Any, path: Path) -> Row:
     try:
         return job.result()
     except (BrokenProcessPool, CancelledError) as error:
-        return {"failed": f"its worker was killed (out of memory?): {error}", "exit": 1}
+        return {"failed": f"{path}: its worker was killed (out of memory?): {error}", "exit": 1}
 
 
 def _folders(paths: Sequence[Path], output: Path) -> list[Path]:
@@ -124,15 +125,16 @@ def _page(summary: Mapping[str, Any]) -> str:
             f"{each['fill']:.1%}",
             *(f"{each['within_bound'][axis]:.1%}" for axis in AXES),
             *(f"{each['phase_sd_deg'][axis]:.4f}" for axis in AXES),
-            f"{len(each['trouble'])} stretches" if each["trouble"] else "none",
+            str(len(each["trouble"])),
         ]
         for each in done
     ]
-    pictures = [Figure(f"{name}/image.png", name) for name in (Path(each["output"]).name for each in done)]
+    names = [Path(each["output"]).name for each in done]
+    pictures = [Figure(f"{quote(name)}/image.png", name, f"{quote(name)}/report.html") for name in names]
     sections = [
-        Section("Recordings", "The report of each stands in its folder.", Table([*heads, "trouble"], rows)),
-        Section("Pictures", figures=pictures, pixelated=True),
+        Section("Recordings", "", Table([*heads, "stretches of trouble"], rows)),
+        Section("Pictures", "Each leads to its report.", figures=pictures, pixelated=True),
     ]
     lead = f"{len(done)} of {len(summary['recordings'])} recordings reconstructed in {summary['seconds']:.1f} s."
-    failed = [f"{each['recording']}: {each['failed']}" for each in summary["recordings"] if each["failed"]]
+    failed = [each["failed"] for each in summary["recordings"] if each["failed"]]
     return render("Reconstructions", lead, sections, failed)

@@ -17,10 +17,15 @@ from scanner.channel import Channel
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture in a data URI with its caption, which is its text for those who cannot see it too."""
+    """A picture in a data URI with its caption, which is its text for those who cannot see it too.
+
+    Attributes:
+        page: that the caption leads to, none if empty.
+    """
 
     uri: str
     caption: str
+    page: str = ""
 
 
 @dataclass(frozen=True)

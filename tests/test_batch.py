@@ -47,7 +47,8 @@ def test_a_bad_one_is_named_and_stops_no_other(
     assert "blind.h5: intensity: is not in the recording" in summary["recordings"][2]["failed"]
     assert {path.name for path in out.iterdir()} == {"scan", "scan-2", "summary.json", "index.html"}
     page = (out / "index.html").read_text(encoding="utf-8")
-    assert "scan-2/image.png" in page
+    assert 'src="scan-2/image.png"' in page
+    assert 'href="scan-2/report.html"' in page
     assert "blind.h5" in page
     assert main(["reconstruct", str(scans[1]), "-o", str(tmp_path / "alone"), *GIVEN]) == 0
     for name in ("image.tif", "coverage.tif"):
