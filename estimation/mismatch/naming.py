@@ -88,7 +88,12 @@ def race(
         fits = []
         for model, x in running:
             best = min((fit.evidence for fit in fits if possible(fit)), default=np.inf)
-            fits.append(solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS))
+            fit = solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS)
+            if stop == stops[0] and fit.chi2 + fit.penalty > base.chi2 + base.penalty:
+                # Stuck: with one more law a fit cannot be worse. First order went too far; start where there is none.
+                x = model.embed(base.model, base.x)
+                fit = solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS)
+            fits.append(fit)
         fits.sort(key=lambda fit: fit.evidence if possible(fit) else np.inf)
         best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
         margin = max(60.0, 0.5 * (worst - best))
