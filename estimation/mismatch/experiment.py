@@ -311,10 +311,11 @@ def _scales(device: Device, name: str, inputs: Inputs, outputs: tuple[Output, ..
     line = strongest_line(voltage, 1 / inputs.step)
     resonance = 2 * np.pi * mechanics.resonance
     parametric = axis.drive is not None and axis.drive.kind == "electrostatic"
-    rate = np.pi * line if parametric and line else 2 * np.pi * line if line else resonance
-    if not 0.5 < rate / resonance < 2.0:
-        rate = resonance
     sensed = next((o for o in outputs if o.kind == "sense" and name in o.axes), outputs[0])
+    follows = not parametric and 0.8 < strongest_line(sensed.data, 1 / sensed.step) / (line or np.inf) < 1.25
+    rate = np.pi * line if parametric and line else 2 * np.pi * line if line else resonance
+    if not (0.5 < rate / resonance < 2.0 or (follows and rate < resonance)):  # a stage far below its resonance follows
+        rate = resonance
     measured = next((o.data for o in outputs if o.name == f"angle_{name}"), None)
     return Scales(
         amplitude=_amplitude(axis, readout, rate, sensed.data, measured),

@@ -82,7 +82,14 @@ class Comparison:
         self._whitened: dict[tuple[int, str, str, float], Array] = {}
 
     def residual(self, model: Model, x: Array, stop: float = 1.0) -> Array:
-        """Whitened data minus model, shape (N,); beyond ``stop`` it is zero."""
+        """Whitened data minus model, shape (N,); beyond ``stop`` it is zero.
+
+        Where a trajectory runs away, the residual is huge: a trial step like any other that is not taken.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._residual(model, x, stop)
+
+    def _residual(self, model: Model, x: Array, stop: float) -> Array:
         parts = []
         for run, whiteners, signals in zip(self.runs, self.whiteners, model.outputs(x, stop), strict=True):
             for output, whiten, signal in zip(run.outputs, whiteners, signals, strict=True):

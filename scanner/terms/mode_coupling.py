@@ -34,5 +34,7 @@ TERM = Term(
     hidden=(lambda s: 0.02, lambda s: 0.04 * s.rate),
     source="Antonio, Zanette & López, Nat. Commun. 3, 806 (2012)",
     lookalikes={"cubic-damping": "no sidebands and no threshold there: record above and below the threshold"},
+    # An internal resonance takes a motion at the axis's own.
+    applies=lambda axis, scales: 0.5 < scales.rate * np.sqrt(scales.J / scales.k) < 2.0,
     torque=torque,
 )
