@@ -1,0 +1,113 @@
+"""A measured piezo stage: what lies between the spiral that it was told to follow and the one that its sensors saw.
+
+    python examples/afm_model.py DATA OUT
+
+DATA holds spiral_20hz.mat. The nominal stage is linear, with a resonance far above the scan's 20 Hz; each axis is
+diagnosed by itself. As everywhere, one block of time in five is kept from the fit.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from afm_spiral import TURNS_PER_SECOND, fit_spiral
+from ladder import ladder, told
+from numpy.typing import NDArray
+
+from estimation.mismatch.diagnosis import Diagnosis, diagnose
+from estimation.mismatch.fit import FOLDS, HELD, Fit
+from recon.readers import read
+from scanner.device import Axis, Device, Drive, Mechanics, Position
+from scanner.recording import Recording
+
+Array = NDArray[np.float64]
+
+RATE = 20e3
+THIN = 10
+LEAD = 1e-3
+"""The file does not say when the stage was told. The spiral that fits the sensors best is led by about what such a
+stage and its electronics lag [s]; damping and stiffness carry the rest, within wide tolerances."""
+
+RESONANCE, QUALITY = 2 * np.pi * 300.0, 1.0
+STAGE = Axis(
+    Mechanics(1.0 / RESONANCE**2, 1.0 / (RESONANCE * QUALITY), 1.0),
+    drive=Drive("linear", 1.0),
+    readout=Position(1.0, 0.07e-3 / np.sqrt(THIN)),
+    tolerance={"J": 1e-9, "b": 0.5, "k": 0.2, "torque_per_volt": 1e-9, "gain": 1e-9},
+    name="x",
+)
+"""1 "rad" stands for 1 V of the sensor; the scan moves far below any resonance, so that J stands for nothing."""
+
+
+def recordings(file: Path) -> dict[str, Recording]:
+    """Commanded and sensed position about the centre at 2 kHz; either axis stands as ``x`` of a device of its own."""
+    from scipy.signal import decimate
+
+    variables = read(file).variables
+    path = np.array([variables[name].raw[:] for name in ("x", "y")])
+    time = np.arange(path.shape[1]) / RATE
+    spiral = fit_spiral(time, path, TURNS_PER_SECOND)
+    told_path = spiral.at(time + LEAD) - spiral.centre[:, None]
+    sensed = path - spiral.centre[:, None]
+    made = {}
+    for i, name in enumerate("xy"):
+        channels = {
+            "drive_x": (told_path[i, ::THIN], "V", RATE / THIN, 0.0),
+            "sense_x": (decimate(sensed[i], THIN, ftype="fir"), "V", RATE / THIN, 0.0),
+        }
+        made[name] = Recording.from_arrays(channels, Device(f"stage-{name}", {"x": STAGE}), f"afm-{name}")
+    return made
+
+
+def left(fit: Fit) -> Array:
+    """Sensed minus simulated position, shape (n,) [V]."""
+    return fit.model.runs[0].outputs[0].data - fit.model.outputs(fit.x)[0][0]
+
+
+def held_out(size: int) -> NDArray[np.bool_]:
+    """Samples that no fit saw, shape (n,)."""
+    return np.asarray((np.floor(np.arange(size) / size * FOLDS).astype(int) % HELD) == HELD // 2)
+
+
+def draw(found: dict[str, Diagnosis], output: Path) -> None:
+    """What each device leaves over time, axis by axis."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(2, 1, figsize=(12, 8), layout="constrained", sharex=True)
+    for panel, (name, diagnosis) in zip(panels, found.items(), strict=True):
+        for effect, fit in ladder(diagnosis).items():
+            rest = left(fit)
+            label = effect if effect == "linear" else f"+ {effect}"
+            panel.plot(np.arange(rest.size) * THIN / RATE, 1e3 * rest, lw=0.7, label=label)
+        panel.set(ylabel=f"sensed − simulated {name} (mV)")
+        panel.legend(loc="upper left")
+    panels[1].set(xlabel="time (s)")
+    figure.savefig(output, dpi=100)
+    plt.close(figure)
+
+
+def main(data: Path, output: Path) -> None:
+    """Diagnose both axes, say what each term is worth, draw."""
+    output.mkdir(parents=True, exist_ok=True)
+    found = {}
+    for name, recording in recordings(data / "spiral_20hz.mat").items():
+        found[name] = diagnose([recording], say=lambda text: print(f"  ... {text}", flush=True))
+        (output / f"device_{name}.toml").write_text(found[name].device.to_toml(), encoding="utf-8")
+        print(f"Axis {name}")
+        print(told(found[name]))
+        print("  Commanded through the stage against sensed position, rms on samples not used in the fit")
+        for effect, fit in ladder(found[name]).items():
+            rest = left(fit)
+            held = 1e3 * float(np.sqrt(np.mean(rest[held_out(rest.size)] ** 2)))
+            print(f"    {effect if effect == 'linear' else '+ ' + effect:22} {held:7.3f} mV")
+    draw(found, output / "afm_model.png")
+    print(f"Picture: {output / 'afm_model.png'}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

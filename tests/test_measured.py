@@ -1,0 +1,76 @@
+"""Measured motion whose nominal device leaves physics out, in short pieces; the examples run the whole of it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.mismatch import search as searching
+from estimation.mismatch.diagnosis import Diagnosis, judged
+from estimation.mismatch.experiment import experiment
+from estimation.mismatch.fit import Comparison, solve
+from estimation.mismatch.model import Candidate, Model
+from estimation.mismatch.prediction import predict
+from estimation.mismatch.start import first_whiteners
+from recon.convert import convert
+from scanner.recording import Recording
+from scanner.terms import catalogue
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    """A diagnosis among a few named effects: the whole catalogue takes minutes."""
+    monkeypatch.setattr(searching, "FREE", {})
+
+    def diagnosed(recording: Recording, *effects: str) -> Diagnosis:
+        device = recording.device
+        assert device is not None
+        terms = {effect: catalogue()[effect] for effect in effects}
+        return judged(searching.search([experiment(recording, device)], device, terms))
+
+    return diagnosed
+
+
+def test_the_silverbox_is_a_cubic_spring(measured_data: Path, found) -> None:  # type: ignore[no-untyped-def]
+    from silverbox import MAPPING, multisines, off
+
+    with convert(measured_data / "silverbox/multisine.npz", MAPPING) as whole:
+        parts = multisines(whole)
+        assert len(parts) == 10
+        short = [part.slice(part.start, part.start + 2.5) for part in parts[2:4]]
+        told = found(short[0], "cubic-stiffness", "quintic-stiffness", "cubic-damping", "sensor-cubic")
+        assert told.findings[0].effect == "cubic-stiffness"
+        linear, cubic = (np.nanstd(off(predict(short[1], d)["sense_x"])) for d in (whole.device, told.device))
+        assert cubic < 0.4e-3 < 10e-3 < linear
+
+
+def test_the_beam_decays_by_its_laws_of_amplitude(measured_data: Path, found) -> None:  # type: ignore[no-untyped-def]
+    from beam_decay import FROM, MAPPING, held_out, simulated, slow_motion
+
+    with convert(next((measured_data / "beam_decay").glob("*.lvm")), MAPPING) as whole:
+        told = found(whole.slice(FROM, FROM + 3.0), "cubic-stiffness", "quadratic-drag", "coulomb-friction")
+    assert [each.effect for each in told.findings] == ["cubic-stiffness", "quadratic-drag"]
+    data = told.search.comparison.runs[0].outputs[0].data
+    frequency, modelled = (slow_motion(s - s.mean(), 1000.0)[1] for s in (data, simulated(told.search.final)))
+    unseen = held_out(data.size, 1000.0)
+    assert np.sqrt(np.mean((frequency - modelled)[unseen] ** 2)) < 0.07 < 0.3 < frequency[unseen].std()
+
+
+def test_the_piezo_stage_has_hysteresis_and_drifts(measured_data: Path) -> None:
+    from afm_model import held_out, left, recordings
+
+    recording = recordings(measured_data / "afm_spiral/spiral_20hz.mat")["x"]
+    device = recording.device
+    run = experiment(recording, device)
+    missed = {}
+    for effects in (("offset-drift",), ("offset-drift", "hysteresis")):
+        model = Model([run], device, [Candidate(catalogue()[effect], "x", "sense") for effect in effects], ())
+        fit = solve(Comparison([run], first_whiteners(model)), model, np.zeros(len(model.free)), turns=8)
+        rest = left(fit)
+        missed[effects[-1]] = np.sqrt(np.mean(rest[held_out(rest.size)] ** 2))
+    assert missed["hysteresis"] < 0.3e-3 < 0.8e-3 < missed["offset-drift"]
