@@ -16,6 +16,7 @@ from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.prediction import predict
 from estimation.mismatch.start import first_whiteners
 from recon.convert import convert
+from scanner.device import Axis, Device, Mechanics, Position
 from scanner.recording import Recording
 from scanner.terms import catalogue
 
@@ -74,3 +75,12 @@ def test_the_piezo_stage_has_hysteresis_and_drifts(measured_data: Path) -> None:
         rest = left(fit)
         missed[effects[-1]] = np.sqrt(np.mean(rest[held_out(rest.size)] ** 2))
     assert missed["hysteresis"] < 0.3e-3 < 0.8e-3 < missed["offset-drift"]
+
+
+def test_a_device_without_a_drive_decays_freely() -> None:
+    rate, turn, fall = 5e3, 2 * np.pi * 40.0, 2.0
+    time = np.arange(5000) / rate
+    axis = Axis(Mechanics(1.0, 2 * fall, turn**2 + fall**2), readout=Position(1.0, 1e-3), name="x")
+    decay = 0.3 * np.exp(-fall * time) * np.cos(turn * time + 0.4)
+    recording = Recording.from_arrays({"sense_x": (decay, "V", rate, 0.0)}, Device("beam", {"x": axis}))
+    assert predict(recording, Device("beam", {"x": axis}))["sense_x"].rmse < 1e-3
