@@ -53,7 +53,7 @@ def reconstruct_file(
             film(folder / "frames.ome.tif", result, recording["intensity"], options)
         write_motion(folder / "motion.h5", result.motion)
         write_json(folder / "summary.json", summary)
-        save_picture(folder / "image.png", result.picture)
+        save_picture(folder / "image.png", result.picture, result.affected)
         page = reconstruction_report(result, summary, recording["intensity"])
         (folder / "report.html").write_text(page, encoding="utf-8")
     return summary

@@ -74,9 +74,14 @@ def visible(picture: Picture) -> NDArray[np.float32]:
     return fill_holes(picture, FILL_FOR_THE_EYE)[0]
 
 
-def save_picture(path: Path, picture: Picture) -> None:
-    """image.png: the picture for the eye; what was measured, and where, stands in image.tif and coverage.tif."""
-    path.write_bytes(png(coloured(visible(picture))))
+def save_picture(path: Path, picture: Picture, affected: NDArray[np.bool_] | None = None) -> None:
+    """image.png: the picture for the eye; what was measured, and where, stands in image.tif and coverage.tif.
+
+    Args:
+        affected: pixels to mark, shape (height, width).
+    """
+    rgb = coloured(visible(picture))
+    path.write_bytes(png(rgb if affected is None else marked(rgb, affected)))
 
 
 def uri(data: bytes, kind: str = "image/png") -> str:

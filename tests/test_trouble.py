@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -122,6 +123,10 @@ def test_the_folder_and_the_summary_say_so(tmp_path: Path) -> None:
     assert affected.dtype == np.uint8
     assert set(np.unique(affected)) == {0, 1}
     assert summary["affected"] == pytest.approx(affected.mean())
+    eye = cv2.imread(str(tmp_path / "out" / "image.png")).astype(int)
+    grey = np.ptp(eye, axis=2) == 0
+    assert not grey[affected == 1].any()
+    assert grey[(affected == 0) & (tifffile.imread(tmp_path / "out" / "coverage.tif") > 0)].all()
     with h5py.File(tmp_path / "out" / "motion.h5") as motion:
         assert np.isfinite(motion["x/angle"][:]).all()
 
