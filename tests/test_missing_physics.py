@@ -1,0 +1,52 @@
+"""The loop of ``examples/missing_physics.py``, without its search: the term in the device sharpens the picture."""
+
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.mismatch.experiment import experiment
+from estimation.mismatch.model import Model
+from estimation.mismatch.screen import all_candidates
+from phantoms.experiment import Experiment, run
+from recon.pipeline import Options, reconstruct
+from recon.score import told_truth
+from recon.summary import summarise
+from scanner import devices
+from scanner.terms import catalogue
+
+EXAMPLE = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "missing_physics.py"))
+
+
+@pytest.fixture(scope="module")
+def calibration():  # type: ignore[no-untyped-def]
+    nominal = devices.load("imaging")
+    return EXAMPLE["calibration"](EXAMPLE["with_terms"](nominal, EXAMPLE["HIDDEN"]), nominal, 0.002)
+
+
+def test_the_term_in_the_device_file_sharpens_the_same_scan() -> None:
+    nominal = devices.load("imaging")
+    true = EXAMPLE["with_terms"](nominal, EXAMPLE["HIDDEN"])
+    scan, told = run(Experiment(true, duration=0.012), 4, nominal=nominal)
+    results = [
+        reconstruct(
+            replace(scan, device_toml=device.to_toml()), Options(pixels=(200, 200)), told_truth(told), quiet=True
+        )
+        for device in (nominal, true)
+    ]
+    before, after = ({a: np.degrees(e.phase_rmse) for a, e in each.errors.items()} for each in results)
+    assert before["x"] > 3.0
+    assert max(after.values()) < 0.03
+    picture = [summarise(each)["picture"]["rms"] for each in results]
+    assert picture[1] < 0.3 * picture[0]
+
+
+def test_a_shared_readout_s_terms_are_candidates_once(calibration) -> None:  # type: ignore[no-untyped-def]
+    nominal = devices.load("imaging")
+    model = Model([experiment(calibration, nominal)], nominal)
+    keys = [each.key for each in all_candidates(nominal, model, catalogue().values())]
+    assert "x.readout-lag" in keys
+    assert "y.readout-lag" not in keys
+    assert {"y.cubic-stiffness", "y.feedthrough", "y.channel-delay:angle", "y.comb-offset"} <= set(keys)
