@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from estimation.mismatch.diagnosis import Estimate, Finding, Rival
 from estimation.mismatch.naming import LEAD_OVER_NEXT, LEAD_OVER_NOTHING
 from estimation.mismatch.sensitivity import APART
-from recon.optics_fit import AT_REST, AXES, COARSEST, Numbers, Scan, fit, foretold, look, measured_noise, scan_of
+from recon.optics_fit import AT_REST, AXES, COARSEST, Fit, Numbers, Scan, fit, foretold, look, measured_noise, scan_of
+from recon.scene import Noise
 from scanner.channel import Channel
 from scanner.device import Amdm, Device
 from scanner.motion import Motion
@@ -35,7 +36,10 @@ Array = NDArray[np.float64]
 METRIC = "reduced chi-square of the intensity about the best picture, on blocks of time not used in the fit"
 
 MISLED = 0.1
-"""What detail finer than a cell of the picture misleads a place by [cells]."""
+"""What detail finer than a cell of the picture misleads a place by [cells]; a whole cell where samples of one cell
+scatter more than ``RESOLVED`` times what neighbouring cells differ by: such a sample the picture does not resolve."""
+
+RESOLVED = 1.25
 
 FLICKER = 0.01
 """What it misleads the light by, as a fraction, over the recording."""
@@ -45,6 +49,9 @@ LATEST = 25e-6
 
 TURN = np.radians(15.0)
 """Phase error that is searched for."""
+
+CLEARLY = 0.95
+"""Share of the scatter at rest below which another start is worth trying."""
 
 SEARCHED = 40_000
 """Samples that the search looks at: a start needs no more."""
@@ -163,15 +170,9 @@ def judge_optics(motion: Motion, intensity: Channel, device: Device) -> Judgemen
     scan = scan_of({axis: motion.axes[axis].angle for axis in AXES}, intensity)
     rates = {axis: 2 * np.pi * float(np.median(motion.axes[axis].frequency)) for axis in AXES}
     wide = _wide(rates)
-    p: Numbers = _searched(scan, rates)
-    levels = [COARSEST]
-    while levels[-1] < scan.finest:
-        levels.append(min(2 * levels[-1], scan.finest))
-    for cells in levels:
-        noise = measured_noise(scan, look(scan, p, cells), cells)
-        found = fit(scan, wide, p, noise, cells)
-        p = found.p
-    prior = _calibration(motion, device, rates, scan)
+    noise, found = _measured(scan, wide, rates)
+    p = found.p
+    prior = _calibration(motion, device, rates, scan, noise)
     at = np.array([p[name] for name in MEASURED])
     measured = Measured(found.information, found.information @ at + at / found.sd**2, prior)
     effects = possible_effects(scan, rates)
@@ -214,8 +215,31 @@ def _wide(rates: Mapping[str, float]) -> Numbers:
     return {name: wide[name] for name in MEASURED}
 
 
-def _searched(scan: Scan, rates: Mapping[str, float]) -> Numbers:
-    """Where the samples of a coarse cell scatter least: both axes late by one time, or one axis alone."""
+def _measured(scan: Scan, wide: Numbers, rates: Mapping[str, float]) -> tuple[Noise, Fit]:
+    """The numbers of the optics, and what samples of one cell then scatter by.
+
+    Detail that repeats makes a wrong place look right, and cells that do not resolve it are misled: whatever comes from
+    coarse cells counts only where it is clearly better than what is found next to rest.
+    """
+    fits = [_refined(scan, wide, AT_REST, scan.finest)]
+    fits += [_refined(scan, wide, start, COARSEST) for start in _starts(scan, rates)]
+    best = min(fits, key=lambda pair: pair[0].scatter)
+    return best if best[0].scatter < CLEARLY * fits[0][0].scatter else fits[0]
+
+
+def _refined(scan: Scan, wide: Numbers, p: Numbers, cells: int) -> tuple[Noise, Fit]:
+    """From ``cells`` to the finest."""
+    while True:
+        noise = measured_noise(scan, look(scan, p, cells), cells)
+        found = fit(scan, wide, p, noise, cells)
+        p = found.p
+        if cells == scan.finest:
+            return measured_noise(scan, look(scan, p, cells), cells), found
+        cells = min(2 * cells, scan.finest)
+
+
+def _starts(scan: Scan, rates: Mapping[str, float]) -> list[Numbers]:
+    """Rest, and where samples of a coarse cell scatter clearly less: both axes late by one time, or one axis alone."""
     few = scan.beginning(SEARCHED)
     fast = scan.fastest
     tried = [AT_REST]
@@ -225,12 +249,15 @@ def _searched(scan: Scan, rates: Mapping[str, float]) -> Numbers:
     ):
         lates = step * np.arange(-np.ceil(reach / step), np.ceil(reach / step) + 1)
         tried += [{**AT_REST, **dict.fromkeys(names, float(late))} for late in lates]
-    return min(tried, key=lambda p: measured_noise(few, look(few, p, COARSEST), COARSEST).scatter)
+    scatter = [measured_noise(few, look(few, p, COARSEST), COARSEST).scatter for p in tried]
+    best = int(np.argmin(scatter))
+    return [AT_REST, tried[best]] if scatter[best] < CLEARLY * scatter[0] else [AT_REST]
 
 
-def _calibration(motion: Motion, device: Device, rates: Mapping[str, float], scan: Scan) -> Array:
+def _calibration(motion: Motion, device: Device, rates: Mapping[str, float], scan: Scan, noise: Noise) -> Array:
     """Covariance of the measured numbers where nothing is wrong but what is known to be uncertain."""
-    blur = 2.0 * MISLED / scan.finest
+    misled = MISLED if noise.scatter < RESOLVED * noise.contrast else 1.0
+    blur = 2.0 * misled / scan.finest
     sd = {"fade": FLICKER, **{f"move_{axis}": blur for axis in AXES}, **{f"swell_{axis}": SWELL for axis in AXES}}
     for axis in AXES:
         phase_sd = float(np.sqrt(np.nanmean(np.square(motion.axes[axis].phase_sd))))

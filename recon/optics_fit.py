@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ the sample over the recording [halves of the swing]. delay, lag: of the intensit
 AT_REST: Numbers = dict.fromkeys(NAMES, 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """Samples of a scan.
 
@@ -83,8 +84,7 @@ class Scan:
 
     def place(self, axis: str, late: float) -> Array:
         """Where the mirror stood ``late`` seconds before every sample, in halves of the swing from its centre."""
-        angle = np.concatenate([read_late(self.tracks[axis], *run, late) for run in self.runs])
-        return np.asarray((angle - self.centre[axis]) / self.half[axis])
+        return _place(self, axis, late)
 
     def beginning(self, samples: int) -> Scan:
         """The first ``samples`` alone."""
@@ -102,11 +102,20 @@ class Scan:
         )
 
 
+@lru_cache(maxsize=6)
+def _place(scan: Scan, axis: str, late: float) -> Array:
+    """``Scan.place``; most numbers of the optics leave it as it is."""
+    angle = np.concatenate([read_late(scan.tracks[axis], *run, late) for run in scan.runs])
+    return np.asarray((angle - scan.centre[axis]) / scan.half[axis])
+
+
 def read_late(track: AngleTrack, first: int, stop: int, late: float) -> Array:
     """Angles ``late`` seconds before samples ``first`` up to ``stop`` [rad]."""
     if isinstance(track, SlowAngle):
         return SlowAngle(track.motion, track.sample_rate, track.start - late, track.size).read(first, stop)
-    return shifted(track.values, -late * track.sample_rate)[first:stop]
+    margin = int(abs(late) * track.sample_rate) + 4
+    low = max(first - margin, 0)
+    return shifted(track.read(low, stop + margin), -late * track.sample_rate)[first - low : stop - low]
 
 
 def scan_of(tracks: Mapping[str, AngleTrack], intensity: Channel) -> Scan:
@@ -147,7 +156,7 @@ def look(scan: Scan, p: Numbers, cells: int) -> Look:
         place = place * (1.0 + p[f"swell_{axis}"] * (scan.turn - 0.5)) - p[f"move_{axis}"] * scan.turn
         places.append(0.5 * (place + 1.0) * (cells - 1))
     rate = scan.tracks["x"].sample_rate
-    return Look(places[0], places[1], np.exp(-p["fade"] * scan.turn), max(p["lag"], 0.0) * rate)
+    return Look(places[0], places[1], np.exp(-p["fade"] * (scan.turn - 0.5)), max(p["lag"], 0.0) * rate)
 
 
 def measured_noise(scan: Scan, at: Look, cells: int) -> Noise:
@@ -267,7 +276,7 @@ def foretold(scan: Scan, p: Numbers, cells: int) -> float:
 def _ways(scan: Scan, cells: int) -> dict[str, float]:
     """How far every number goes for half a cell."""
     half_cell, fast = 1.0 / cells, scan.fastest
-    ways = {"fade": 0.01, "delay": half_cell / max(fast.values()), "lag": half_cell / max(fast.values())}
+    ways = {"fade": 0.1, "delay": half_cell / max(fast.values()), "lag": half_cell / max(fast.values())}
     for axis in AXES:
         late = half_cell / fast[axis]
         ways |= {f"late_{axis}": late, f"slew_{axis}": 2 * late, f"swell_{axis}": 2 * half_cell}
