@@ -72,6 +72,8 @@ def draw(measured: Array, steps: dict[str, Fit], rate: float, output: Path) -> N
         panels[1].semilogx(amplitude[ends], decay[ends], style, ms=2, label=label)
     panels[0].set(title="Frequency", xlabel="amplitude (strain / 1e-4)", ylabel="Hz", ylim=(36.5, 40))
     panels[1].set(title="Decay rate", xlabel="amplitude (strain / 1e-4)", ylabel="1/s", ylim=(0, 2.5))
+    for panel in panels:
+        panel.set_xlim(0.04, 1.2)
     panels[1].legend()
     figure.savefig(output, dpi=100)
     plt.close(figure)
