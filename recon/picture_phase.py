@@ -13,11 +13,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.signals import reference_of
 from estimation.steady import settle_signs
+from estimation.terms import estimate_with_terms
 from estimation.tracker import PhaseSeen, track
 from estimation.tracker.driven import drive_only
 from recon.mapping import Grid
 from recon.registration import SLICE, PhaseError, registered, slow_period
+from recon.undo import placed
 from scanner.channel import Channel
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -31,7 +34,7 @@ REGISTERED = 800  # periods of the slower axis that share one picture
 ROUNDS = 6
 REST = 0.5  # of its least standard deviation: a phase that moves less has come to rest
 FINE = 0.1  # pixels at the middle of a line: a sense signal that tells the phase so well needs no help
-Smoother = Callable[[Mapping[str, PhaseSeen]], Motion]
+Smoother = Callable[[Recording, Device, Mapping[str, PhaseSeen]], Motion]
 
 
 def refined(
@@ -40,8 +43,8 @@ def refined(
     """The motion with the phases that the picture shows, and a line for each axis on what it showed.
 
     Axes whose sense signal tells their phase to a tenth of a pixel stay as they are, and so do the motions of other
-    estimators than ``tracker`` and ``picture``. Where it tells less, the picture's phases are smoothed with it; where it
-    tells less than drive and picture do, without it.
+    estimators than ``tracker`` and ``picture``. Where it tells less, the picture's phases are smoothed with it, and
+    without it where it tells less than drive and picture do.
 
     Args:
         motion: as ``estimate`` gave it with these ``flips``.
@@ -56,9 +59,10 @@ def refined(
     by: dict[str, str] = {}
     while rounds < ROUNDS and not rest:
         # At first amplitudes are wrong too and change: what is taken at different times then shares no picture.
-        errors = registered(motion, intensity, grid, windows(motion, intensity, REGISTERED if rounds else SLICE))
+        parts = windows(motion, intensity, REGISTERED if rounds else SLICE)
+        errors = registered(placed(motion, device, recording.start), intensity, grid, parts)
         seen = {name: _seen(errors, motion.axes[name], name, flips.get(name, False)) for name in helped}
-        found = {way: settle_signs(smooth(seen), recording, flips) for way, smooth in smoothers.items()}
+        found = {way: _smoothed(recording, device, smooth, seen, flips) for way, smooth in smoothers.items()}
         by = {name: _better(found, name, alone[name]) for name in helped}
         before, motion = motion, replace(motion, axes={**motion.axes, **{n: found[by[n]].axes[n] for n in helped}})
         rounds, rest = rounds + 1, all(_rests(before.axes[name], motion.axes[name]) for name in helped)
@@ -72,14 +76,35 @@ def _smoothers(recording: Recording, device: Device, estimator: str) -> dict[str
     """What smooths phases seen, by the name of its estimator: the drive alone only where it sustains the motion."""
     if estimator not in ("tracker", "picture"):
         return {}
-    found: dict[str, Smoother] = {"picture": lambda seen: drive_only(recording, device, seen)}
+    found: dict[str, Smoother] = {"picture": drive_only}
     if estimator == "tracker":
+        found["tracker"] = lambda recording, device, seen: track(recording, device, seen=seen)
         try:
-            drive_only(recording, device)
+            _smoothed(recording, device, drive_only, {}, {})
         except BadInput:
-            found.clear()
-        found["tracker"] = lambda seen: track(recording, device, seen=seen)
+            del found["picture"]
     return found
+
+
+def _smoothed(
+    recording: Recording, device: Device, smooth: Smoother, seen: Mapping[str, PhaseSeen], flips: Mapping[str, bool]
+) -> Motion:
+    """The motion as ``estimate`` makes it, of a device that may have terms, with phases seen."""
+
+    def run(told: Recording, bare: Device) -> Motion:
+        pulled = {name: _against(phases, name, device, recording, told) for name, phases in seen.items()}
+        return settle_signs(smooth(told, bare, pulled), told, flips)
+
+    return estimate_with_terms(recording, device, run)
+
+
+def _against(seen: PhaseSeen, name: str, device: Device, recording: Recording, told: Recording) -> PhaseSeen:
+    """Phases against the drive that pulls, where a term makes another one of the recorded drive."""
+    key = f"drive_{name}"
+    if key not in told or told[key] is recording[key]:
+        return seen
+    recorded, pulled = (reference_of(each, device, name).phase(seen.time) for each in (recording, told))
+    return seen._replace(phase=seen.phase + recorded - pulled)
 
 
 def windows(motion: Motion, intensity: Channel, periods: int) -> list[tuple[int, int]]:

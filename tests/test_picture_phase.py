@@ -141,7 +141,7 @@ def test_bars_tell_the_phase_across_them_and_not_the_one_along() -> None:
     field = without(recording, "sense", intensity=bars)
     motion, notes = refined(field, field.device, drive_only(field, field.device), field["intensity"], GRID, {})
     assert rmse(motion, truth)["x"] < 0.15
-    assert motion.info["picture"]["told"]["y"] == 0
+    assert motion.info["picture"]["told"]["y"] == 0  # type: ignore[index]
     assert any("nothing of the phase of y" in note for note in notes)
 
 
