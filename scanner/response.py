@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scanner.device import Amdm, Axis, Position, Readout
 from scanner.errors import BadInput
 from scanner.laws import amdm_voltage, capacitance, capacitance_slope, position_voltage, transimpedance_voltage
-from scanner.lowpass import lowpass, step_coefficients
-from scanner.terms import STAGES, Term, View, catalogue, shifted
+from scanner.lowpass import low_passed
+from scanner.terms import STAGES, Term, View, catalogue
 
 Array = NDArray[np.float64]
 _NOTHING = np.empty(0)
@@ -207,7 +207,9 @@ def sense(readout: Readout, paths: Sequence[Path]) -> Array:
                 for each in path.added:
                     if each.term.modulate is not None:
                         signal = each.term.modulate(signal, each.values, _view(path, readout))
-            signal = amdm_voltage(_demodulated(signal, readout, paths[0].inputs.step), readout.a_cir, readout.b_cir)
+            for corner in readout.lpf_hz:
+                signal = low_passed(signal, corner, paths[0].inputs.step)
+            signal = amdm_voltage(signal, readout.a_cir, readout.b_cir)
         case Position():
             signal = position_voltage(paths[0].angle, readout.gain, readout.offset)
         case _:
@@ -225,16 +227,6 @@ def effective(readout: Readout, paths: Sequence[Path]) -> Readout:
         terms = [each for each in path.added if each.term.stage == "readout"]
         readout = with_constants(replace(path.axis, readout=readout), terms).require_readout()
     return readout
-
-
-def _demodulated(signal: Array, readout: Amdm, step: float) -> Array:
-    """The capacitance behind the sections, stepped twice a sample: their step takes its input for linear in between."""
-    dense = np.empty(2 * signal.size - 1)
-    dense[::2] = signal
-    dense[1::2] = shifted(signal, 0.5)[:-1]
-    for corner in readout.lpf_hz:
-        lowpass(dense, *step_coefficients(corner, 0.5 * step), dense[0], dense[0])
-    return dense[::2].copy()
 
 
 def reference(path: Path) -> Array:

@@ -26,6 +26,13 @@ POWERS = tuple((i, n - i) for n in range(2, DEGREE + 1) for i in range(n, -1, -1
 WAVES = 3
 """Cosines over the recording's length by which stiffness and damping may move."""
 
+OFFSETS, GAINS, DELAYS = 6, 28, 20
+"""Cosines over the recording's length of a readout's offset and gain, and of a delay: a few where the spectrum is full
+of other things, up to a dozen cycles where nothing else stands."""
+
+KNOTS = np.linspace(-1.0, 1.0, 15)
+"""Angles, over the amplitude, between which the free mapping of a reference angle is straight."""
+
 SOURCE = "free correction: polynomials and cosines, no physics of their own"
 
 
@@ -74,21 +81,21 @@ def _readout(signal: Array, p: Sequence[float], view: View) -> Array:
     swing = signal - signal.mean()
     slope = np.gradient(signal, view.step) / rate
     change = p[3] * swing**2 / size + p[4] * swing**3 / size**2 + p[5] * slope
-    for j in range(1, 7):
+    for j in range(1, OFFSETS + 1):
         change = change + p[5 + j] * size * np.cos(j * turn)
-    for j in range(1, 4):
-        change = change + p[11 + j] * swing * np.cos(j * turn)
-    return signal + change
+    gain = np.zeros_like(signal)
+    for j in range(1, GAINS + 1):
+        gain += p[5 + OFFSETS + j] * np.cos(j * turn)
+    return signal + change + gain * swing
 
 
 def _timing(signal: Array, p: Sequence[float], view: View) -> Array:
-    late = sum(p[1 + j] * np.cos(np.pi * j * view.time / p[0]) for j in range(5))
+    late = sum(p[1 + j] * np.cos(np.pi * j * view.time / p[0]) for j in range(DELAYS + 1))
     return signal - late * np.gradient(signal, view.step)
 
 
 def _optics(signal: Array, p: Sequence[float], view: View) -> Array:
-    x = signal / p[0]
-    return signal + p[0] * (p[1] * x**2 + p[2] * x**3 + p[3] * x**5)
+    return signal + p[0] * np.interp(signal / p[0], KNOTS, p[1:])
 
 
 def _size(i: int, j: int):  # type: ignore[no-untyped-def]
@@ -137,7 +144,8 @@ FREE: dict[str, Term] = {
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 Parameter("size", "V", lambda s: s.sense_rms, kind="fixed"),
                 Parameter("rate", "rad/s", lambda s: s.rate, kind="fixed"),
-                *(Parameter(f"y{i}", "1", lambda s: 0.04) for i in range(12)),
+                *(Parameter(f"y{i}", "1", lambda s: 0.04) for i in range(3 + OFFSETS)),
+                *(Parameter(f"g{i}", "1", lambda s: 0.04) for i in range(1, GAINS + 1)),
             ),
             SOURCE, output=_readout,
         ),
@@ -145,7 +153,7 @@ FREE: dict[str, Term] = {
             "free-timing", "timing", "y(t − δ(t))",
             (
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
-                *(Parameter(f"d{i}", "s", lambda s: 0.05 / s.rate) for i in range(5)),
+                *(Parameter(f"d{i}", "s", lambda s: 0.05 / s.rate) for i in range(DELAYS + 1)),
             ),
             SOURCE, output=_timing, channels=("sense", "angle"),
         ),
@@ -153,7 +161,7 @@ FREE: dict[str, Term] = {
             "free-optics", "optics", "θ_ref = θ + g(θ)",
             (
                 Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
-                *(Parameter(f"c{i}", "1", lambda s: 0.03) for i in (2, 3, 5)),
+                *(Parameter(f"c{i}", "1", lambda s: 0.02) for i in range(KNOTS.size)),
             ),
             SOURCE, output=_optics, channels=("angle",),
         ),

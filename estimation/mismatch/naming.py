@@ -22,6 +22,9 @@ LEAD_OVER_NEXT = 6.0
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
 
+MUCH = 100.0
+"""Fall of -2 log evidence beyond which first order is no judge of candidates."""
+
 FINALISTS = 6
 STARTERS = 12
 
@@ -58,14 +61,23 @@ def convincing(before: Fit, after: Fit) -> bool:
 
 
 def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], threshold: float = 3.0) -> list[Fit]:
-    """Fits of the candidates that first order around ``base`` promises anything of, best first."""
+    """Fits of the candidates that first order around ``base`` promises anything of, best first.
+
+    Where much is missing, first order promises one ten times too little and the other ten times too much: all take a
+    step or two, and those that lag far behind drop out.
+    """
     promising = sorted((screen(comparison, base, each) for each in candidates), key=lambda s: -s.gain)
     promising = [each for each in promising if each.gain > threshold]
-    fits: list[Fit] = []
-    for each in promising:
-        if len(fits) >= FINALISTS and each.gain < 0.5 * promising[0].gain:
-            break
-        fits.append(solve(comparison, each.model, each.x))
+    running = [(each.model, each.x) for each in promising]
+    if promising and promising[0].gain > MUCH:
+        for turns in (2, 3):
+            fits = sorted((solve(comparison, *each, turns=turns) for each in running), key=lambda fit: fit.evidence)
+            half = max(FINALISTS, len(fits) // 2)
+            running = [(fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + HOPELESS][:half]
+    else:
+        clear = [each for each in promising if each.gain > 0.5 * promising[0].gain]
+        running = running[: max(FINALISTS, len(clear))]
+    fits = [solve(comparison, *each) for each in running]
     return sorted((fit for fit in fits if possible(fit)), key=lambda fit: fit.evidence)
 
 

@@ -21,6 +21,9 @@ MEDIAN_OF_POWER = float(np.log(2.0))
 
 LEAST_BINS = 14
 
+SLOPE_SD = 0.8
+"""Standard deviation of the power law that continues the spectrum below its first window."""
+
 
 @dataclass(frozen=True)
 class Whitener:
@@ -138,5 +141,6 @@ def _running_median(position: Array, power: Array, wanted: Array) -> Array:
     if heights.size > 1:
         slope = np.clip((heights[0] - heights[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
         below = wanted < centres[0]
-        smooth[below] += slope * np.log(centres[0] / np.maximum(wanted[below], 0.5))
+        distance = np.log(centres[0] / np.maximum(wanted[below], 0.5))
+        smooth[below] += slope * distance + 0.5 * (SLOPE_SD * distance) ** 2  # mean of a log-normal level
     return np.exp(smooth)

@@ -17,6 +17,9 @@ from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
 
+LARGEST = 3.0
+"""Prior standard deviations that a first-order estimate may reach."""
+
 
 @dataclass(frozen=True)
 class Screened:
@@ -65,29 +68,40 @@ def starts(candidate: Candidate) -> list[tuple[float, ...]]:
     return list(product(*[(0.0,) if p.kind in AMPLITUDES else p.starts for p in candidate.term.free]))
 
 
-def screen(comparison: Comparison, base: Fit, candidate: Candidate, stop: float = 1.0) -> Screened:
-    """The best start of a candidate by first order around ``base``."""
+def screen(
+    comparison: Comparison, base: Fit, candidate: Candidate, stop: float = 1.0, gone: Sequence[Candidate] = ()
+) -> Screened:
+    """The best start of a candidate by first order around ``base``.
+
+    Args:
+        gone: terms of ``base`` in whose place it would stand: ``base`` follows the motion, they need not be right.
+    """
     model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
     rows = base.rows & (comparison.time < stop)
+    known = Projection(base, rows, gone)
     best: Screened | None = None
     for grid in starts(candidate):
         x = model.embed(base.model, base.x)
         at = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == candidate.key]
         x[at] = grid
         moving = [i for i in at if model.free[i].parameter.kind in AMPLITUDES]  # type: ignore[union-attr]
-        found = (
-            _first_order(comparison, base, candidate, model, x, moving, rows, stop)
-            if moving
-            else _at_a_point(comparison, base, candidate, model, x, rows, stop)
-        )
-        if best is None or found.gain > best.gain:
-            best = found
+        if moving:
+            columns = _sensitivities(comparison, base, model, x, moving, rows, stop)
+            gain, estimate = known.gain(columns[rows])
+            x[moving] = np.clip(estimate, -LARGEST, LARGEST)
+        else:  # a term without an amplitude (a clip level): what a finite size of it changes
+            columns = (comparison.residual(model, x, stop) - base.residual)[:, None]
+            gain, share = known.gain(columns[rows])
+            gain = gain if share[0] > 0.3 else 0.0
+        if best is None or gain > best.gain:
+            best = Screened(candidate, model, x, gain, columns)
     assert best is not None
     return best
 
 
-def _first_order(comparison: Comparison, base: Fit, candidate: Candidate, model: Model, x: Array, moving: Sequence[int],
-                 rows: NDArray[np.bool_], stop: float) -> Screened:  # fmt: skip
+def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, moving: Sequence[int],
+                   rows: NDArray[np.bool_], stop: float) -> Array:  # fmt: skip
+    """Derivatives of the whitened residual by the amplitudes ``moving``, shape (N, q)."""
     columns = np.empty((base.residual.size, len(moving)))
     for j, i in enumerate(moving):
         delta = 1e-3
@@ -99,28 +113,38 @@ def _first_order(comparison: Comparison, base: Fit, candidate: Candidate, model:
             if 0.05 < size * delta < 20.0:
                 break
             delta = float(np.clip(1.0 / size if size else 1e-2, 1e-6, 0.1))
-    gain, estimate = _gain(base, columns, rows)
-    x = x.copy()
-    x[list(moving)] = np.clip(estimate, -3.0, 3.0)
-    return Screened(candidate, model, x, gain, columns)
+    return columns
 
 
-def _at_a_point(comparison: Comparison, base: Fit, candidate: Candidate, model: Model, x: Array,
-                rows: NDArray[np.bool_], stop: float) -> Screened:  # fmt: skip
-    """A term without an amplitude (a clip level): what a finite size of it changes."""
-    column = (comparison.residual(model, x, stop) - base.residual)[:, None]
-    gain, share = _gain(base, column, rows)
-    return Screened(candidate, model, x, gain if share[0] > 0.3 else 0.0, column)
+class Projection:
+    """What is left to explain around a fit once everything in it but the terms ``gone`` has been refitted to it.
+
+    To first order: the residual is that of the fit without their part, and the columns of the others are projected out.
+    """
+
+    def __init__(self, base: Fit, rows: NDArray[np.bool_], gone: Sequence[Candidate] = ()):
+        keys = {each.key for each in gone}
+        out = np.array([f.kind in ("term", "hidden") and f.owner in keys for f in base.model.free])
+        jacobian = base.jacobian[rows]
+        self._old = jacobian[:, ~out]
+        self._residual = base.residual[rows] - jacobian[:, out] @ base.x[out]
+        precision = base.model.precision[~out]
+        self._normal = self._old.T @ self._old + np.diag(precision)
+        self._gradient = self._old.T @ self._residual + precision * base.x[~out]
+
+    def system(self, new: Array) -> tuple[Array, Array]:
+        """Normal matrix (q, q) and gradient (q,) of amplitudes of standard normal prior, from their columns (n, q)."""
+        cross = self._old.T @ new
+        solved = np.linalg.solve(self._normal, np.column_stack([cross, self._gradient]))
+        normal = new.T @ new - cross.T @ solved[:, :-1] + np.eye(new.shape[1])
+        return normal, new.T @ self._residual - cross.T @ solved[:, -1]
+
+    def gain(self, new: Array) -> tuple[float, Array]:
+        """Fall of -2 log evidence and estimate of the new amplitudes, all else refitted."""
+        return gain_of(*self.system(new))
 
 
-def _gain(base: Fit, columns: Array, rows: NDArray[np.bool_]) -> tuple[float, Array]:
-    """Fall of -2 log evidence and estimate of the new amplitudes, all other free numbers refitted to first order."""
-    old, new = base.jacobian[rows], columns[rows]
-    normal = old.T @ old + np.diag(base.model.precision)
-    cross = old.T @ new
-    gradient = old.T @ base.residual[rows] + base.model.precision * base.x
-    kept = new.T @ new - cross.T @ np.linalg.solve(normal, cross)
-    push = new.T @ base.residual[rows] - cross.T @ np.linalg.solve(normal, gradient)
-    inner = kept + np.eye(new.shape[1])
-    estimate = np.asarray(-np.linalg.solve(inner, push))
-    return float(-push @ estimate - np.linalg.slogdet(inner)[1]), estimate
+def gain_of(normal: Array, gradient: Array) -> tuple[float, Array]:
+    """Fall of -2 log evidence and estimate, from a normal matrix and a gradient."""
+    estimate = np.asarray(-np.linalg.solve(normal, gradient))
+    return float(-gradient @ estimate - np.linalg.slogdet(normal)[1]), estimate

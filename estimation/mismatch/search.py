@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.experiment import Run
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
+from estimation.mismatch.instead import instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.naming import LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
@@ -21,6 +22,8 @@ from scanner.terms import Term
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
+Leads = tuple[tuple[float, Candidate], ...]
+"""Rivals of a term, each with its distance behind in -2 log evidence."""
 
 MOST_EFFECTS = 3
 """Effects looked for at a time."""
@@ -35,6 +38,9 @@ below it, three laws find something to explain in anything."""
 
 NEXT_TO_NOTHING = 0.005
 """Share of the misfit that they may leave: 7 % of its amplitude."""
+
+INADEQUATE = 1.3
+"""Held-out reduced chi-square from which named terms are no explanation: near relatives stand in for something else."""
 
 CLOSE = 80.0
 """Rivals within this of the best in -2 log evidence are refitted when the noise has been measured anew."""
@@ -53,7 +59,7 @@ class Round:
     candidate: Candidate
     before: Fit
     after: Fit
-    leads: tuple[tuple[float, Candidate], ...]
+    leads: Leads
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,8 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
         several = [states[-2], *_extended(states[-2], named, early, stops, say)][-1]
         if several.best.held_chi2 - 1.0 < NEXT_TO_NOTHING * (several.nominal.held_chi2 - 1.0):
             found = several
+    elif found.best.model.candidates and not _is_free(found.best) and found.best.held_chi2 > INADEQUATE:
+        found = _unnamed(found)
     rounds = tuple(
         _round(found.comparison, found.nominal, found.best, each, found.rivals.get(each.key, ()))
         for each in found.best.model.candidates
@@ -112,7 +120,7 @@ class _State:
     comparison: Comparison
     nominal: Fit
     best: Fit
-    rivals: Mapping[str, tuple[tuple[float, Candidate], ...]]
+    rivals: Mapping[str, Leads]
 
 
 def _extended(
@@ -143,15 +151,63 @@ def _extended(
         if not close:
             yield _State(comparison, nominal, before, rivals)
             return
-        rivals[close[0].model.candidates[-1].key] = tuple(
-            (fit.evidence - close[0].evidence, fit.model.candidates[-1]) for fit in close[1:]
-        )
-        best = needed_only(comparison, close[0])
+        named = [each for each in candidates if each.term.effect not in FREE]
+        found, leads = close[0], {close[0].model.candidates[-1].key: _leads(close[0], close[1:])}
+        if _is_free(found):
+            say("named terms in the free correction's place")
+            comparison, before, found = _by_name(comparison, before, found, named)
+        if not _is_free(found):
+            newest = len(found.model.candidates) - len(best.model.candidates)
+            final = settled(comparison, found, named, newest)
+            leads = {key: _merged(own, leads.get(key, ())) for key, own in final.leads.items()}
+            found = final.fit
+        rivals |= leads
+        best = needed_only(comparison, found)
         if not _is_free(best) and best.held_chi2 > TRACKED:
             best = exchanged(comparison, best, [each for each in terms if each.effect not in FREE])
         yield _State(comparison, nominal, best, rivals)
         if _is_free(best):
             return
+
+
+def _by_name(comparison: Comparison, before: Fit, free: Fit, named: Sequence[Candidate]) -> tuple[Comparison, Fit, Fit]:
+    """Named terms instead of a free correction where they explain more for less, under the noise that they leave.
+
+    Returns:
+        comparison, the fit before, the fit with the terms or, where none will do, with the free correction.
+    """
+    others = instead(comparison, free, free.model.candidates[-1], named, pairs=True)
+    others = [fit for fit in others if fit.evidence < free.evidence and convincing(before, fit)]
+    if not others:
+        return comparison, before, free
+    comparison = Comparison(comparison.runs, measured_whiteners(others[0].model, others[0].x))
+    return comparison, solve(comparison, before.model, before.x), solve(comparison, others[0].model, others[0].x)
+
+
+def _unnamed(state: _State) -> _State:
+    """A free correction in the place of the weightiest term, if that explains more; the term becomes its rival."""
+    comparison, fit = state.comparison, state.best
+    weightiest = max(fit.model.candidates, key=lambda each: without(comparison, fit, each).evidence)
+    free = all_candidates(fit.model.device, fit.model, FREE.values())
+    others = [each for each in instead(comparison, fit, weightiest, free) if each.evidence < fit.evidence]
+    if not others:
+        return state
+    found = needed_only(comparison, others[0])
+    leads = {found.model.candidates[-1].key: ((fit.evidence - others[0].evidence, weightiest),)}
+    return replace(state, best=found, rivals={**state.rivals, **leads})
+
+
+def _leads(best: Fit, others: Sequence[Fit]) -> Leads:
+    return tuple((fit.evidence - best.evidence, fit.model.candidates[-1]) for fit in others)
+
+
+def _merged(*parts: Leads) -> Leads:
+    """All rivals, each with its smallest distance, the nearest first."""
+    nearest: dict[str, tuple[float, Candidate]] = {}
+    for lead, candidate in (each for part in parts for each in part):
+        if candidate.key not in nearest or lead < nearest[candidate.key][0]:
+            nearest[candidate.key] = (lead, candidate)
+    return tuple(sorted(nearest.values(), key=lambda each: each[0]))
 
 
 def _is_free(fit: Fit) -> bool:
@@ -196,7 +252,7 @@ def _round(
     nominal: Fit,
     best: Fit,
     candidate: Candidate,
-    leads: tuple[tuple[float, Candidate], ...],
+    leads: Leads,
 ) -> Round:
     """What one term of the final fit does there."""
     alone = len(best.model.candidates) == 1

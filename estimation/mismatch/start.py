@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.mismatch.experiment import Output
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.model import Model
-from estimation.mismatch.noise import Whitener, flat_psd, noise_psd, whitener
+from estimation.mismatch.noise import Whitener, flat_psd, near_lines, noise_psd, whitener
 
 Array = NDArray[np.float64]
 
@@ -48,17 +49,23 @@ def measured_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
     for run, signals in zip(model.runs, model.outputs(x), strict=True):
         row = []
         for output, signal in zip(run.outputs, signals, strict=True):
-            lines: list[float] = []
-            width = 0.0
-            for axis in output.axes:
-                motion = run.scales[axis].rate / (2 * np.pi)
-                lines = [*lines, *(motion * np.arange(1, HARMONICS + 1)), *run.lines[axis]]
-                # Lines of a multisine lie closer than a decaying motion is wide.
-                width = max(width, 0.06 * motion) if run.lines[axis].size < 200 else width
+            motions = [run.scales[axis].rate / (2 * np.pi) for axis in output.axes]
+            harmonics = np.outer(motions, np.arange(1, HARMONICS + 1)).ravel()
+            lines = np.concatenate([harmonics, *(run.lines[axis] for axis in output.axes)])
+            width = 0.06 * max(motions)  # of a motion that decays
+            if _crowded(output, lines, width, min(motions)):
+                width = 0.0
             psd = noise_psd(output.data - signal, output.bins, output.step, lines, width)
             row.append(whitener(psd, output.data.size, output.guard))
         made.append(row)
     return made
+
+
+def _crowded(output: Output, lines: Array, width: float, motion: float) -> bool:
+    """Whether lines lie so close, as a multisine's do, that around the motion hardly a bin is clear of them."""
+    frequency = np.arange(output.bins) / (output.data.size * output.step)
+    around = frequency < 1.5 * motion
+    return bool(near_lines(frequency, lines, width)[around].mean() > 0.8)
 
 
 def started(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Comparison, Fit
-from estimation.mismatch.free import POWERS
+from estimation.mismatch.free import GAINS, KNOTS, POWERS
 from estimation.mismatch.model import Candidate
 
 Array = NDArray[np.float64]
@@ -107,17 +107,27 @@ def _basis(fit: Fit, at: list[int]) -> tuple[Array, str, str, Array, str]:
             return np.stack(columns, axis=1) * sizes, "extra capacitance / C0", "1", span, "angle / theta0"
         case "timing":
             s = 0.5 * (unit + 1.0)
-            columns = [np.cos(np.pi * j * s) for j in range(5)]
+            columns = [np.cos(np.pi * j * s) for j in range(len(at))]
             return np.stack(columns, axis=1) * sizes, "delay", "s", scales.duration * s, "time (s)"
         case "optics":
-            columns = [scales.amplitude * unit**n for n in (2, 3, 5)]
+            columns = [scales.amplitude * np.interp(unit, KNOTS, hat) for hat in np.eye(KNOTS.size)]
             return np.stack(columns, axis=1) * sizes, "angle error", "rad", scales.amplitude * unit, "angle (rad)"
+        case "readout" if _wanders(fit, at, sizes):
+            s = 0.5 * (unit + 1.0)
+            columns = [*[0.0 * s for _ in names[:-GAINS]], *[np.cos(np.pi * j * s) for j in range(1, GAINS + 1)]]
+            return np.stack(columns, axis=1) * sizes, "gain error", "1", scales.duration * s, "time (s)"
         case "readout":
             columns = [unit**2, unit**3, *[0.0 * unit for _ in names[2:]]]
             return np.stack(columns, axis=1) * sizes, "signal error / rms", "1", unit, "signal / rms"
         case _:
             columns = [unit, 0.0 * unit, unit**2, *[0.0 * unit for _ in names[3:]]]
             return np.stack(columns, axis=1) * sizes, "drive error / rms", "1", unit, "drive / rms"
+
+
+def _wanders(fit: Fit, at: list[int], sizes: Array) -> bool:
+    """Whether a free readout's gain over time tells more than its static law."""
+    parts = sizes * fit.x[at]
+    return bool(np.linalg.norm(parts[-GAINS:]) > np.linalg.norm(parts[:2]))
 
 
 def formula(fit: Fit, at: list[int], most: int = 4) -> str:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.device import Axis, Readout
+from scanner.lowpass import low_passed
 
 Array = NDArray[np.float64]
 
@@ -197,12 +198,9 @@ def section(signal: Array, corner: float, step: float) -> Array:
 
     A negative corner mirrors the change, so that a fit may walk through zero lag.
     """
-    from scanner.lowpass import lowpass, step_coefficients
-
     if not np.isfinite(corner):
         return signal
-    slow = signal.copy()
-    lowpass(slow, *step_coefficients(abs(corner), step), slow[0], slow[0])
+    slow = low_passed(signal, abs(corner), step)
     return slow if corner > 0 else 2.0 * signal - slow
 
 
