@@ -19,6 +19,9 @@ LEAD_OVER_NOTHING = 10.0
 LEAD_OVER_NEXT = 6.0
 """Lead from which a term is named alone; within it, the next is named beside it."""
 
+SHARE_HELD = 0.2
+"""Of what a term gains where it was fitted, the least that it must gain, sample for sample, where it was not."""
+
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
 
@@ -47,7 +50,7 @@ def possible(fit: Fit) -> bool:
 
 
 def convincing(before: Fit, after: Fit) -> bool:
-    """Whether a term is there: well ahead of nothing, and no worse on samples that no fit has seen.
+    """Whether a term is there: well ahead of nothing, and better on samples that no fit has seen.
 
     A pull on the nominal values that a term relieves is evidence that no held-out sample shows, so those may stay as
     they were, within the scatter of what the term changes there.
@@ -56,8 +59,10 @@ def convincing(before: Fit, after: Fit) -> bool:
         return False
     gained = float(np.sum(before.residual[before.held] ** 2) - np.sum(after.residual[after.held] ** 2))
     changed = float(np.sum((before.residual[before.held] - after.residual[after.held]) ** 2))
-    in_residual = before.chi2 - after.chi2 > before.penalty - after.penalty
-    return gained > 0.0 if in_residual else gained > -2.0 * np.sqrt(changed) - 2.0
+    fitted = before.chi2 - after.chi2
+    if fitted > before.penalty - after.penalty:
+        return gained > SHARE_HELD * fitted * np.count_nonzero(after.held) / np.count_nonzero(after.rows)
+    return gained > -2.0 * np.sqrt(changed) - 2.0
 
 
 def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], threshold: float = 3.0) -> list[Fit]:

@@ -19,7 +19,10 @@ MEDIAN_OF_POWER = float(np.log(2.0))
 """Median of a periodogram's bin over its mean, for Gaussian noise (an exponential variable)."""
 
 
-LEAST_BINS = 14
+MEDIAN_SPREAD = 1.44
+"""Relative standard deviation of a level from the median of n bins, times the root of n."""
+
+LEAST_BINS = 20
 
 SLOPE_SD = 0.8
 """Standard deviation of the power law that continues the spectrum below its first window."""
@@ -122,7 +125,7 @@ def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -
 def _running_median(position: Array, power: Array, wanted: Array) -> Array:
     """Mean power from medians over windows that widen with frequency, at the wanted positions.
 
-    Windows hold at least ``LEAST_BINS`` bins (a relative error of 1.44 / sqrt(bins)) and a quarter of their frequency.
+    Windows hold at least ``LEAST_BINS`` bins and a quarter of their frequency.
     Below the first window the spectrum goes on rising as it did between the first two: red noise taken for flat there
     would pass for a baseline that drifts.
     """
@@ -134,7 +137,10 @@ def _running_median(position: Array, power: Array, wanted: Array) -> Array:
     centres, levels = [], []
     for low, high in pairwise(edges):
         centres.append(np.mean(position[low:high]))
-        levels.append(np.median(power[low:high]) / MEDIAN_OF_POWER)
+        # A level found too low makes every residual there too large, on average by its own relative variance; the
+        # median of few bins is itself too high.
+        doubt = 1.0 + (MEDIAN_SPREAD**2 - 0.72) / (high - low)
+        levels.append(np.median(power[low:high]) / MEDIAN_OF_POWER * doubt)
     floor = max(max(levels) * 1e-14, 1e-300)
     heights = np.log(np.maximum(levels, floor))
     smooth = np.interp(wanted, centres, heights)
