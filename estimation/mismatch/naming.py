@@ -61,7 +61,7 @@ def convincing(before: Fit, after: Fit) -> bool:
     changed = float(np.sum((before.residual[before.held] - after.residual[after.held]) ** 2))
     fitted = before.chi2 - after.chi2
     if fitted > before.penalty - after.penalty:
-        return gained > SHARE_HELD * fitted * np.count_nonzero(after.held) / np.count_nonzero(after.rows)
+        return gained > SHARE_HELD * fitted * int(after.held.sum()) / int(after.rows.sum())
     return gained > -2.0 * np.sqrt(changed) - 2.0
 
 
