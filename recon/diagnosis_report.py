@@ -9,7 +9,7 @@ import numpy as np
 
 from estimation.mismatch.diagnosis import Diagnosis, Finding
 from estimation.mismatch.search import Round, Search
-from estimation.mismatch.sensitivity import APART, visibility
+from estimation.mismatch.sensitivity import APART, Visible, visibility
 from recon import views
 from recon.report import Figure, Section, Table, render
 from scanner.terms import catalogue
@@ -86,7 +86,8 @@ def _motion_sections(diagnosis: Diagnosis, found: Search) -> list[Section]:
         text = "Distances in -2 log evidence: 10 over nothing is certain, a lead of 6 over the next names alone."
         rows = evidence_table(found.rounds)
         sections.append(Section("Candidates", text, Table(["effect", "behind", "over nothing"], rows)))
-    return [*sections, _visible(found), _nominal(diagnosis)]
+    told = visibility(found.comparison, found.final, catalogue().values())
+    return [*sections, _visible(told), _nominal(diagnosis)]
 
 
 def _optics(table: Mapping[str, Any]) -> Section:
@@ -157,26 +158,45 @@ def _nominal(diagnosis: Diagnosis) -> Section:
     return Section("Nominal values", text, Table(["value", "pull"], rows))
 
 
-def _visible(search: Search) -> Section:
-    """The map of what these recordings can tell, as a picture."""
-    found = visibility(search.comparison, search.final, catalogue().values())
+def plan_report(plan: Mapping[str, Any], told: Sequence[Visible]) -> str:
+    """What planned excitations could tell, as a page; ``plan`` is the content of plan.json."""
+    names = ", ".join(each["name"] for each in plan["excitations"])
+    alone = sum(each.distance >= APART for each in told)
+    lead = f"{plan['device']} under {names}: {alone} of {len(told)} effects of their natural size could be named alone."
+    runs = [
+        [each["name"], f"{1e3 * each['duration']:.4g}", ", ".join(each["channels"])] for each in plan["excitations"]
+    ]
+    ties = [
+        [each["effect"], f"{each['axis']} {each['stage']}", f"{each['sigma']:.3g}", f"{each['distance']:.3g}",
+         each["nearest"], each["advice"] or "another excitation, or a further channel"]
+        for each in plan["effects"] if each["distance"] < APART
+    ]  # fmt: skip
+    sections = [Section("Planned", "", Table(["excitation", "ms", "channels"], runs)), _visible(told)]
+    if ties:
+        head = ["effect", "where", "σ", "distance σ", "look-alike", "what would tell them apart"]
+        sections.append(Section("What would stay open", "", Table(head, ties)))
+    return render("What a measurement can tell", lead, sections)
+
+
+def _visible(told: Sequence[Visible]) -> Section:
+    """The map of what recordings can tell, as a picture."""
 
     def draw(axes: Axes) -> None:
-        place = np.arange(len(found))
-        axes.barh(place, [max(each.sigma, 0.1) for each in found], color=AFTER, alpha=0.35, label="size")
-        axes.barh(place, [max(each.distance, 0.1) for each in found], color=AFTER, height=0.4, label="distance")
+        place = np.arange(len(told))
+        axes.barh(place, [max(each.sigma, 0.1) for each in told], color=AFTER, alpha=0.35, label="size")
+        axes.barh(place, [max(each.distance, 0.1) for each in told], color=AFTER, height=0.4, label="distance")
         axes.axvline(APART, color=BEFORE, lw=1)
-        axes.set_yticks(place, [f"{each.key} | {each.nearest}" for each in found], fontsize=7)
-        axes.invert_yaxis()
+        axes.set_yticks(place, [f"{each.candidate.key} | {each.nearest.key}" for each in told], fontsize=7)
+        axes.set_ylim(len(told) - 0.4, -0.6)
         axes.set(xscale="log", xlabel="σ, for an effect of its natural size")
-        axes.legend(frameon=False)
+        axes.legend(frameon=False, loc="lower right")
 
     text = (
         "Every effect of its natural size, and what is left of it when its nearest look-alike (named behind it) "
         f"imitates it as well as it can. Beyond {APART} σ it is named alone; below, it needs a further measurement."
     )
     figure = _figure(
-        draw, "size of every effect, and distance to its nearest look-alike", height=1.0 + 0.18 * len(found)
+        draw, "size of every effect, and distance to its nearest look-alike", height=1.0 + 0.18 * len(told)
     )
     return Section("What these recordings can tell", text, figures=[figure], least="34rem")
 

@@ -6,14 +6,18 @@ apart are told apart with probability about Phi(d/2): 95 % at 3.3; one is named 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import Comparison, Fit
-from estimation.mismatch.screen import Screened, all_candidates, screen
+from estimation.mismatch.experiment import Output
+from estimation.mismatch.fit import Comparison, Fit, made_fit
+from estimation.mismatch.model import Candidate, Model
+from estimation.mismatch.noise import Whitener, flat_psd, whitener
+from estimation.mismatch.screen import all_candidates, screen, starts
+from scanner.errors import BadInput
 from scanner.terms import Term
 
 Array = NDArray[np.float64]
@@ -27,56 +31,121 @@ class Visible:
     """How well one effect of its natural size shows.
 
     Attributes:
-        key: the effect, with axis and channel.
+        candidate: the effect, with axis and channel.
         sigma: its size.
-        nearest: the effect that imitates it best.
+        nearest: the effect that imitates it best, itself where there is no other.
         distance: what is left of it after that and all nominal values have done their best [sigma].
     """
 
-    key: str
+    candidate: Candidate
     sigma: float
-    nearest: str
+    nearest: Candidate
     distance: float
 
 
 def visibility(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> list[Visible]:
-    """Every effect around ``fit``, the clearest first; effects already in it are left out."""
+    """Every effect around ``fit``, the clearest first; effects already in it are left out.
+
+    An effect with a time constant or a frequency has the median size of those that it is searched from; a look-alike
+    may take whichever imitates best.
+    """
     taken = {each.key for each in fit.model.candidates}
     candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in taken]
-    screened = [each for each in (screen(comparison, fit, c) for c in candidates) if np.any(each.columns)]
-    seen, apart = distances(fit, screened, comparison.rows)
-    found = []
-    for i, each in enumerate(screened):
-        others = [j for j, other in enumerate(screened) if other.candidate.term.effect != each.candidate.term.effect]
+    found = [(candidate, block) for candidate in candidates for block in columns(comparison, fit, candidate)]
+    if not found:
+        return []
+    sizes, apart = distances(fit, [block for _, block in found], comparison.rows)
+    keys = np.array([candidate.key for candidate, _ in found])
+    effects = np.array([candidate.term.effect for candidate, _ in found])
+    shown = []
+    for candidate in candidates:
+        own = np.flatnonzero(keys == candidate.key)
+        if not own.size:
+            continue
+        i = own[np.argsort(sizes[own])[own.size // 2]]
+        others = np.flatnonzero(effects != candidate.term.effect)
         nearest = min(others, key=lambda j: apart[i, j], default=i)
-        found.append(
-            Visible(each.candidate.key, float(seen[i]), screened[nearest].candidate.key, float(apart[i, nearest]))
+        shown.append(Visible(candidate, float(sizes[i]), found[nearest][0], float(apart[i, nearest])))
+    return sorted(shown, key=lambda each: -each.sigma)
+
+
+def columns(comparison: Comparison, fit: Fit, candidate: Candidate) -> list[Array]:
+    """Sensitivities to a candidate around ``fit``, shape (N, q), for each of its starts that shows anything."""
+    blocks = []
+    for start in starts(candidate):
+        place = iter(start)
+        parameters = tuple(
+            p if p.kind == "fixed" else replace(p, starts=(next(place),)) for p in candidate.term.parameters
         )
-    return sorted(found, key=lambda each: -each.sigma)
+        alone = replace(candidate, term=replace(candidate.term, parameters=parameters))
+        blocks.append(screen(comparison, fit, alone).columns)
+    return [block for block in blocks if np.any(block)]
 
 
-def distances(fit: Fit, screened: list[Screened], rows: NDArray[np.bool_]) -> tuple[Array, Array]:
+def distances(fit: Fit, blocks: Sequence[Array], rows: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Sizes and distances of effects of their natural size.
+
+    Args:
+        blocks: sensitivities to each, shape (N, q).
 
     Returns:
         (size [sigma], shape (n,); distance of effect i to effect j [sigma], shape (n, n)).
     """
-    old = fit.jacobian[rows]
-    normal = old.T @ old + np.diag(fit.model.precision)
-    blocks = [each.columns[rows] for each in screened]
-    ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
-    whole = np.column_stack(blocks)
-    cross = old.T @ whole
-    gram = whole.T @ whole - cross.T @ np.linalg.solve(normal, cross)  # nominal values projected out
-    signals = np.zeros((len(blocks), whole.shape[1]))
-    for i in range(len(blocks)):
-        signals[i, ends[i] : ends[i + 1]] = 1.0 / np.sqrt(blocks[i].shape[1])
-    overlap = signals @ gram
-    size = np.sqrt(np.maximum(np.einsum("ij,ij->i", overlap, signals), 0.0))
-    apart = np.empty((len(blocks), len(blocks)))
+    signals = np.stack([block[rows] @ np.full(block.shape[1], block.shape[1] ** -0.5) for block in blocks], axis=1)
+    return left_over(fit.jacobian[rows], fit.model.precision, signals, [block[rows] for block in blocks])
+
+
+def left_over(nominal: Array, precision: Array, signals: Array, blocks: Sequence[Array]) -> tuple[Array, Array]:
+    """What of ``signals`` neither nominal values nor a look-alike can imitate, within their priors.
+
+    Args:
+        nominal: sensitivities to the nominal values, shape (N, m); ``precision``: of their priors, (m,).
+        signals: shape (N, n).
+        blocks: sensitivities to each look-alike, per prior standard deviation, shape (N, q).
+
+    Returns:
+        (size behind the nominal values, shape (n,); size behind look-alike j too, shape (n, len(blocks))).
+    """
+    whole = np.column_stack([signals, *blocks])
+    cross = nominal.T @ whole
+    gram = whole.T @ whole - cross.T @ np.linalg.solve(nominal.T @ nominal + np.diag(precision), cross)
+    n = signals.shape[1]
+    ends = n + np.cumsum([0, *(block.shape[1] for block in blocks)])
+    size = np.maximum(np.diag(gram)[:n], 0.0)
+    apart = np.empty((n, len(blocks)))
     for j in range(len(blocks)):
         part = slice(ends[j], ends[j + 1])
+        overlap = gram[part, :n]
         inner = gram[part, part] + np.eye(blocks[j].shape[1])
-        explained = np.einsum("ij,ji->i", overlap[:, part], np.linalg.solve(inner, overlap[:, part].T))
-        apart[:, j] = np.sqrt(np.maximum(size**2 - explained, 0.0))
-    return size, apart
+        apart[:, j] = size - np.einsum("ij,ij->j", overlap, np.linalg.solve(inner, overlap))
+    return np.sqrt(size), np.sqrt(np.maximum(apart, 0.0))
+
+
+def linearised(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Comparison, Fit]:
+    """The comparison that a model would meet if its own signals at ``x`` were recorded, and its perfect fit there."""
+    runs = [
+        replace(run, outputs=tuple(replace(o, data=signal) for o, signal in zip(run.outputs, signals, strict=True)))
+        for run, signals in zip(model.runs, model.outputs(x), strict=True)
+    ]
+    made = Model(runs, model.device, model.candidates, model.mains)
+    comparison = Comparison(runs, whiteners)
+    residual, steps = comparison.residual(made, x), np.full(x.size, 1e-4)
+    for _ in range(2):  # the second time with steps of the right size
+        jacobian = comparison.jacobian(made, x, residual, steps)
+    return comparison, made_fit(comparison, made, x, residual, jacobian, comparison.rows)
+
+
+def stated_whitener(output: Output) -> Whitener:
+    """The whitening for the noise that is stated; for that of the channel's own high frequencies where none is.
+
+    Raises:
+        BadInput: the stated noise is zero.
+    """
+    if output.noise_sd is None:
+        return whitener(flat_psd(output.data, output.bins), output.data.size, output.guard)
+    if output.noise_sd <= 0.0:
+        hint = "state noise_var or noise_sd of the readout"
+        raise BadInput("its readout states no noise: every effect would show", channel=output.name, hint=hint)
+    thinning = output.step * output.full_rate
+    power = output.data.size * output.noise_sd**2 / thinning
+    return whitener(np.full(output.bins, power), output.data.size, output.guard)

@@ -1,4 +1,7 @@
-"""``lissajous diagnose REC...``: locate, name and model what the nominal device leaves out."""
+"""``lissajous diagnose REC...``: locate, name and model what the nominal device leaves out.
+
+With ``--plan`` nothing is compared: what recordings under such excitations could tell.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +12,48 @@ from typing import Any
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="recordings of one device (.h5)")
+    parser.add_argument(
+        "--plan",
+        action="store_true",
+        help="no diagnosis: what such recordings could tell; REC may be an excitation (.toml)",
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
+    parser.add_argument(
+        "--device",
+        type=Path,
+        metavar="FILE",
+        help="device TOML in place of the recording's own; with --plan, or a name",
+    )
     parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms of your own")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.diagnosing import diagnose_files
+    from recon.planning import plan_files
 
-    return diagnose_files(
+    work = plan_files if args.plan else diagnose_files
+    return work(
         args.recordings, args.output, device=args.device, terms=args.terms, mapping=args.mapping, quiet=args.json
     )
 
 
 def tell(summary: dict[str, Any]) -> str:
+    return _plan(summary) if "excitations" in summary else _diagnosis(summary)
+
+
+def _plan(summary: dict[str, Any]) -> str:
+    apart = [each for each in summary["effects"] if each["distance"] >= summary["apart"]]
+    lines = [f"{summary['output']}: {len(apart)} of {len(summary['effects'])} effects could be named alone"]
+    lines += [
+        f"  {each['axis']} {each['effect']}: {each['sigma']:.3g} sigma, {each['distance']:.3g} from {each['nearest']}"
+        + (f" ({each['advice']})" if each["advice"] else "")
+        for each in summary["effects"]
+    ]
+    return "\n".join([*lines, f"  report {summary['output']}/report.html"])
+
+
+def _diagnosis(summary: dict[str, Any]) -> str:
     lines = [f"{summary['output']}: {summary['verdict']}"]
     for finding in summary["findings"]:
         change = finding["heldout"]
