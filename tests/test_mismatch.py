@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,14 +12,18 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from estimation.mismatch.diagnosis import diagnose
-from estimation.mismatch.experiment import between, experiment
-from estimation.mismatch.fit import Comparison
-from estimation.mismatch.model import Model
+from estimation.mismatch.experiment import between, experiment, thinned
+from estimation.mismatch.fit import Comparison, solve
+from estimation.mismatch.free import FREE
+from estimation.mismatch.instead import instead
+from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.noise import noise_psd, whitener
-from estimation.mismatch.start import first_whiteners, grown, started, windows
+from estimation.mismatch.screen import all_candidates
+from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
 from recon.cli import main
 from scanner.device import Axis, Device, Drive, Mechanics, Position
 from scanner.recording import Recording
+from scanner.terms import catalogue
 
 F0, RATE, N = 500.0, 40e3, 8000
 K = 1e-12 * (2 * np.pi * F0) ** 2
@@ -137,6 +142,45 @@ def test_whitened_noise_is_white_and_of_unit_size() -> None:
     white = whitener(psd, noise.size, (20, 20))(noise)
     assert white.std() == pytest.approx(1.0, abs=0.03)
     assert abs(np.corrcoef(white[:-1], white[1:])[0, 1]) < 0.05
+
+
+def test_red_noise_is_measured_between_the_lines_of_a_multisine() -> None:
+    from scipy.signal import lfilter
+
+    noise = lfilter([1.0], [1.0, -0.95], np.random.default_rng(3).normal(0, 1e-3, N))
+    run = experiment(recording(), DEVICE)
+    model = Model([run], DEVICE)
+    x = np.zeros(len(model.free))
+    data = model.outputs(x)[0][0] + noise[: run.outputs[0].data.size]
+    noisy = replace(run, outputs=(replace(run.outputs[0], data=data),))
+    whiten = measured_whiteners(Model([noisy], DEVICE), x)[0][0]
+    white = whiten(noise[: data.size])
+    slow = np.abs(np.fft.rfft(white))[2:100] ** 2 / white.size  # below 500 Hz, where lines stand every 62.5 Hz
+    assert 0.6 < slow.mean() < 1.3
+
+
+def test_thinning_leaves_the_compared_band_as_it_is() -> None:
+    t = np.arange(20_000)
+    for f in (0.02, 0.1, 0.3):  # of the thinned rate; 0.35 is the highest that is compared
+        shown = thinned(np.sin(2 * np.pi * f / 4 * t), 4)[50:-50]
+        assert np.abs(shown - np.sin(2 * np.pi * f / 4 * t[::4])[50:-50]).max() < 1e-4
+
+
+def test_two_effects_are_found_around_a_free_correction() -> None:
+    """Around a fit that follows the motion, first order tells which two named terms would do the same."""
+    size = np.abs(signals(0.0, 0.0)[1]).max()
+    run = experiment(recording(k3=0.06 * K / size**2, gain=0.15, seed=4), DEVICE)
+    nominal = Model([run], DEVICE)
+    comparison = Comparison([run], first_whiteners(nominal))
+    stops = windows(nominal)
+    early = grown(comparison, nominal, started(comparison, nominal, stops[0]).x, stops)[-1]
+    free = Candidate(FREE["free-mechanics"], "x", "sense")
+    model = Model([run], DEVICE, [free], nominal.mains)
+    stood_in = solve(comparison, model, model.embed(early.model, early.x), turns=20)
+    pool = [c for c in all_candidates(DEVICE, nominal, catalogue().values()) if not c.channel.startswith("angle")]
+    best = instead(comparison, stood_in, free, pool, pairs=True)[0]
+    assert {each.term.effect for each in best.model.candidates} == {"cubic-stiffness", "gain-drift"}
+    assert best.evidence < stood_in.evidence - 100.0
 
 
 def test_a_jump_stays_sharp_and_a_sine_is_exact_between_samples() -> None:

@@ -14,7 +14,7 @@ from scanner.device import Axis, Capacitance, Mechanics
 from scanner.drift import settling
 from scanner.harmonics import capacitance_harmonics, readout_response
 from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, electrostatic_torque
-from scanner.lowpass import lowpass, response, step_coefficients
+from scanner.lowpass import low_passed, lowpass, response, step_coefficients
 from scanner.parametric import sine_drive, slow_flow, steady_state, stiffness_modulation, threshold, tongue_edges
 from scanner.trajectory import integrate, thirds
 
@@ -166,6 +166,16 @@ def test_sections_step_exactly_as_their_response() -> None:
     assert np.abs(got - response(f, (40_800.0, 41_100.0))) < 2e-4  # linear between samples: (pi f/rate)^2 / 3
     slope = np.diff(np.angle(response(np.array([31_000.0, 31_001.0]), (40_800.0, 41_100.0))))
     assert np.degrees(slope[0]) == pytest.approx(-0.0018, abs=1e-4)  # SEEDS.md section 3
+
+
+def test_a_section_over_a_smooth_signal_is_right_at_twenty_samples_a_turn() -> None:
+    rate, cutoff = 1.25e6, 40_800.0
+    f = rate / 20
+    t = np.arange(4000) / rate
+    shown = low_passed(np.sin(2 * np.pi * f * t), cutoff, 1 / rate)[2000:-1]
+    exact = np.imag(response(f, [cutoff]) * np.exp(2j * np.pi * f * t[2000:-1]))
+    # A step that is exact for an input linear in between is off by (2 pi / 20)^2 / 12 = 8e-3 of it.
+    assert np.abs(shown - exact).max() < 2e-4 * abs(response(f, [cutoff]))
 
 
 def test_transimpedance_response_is_a_derivative() -> None:

@@ -1,6 +1,8 @@
 """Run the diagnosis on sealed recordings, open the keys, and count.
 
-    python -m benchmarks.concealed.score RECORDINGS KEYS.json OUT [--timeout 600] [--workers 2]
+    python -m benchmarks.concealed.score RECORDINGS KEYS OUT [--timeout 600] [--workers 2]
+
+KEYS is a file of keys, or the folder into which they are being written: what is there by now is scored.
 
 Writes ``OUT/<recording>/`` (what the diagnosis wrote), ``OUT/score.json`` and ``OUT/score.md``. A recording whose
 diagnosis was run into the same OUT is not run again. Keys with one effect and no distances are taken as well.
@@ -21,6 +23,8 @@ from typing import Any
 from tqdm import tqdm
 
 from benchmarks.concealed.table import markdown, summary
+
+KEYS = "keys.json"
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,14 @@ def load(name: str, key: dict[str, Any], out: Path) -> Run:
     return Run(name, opened(key), diagnosis, ran["seconds"], failure)
 
 
+def keys_of(path: Path) -> dict[str, Any]:
+    """Keys by recording, from one file or from a folder of single ones."""
+    if path.is_dir():
+        return {each.stem: json.loads(each.read_text()) for each in sorted(path.glob("*.json")) if each.name != KEYS}
+    keys: dict[str, Any] = json.loads(path.read_text())
+    return keys
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Diagnose sealed recordings, then open their keys and count.")
     parser.add_argument("recordings", type=Path)
@@ -84,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=2, choices=(1, 2))
     parser.add_argument("--command", default=str(Path(sys.executable).with_name("lissajous")))
     options = parser.parse_args(arguments)
-    keys = json.loads(options.keys.read_text())
+    keys = keys_of(options.keys)
 
     def run(name: str) -> Run:
         out = options.out / name
