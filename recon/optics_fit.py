@@ -27,6 +27,9 @@ MOST = 200_000
 FOLDS, HELD = 20, 5
 """Blocks of time a scan is cut into; every ``HELD``-th is held out of every fit."""
 
+PATCH = 4
+"""Cells along a side of what samples of one place share: detail that the picture does not resolve."""
+
 SAMPLES_PER_CELL = 6.0
 COARSEST, FINEST = 24, 200
 """Cells along a side of the picture: few have a wide reach and no detail, as many as the samples fill tell most."""
@@ -187,7 +190,6 @@ class Fit:
         free: names of the free numbers; sd: of their priors.
         p: all numbers.
         seen: scene and residual under them.
-        value: misfit, with the priors' penalty.
         information: of the free numbers, in their own units and without the priors, shape (free, free).
         held_chi2: reduced chi-square of the held-out samples.
     """
@@ -196,20 +198,8 @@ class Fit:
     sd: Array
     p: Numbers
     seen: Seen
-    value: float
     information: Array
     held_chi2: float
-
-    @property
-    def evidence(self) -> float:
-        """-2 log evidence (Laplace); less is better."""
-        inner = np.eye(self.sd.size) + self.sd[:, None] * self.information * self.sd
-        return self.value + float(np.linalg.slogdet(inner)[1])
-
-    @property
-    def spread(self) -> Array:
-        """Posterior standard deviations of the free numbers."""
-        return np.sqrt(np.diag(np.linalg.inv(self.information + np.diag(self.sd**-2))))
 
 
 def fit(scan: Scan, free: Numbers, p: Numbers, noise: Noise, cells: int, turns: int = 6) -> Fit:
@@ -256,7 +246,30 @@ def fit(scan: Scan, free: Numbers, p: Numbers, noise: Noise, cells: int, turns: 
         if gain < 0.1:
             break
     held = float(np.mean(seen.residual[scan.held] ** 2) / noise.scatter)
-    return Fit(names, sd, placed(x), seen, float(value), information / np.outer(sd, sd), held)
+    shared = _patch_sums(here.look, weight * seen.residual, columns, cells)
+    return Fit(names, sd, placed(x), seen, _doubted(information, shared) / np.outer(sd, sd), held)
+
+
+def _patch_sums(at: Look, score: Array, columns: Array, cells: int) -> Array:
+    """``score`` (n,) times ``columns`` (n, k), summed over the samples of every patch of the picture, (patches, k)."""
+    across = cells // PATCH + 1
+    column, row = (np.clip(place // PATCH, 0, across - 1).astype(np.intp) for place in (at.u, at.v))
+    patch, patches = row * across + column, across**2
+    sums = np.array([np.bincount(patch, score * each, patches) for each in columns.T])
+    return sums.reshape(columns.shape[1], patches).T
+
+
+def _doubted(information: Array, sums: Array) -> Array:
+    """Information of samples whose residuals go together within a patch: H S^-1 H, with S the scatter of ``sums``.
+
+    What the cells do not resolve is no noise: all samples of a place see it. Nothing becomes more certain by this.
+    Liang & Zeger 1986, "Longitudinal data analysis using generalized linear models", eq. 7.
+    """
+    root = np.linalg.cholesky(information + 1e-9 * (1.0 + np.trace(information)) * np.eye(len(information)))
+    whitened = np.linalg.solve(root, sums.T)
+    scatter, ways = np.linalg.eigh(whitened @ whitened.T)
+    ways = root @ ways
+    return np.asarray(ways / np.maximum(scatter, 1.0) @ ways.T)
 
 
 def foretold(scan: Scan, p: Numbers, cells: int) -> float:
