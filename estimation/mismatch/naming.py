@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.screen import screen
+from estimation.mismatch.screen import Screened, screen
+from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
 
@@ -87,33 +89,57 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], thr
 
 
 def race(
-    comparison: Comparison, nominal: Model, early: Fit, stops: Sequence[float], candidates: Sequence[Candidate]
+    comparison: Comparison, nominal: Model, early: Sequence[Fit], stops: Sequence[float], candidates: Sequence[Candidate]
 ) -> list[Fit]:
-    """Fits of candidates that grow window by window from where the nominal model begins to fail; laggards drop out.
+    """Fits of candidates that grow window by window from where the nominal model still follows; laggards drop out.
 
     A nominal model that has lost the motion's phase is nothing to linearise around, the one that is about to is: first
-    order there says who may start.
+    order there says who may start. They start from where nothing was lost yet: what a failing model does to the nominal
+    values leads astray.
+
+    Args:
+        early: fits of the nominal model over the windows ``stops``.
     """
-    base = solve(comparison, nominal, nominal.embed(early.model, early.x), stops[0], 8)
-    field = sorted((screen(comparison, base, each, stops[0]) for each in candidates), key=lambda each: -each.gain)
+    first = _failing(early)
+    followed = early[max(first - 1, 0)]
+    base = solve(comparison, nominal, nominal.embed(early[first].model, early[first].x), stops[first], 8)
+    field = sorted((screen(comparison, base, each, stops[first]) for each in candidates), key=lambda each: -each.gain)
     few = base.rows.sum() > MANY_SAMPLES
     starters = [each for i, each in enumerate(field) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
-    running = [(each.model, each.x) for each in starters]
+    running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in starters]
     fits: list[Fit] = []
-    for stop in stops:
-        turns, tolerance = (14, 0.05) if stop == stops[-1] else (6, 1.0)
+    for stop in _eased(stops[max(first - 1, 0) :]) if first else stops:
+        turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
         fits = []
         for model, x in running:
             best = min((fit.evidence for fit in fits if possible(fit)), default=np.inf)
-            fit = solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS)
-            if stop == stops[0] and fit.chi2 + fit.penalty > base.chi2 + base.penalty:
-                # Stuck: with one more law a fit cannot be worse. First order went too far; start where there is none.
-                x = model.embed(base.model, base.x)
-                fit = solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS)
-            fits.append(fit)
+            fits.append(solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS))
         fits.sort(key=lambda fit: fit.evidence if possible(fit) else np.inf)
         best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
         margin = max(60.0, 0.5 * (worst - best))
         kept = [fit for fit in fits if fit.evidence < best + margin]
         running = [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
     return [fit for fit in fits if possible(fit)]
+
+
+def _failing(early: Sequence[Fit]) -> int:
+    """The first window over which the nominal model follows the motion worse than before."""
+    levels = [fit.chi2 / fit.rows.sum() for fit in early]
+    first = 0
+    while first + 1 < len(levels) and levels[first] < 2.0 * min([TRACKED, *levels[:first]]):
+        first += 1
+    return first
+
+
+def _eased(stops: Sequence[float]) -> list[float]:
+    """Windows after the first of ``stops``, with one in between each: a law is added where a little has gone wrong."""
+    return [stop for low, high in pairwise(stops) for stop in (float(np.sqrt(low * high)), high)]
+
+
+def _unspoilt(each: Screened, followed: Fit) -> Array:
+    """Where a candidate starts: the nominal values of the last window that was followed, its law not there yet."""
+    x = each.model.embed(followed.model, followed.x)
+    for i, f in enumerate(each.model.free):
+        if f.kind == "term" and f.parameter is not None and f.parameter.kind not in AMPLITUDES:
+            x[i] = each.x[i]
+    return x

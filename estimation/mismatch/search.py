@@ -136,7 +136,7 @@ def _extended(
         if taken or best.chi2 < TRACKED * best.rows.sum():
             fits = near(comparison, best, candidates)
         else:
-            fits = race(comparison, best.model, *_failed(early, stops), candidates)
+            fits = race(comparison, best.model, early, stops, candidates)
         if not fits or best.evidence - fits[0].evidence < LEAD_OVER_NOTHING:
             return
         say(f"refit with {fits[0].model.candidates[-1].key}")
@@ -279,12 +279,3 @@ def with_line(comparison: Comparison, fit: Fit) -> Fit:
     )
     model = Model(runs, fit.model.device, fit.model.candidates, fit.model.mains)
     return replace(fit, model=model)
-
-
-def _failed(early: Sequence[Fit], stops: Sequence[float]) -> tuple[Fit, Sequence[float]]:
-    """The first window over which the nominal model follows the motion worse than before, and those from there on."""
-    levels = [fit.chi2 / fit.rows.sum() for fit in early]
-    first = 0
-    while first + 1 < len(levels) and levels[first] < 2.0 * min([TRACKED, *levels[:first]]):
-        first += 1
-    return early[first], stops[first:]
