@@ -89,7 +89,11 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], thr
 
 
 def race(
-    comparison: Comparison, nominal: Model, early: Sequence[Fit], stops: Sequence[float], candidates: Sequence[Candidate]
+    comparison: Comparison,
+    nominal: Model,
+    early: Sequence[Fit],
+    stops: Sequence[float],
+    candidates: Sequence[Candidate],
 ) -> list[Fit]:
     """Fits of candidates that grow window by window from where the nominal model still follows; laggards drop out.
 
