@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.mismatch.advice import advice, distances_from
 from estimation.mismatch.experiment import experiment
-from estimation.mismatch.fit import Fit
+from estimation.mismatch.fit import Comparison, Fit
 from estimation.mismatch.free import FREE
+from estimation.mismatch.intervals import profile_interval
 from estimation.mismatch.model import Candidate
 from estimation.mismatch.naming import LEAD_OVER_NEXT
 from estimation.mismatch.search import Round, Search, search
+from estimation.mismatch.sensitivity import APART
 from estimation.mismatch.where import correction_curve, where
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
@@ -42,10 +45,14 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Rival:
-    """Another effect in the finding's place, and how probable it is."""
+    """Another effect in the finding's place: how probable it is, and what of the finding it cannot imitate [sigma].
+
+    The distance is None where it was not worked out: for an effect without a law, and for the optics.
+    """
 
     effect: str
     probability: float
+    distance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -159,51 +166,72 @@ def _finding(found: Search, each: Round) -> Finding:
         options[name] = max(options.get(name, 0.0), float(np.exp(-0.5 * np.clip(lead, 0.0, 1400.0))))
     nothing = float(np.exp(-0.5 * np.clip(each.before.evidence - each.after.evidence, 0.0, 1400.0)))
     total = sum(options.values()) + nothing
+    distance = {} if unknown else _distances(found, each)
+    near = {_name(other): distance[other.key] for _, other in reversed(each.leads) if other.key in distance}
     rivals = tuple(
-        Rival(name, weight / total)
+        Rival(name, weight / total, near.get(name))
         for name, weight in sorted(options.items(), key=lambda item: -item[1])
         if name != effect and weight / total > 1e-4
-    )
-    close = [other for lead, other in each.leads if lead < LEAD_OVER_NEXT and _name(other) != effect]
-    advice = "; ".join(
-        f"{other.term.effect}: {text}"
-        for other in close
-        if (
-            text := candidate.term.lookalikes.get(other.term.effect) or other.term.lookalikes.get(candidate.term.effect)
-        )
     )
     return Finding(
         axis=candidate.axis,
         stage=candidate.term.stage,
         effect=effect,
         equation=candidate.term.equation,
-        parameters=() if unknown else estimates(found.final, candidate),
+        parameters=() if unknown else estimates(found.comparison, found.final, candidate),
         where=where(found.comparison, candidate, each.before, each.after),
         probability=options[effect] / total,
         rivals=rivals,
         heldout={"metric": METRIC, "before": each.before.held_chi2, "after": found.final.held_chi2},
         channel=candidate.channel,
         source=candidate.term.source,
-        advice=advice or None,
+        advice=_advice(found, each, distance),
         curve=correction_curve(each.after) if unknown else None,
     )
+
+
+def _distances(found: Search, each: Round) -> dict[str, float]:
+    """How far each named rival stands from what was found, by key [sigma]."""
+    taken = {other.key for other in found.final.model.candidates}
+    rivals = [other for _, other in each.leads if other.term.effect not in FREE and other.key not in taken]
+    return dict(
+        zip((r.key for r in rivals), distances_from(found.comparison, found.final, each.candidate, rivals), strict=True)
+    )
+
+
+def _advice(found: Search, each: Round, distance: Mapping[str, float]) -> str | None:
+    """What would tell the finding from the rivals that it cannot be told from: worked out for the nearest of them."""
+    candidate = each.candidate
+    effect = candidate.term.effect
+    close = {
+        other.key: other
+        for lead, other in each.leads
+        if other.term.effect != effect and (lead < LEAD_OVER_NEXT or distance.get(other.key, np.inf) < APART)
+    }
+    said = []
+    nearest = min(close, key=lambda key: distance.get(key, np.inf), default=None)
+    if nearest is not None and distance.get(nearest, np.inf) < APART:
+        said.append(advice(found.comparison, found.final, candidate, close.pop(nearest), distance[nearest]))
+    for other in close.values():
+        text = candidate.term.lookalikes.get(other.term.effect) or other.term.lookalikes.get(effect)
+        said += [f"{other.term.effect}: {text}"] if text else []
+    return "; ".join(said) or None
 
 
 def _name(candidate: Candidate) -> str:
     return "unknown" if candidate.term.effect in FREE else candidate.term.effect
 
 
-def estimates(fit: Fit, candidate: Candidate) -> tuple[Estimate, ...]:
-    """Physical values of a candidate's parameters with their 95 % intervals, from the posterior in x."""
+def estimates(comparison: Comparison, fit: Fit, candidate: Candidate) -> tuple[Estimate, ...]:
+    """Physical values of a candidate's parameters with their 95 % intervals, by profile likelihood."""
     scales = fit.model.scales(candidate.axis)
-    spread = np.sqrt(np.diag(fit.covariance))
     values = fit.model.values(candidate, fit.x)
     found = []
     for parameter, value in zip(candidate.term.parameters, values, strict=True):
         at = fit.model.index("term", candidate.key, parameter.name)
         ends = [value, value]
         if at is not None:
-            ends = [parameter.value(fit.x[at] + side * 1.96 * spread[at], scales) for side in (-1.0, 1.0)]
+            ends = [parameter.value(end, scales) for end in profile_interval(comparison, fit, at)]
         found.append(Estimate(parameter.name, float(value), (float(min(ends)), float(max(ends))), parameter.unit))
     return tuple(found)
 
