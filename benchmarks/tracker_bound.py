@@ -1,4 +1,4 @@
-"""Phase error of the tracker against the posterior Cramer-Rao bound (docs/bound.md), from 40 to 0 dB.
+"""Phase error of the tracker against the posterior Cramer-Rao bound (docs/bound.md), 40 to 0 dB, and its intervals.
 
 The stiffness of both axes drifts as an integrated random walk, drawn anew for every path; several noises are laid over
 each path. The tracker is not told the drift's law: it tunes its own. Run: python benchmarks/tracker_bound.py [paths]
@@ -62,10 +62,11 @@ def with_noise(recording: Recording, snr_db: float, rng: np.random.Generator, de
 
 
 def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
-    """Error and bound [deg] and their ratio, by SNR and axis."""
+    """Error and bound [deg], their ratio, share of blocks whose 95 % interval holds the truth; by SNR and axis."""
     device = device_with(shared)
     squares: dict[tuple[int, str], list[NDArray[np.float64]]] = {}
     bounds: dict[tuple[int, str], list[NDArray[np.float64]]] = {}
+    held: dict[tuple[int, str], list[NDArray[np.bool_]]] = {}
     for path in range(paths):
         rng = np.random.default_rng(path)
         drift = {axis: Drift(wandering(rng)) for axis in DRIVES}
@@ -84,16 +85,20 @@ def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
                     (own,) = (s for s in senses(noisy, device) if s.channel.name == sense.channel.name)
                     prepared = prepare(noisy, device, own, references)
                     begin, _ = signed(prepared, starting_belief(prepared, device))
-                    found = follow(prepared, begin, tuned_walk(prepared, begin)).states
+                    found = follow(prepared, begin, tuned_walk(prepared, begin))
                     for i, name in enumerate(sense.axes):
-                        error = found[:, i * STATES + PHASE] - truth[:, i * STATES + PHASE]
+                        error = found.states[:, i * STATES + PHASE] - truth[:, i * STATES + PHASE]
                         error = (error + np.pi / 2) % np.pi - np.pi / 2
                         squares.setdefault((snr, name), []).append(error**2)
                         bounds.setdefault((snr, name), []).append(least[:, i] ** 2)
+                        within = np.abs(error) < 1.96 * found.sds[:, i * STATES + PHASE]
+                        held.setdefault((snr, name), []).append(within)
     out: dict[str, dict[str, dict[str, float]]] = {}
     for (snr, name), values in squares.items():
         rmse, least = (float(np.rad2deg(np.sqrt(np.mean(v)))) for v in (values, bounds[snr, name]))
-        out.setdefault(f"{snr} dB", {})[name] = {"rmse_deg": rmse, "bound_deg": least, "ratio": rmse / least}
+        share = float(np.mean(held[snr, name]))
+        told = {"rmse_deg": rmse, "bound_deg": least, "ratio": rmse / least, "held": share}
+        out.setdefault(f"{snr} dB", {})[name] = told
     return out
 
 

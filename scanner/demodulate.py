@@ -9,9 +9,7 @@ Array = NDArray[np.float64]
 Phasors = NDArray[np.complex128]
 
 
-def block_phasors(
-    values: Array, rate: float, start: float, frequency: float, block: int
-) -> tuple[Array, Phasors]:
+def block_phasors(values: Array, rate: float, start: float, frequency: float, block: int) -> tuple[Array, Phasors]:
     """Amplitude and phase of ``values`` near ``frequency`` in consecutive blocks.
 
     Every block is fitted, under a Hann window, with an offset and a sine: values = c + Im(Z exp(2 pi i f (t - tc))), so
@@ -42,10 +40,6 @@ def block_length(frequency: float, rate: float, cycles: float) -> int:
 
 def unwrapped(phase: Array) -> Array:
     """Phase without jumps, each step continuing the slope before it, so that a frequency that runs away is followed."""
-    out = np.array(phase, dtype=np.float64)
-    slope = 0.0
-    for i in range(1, out.size):
-        step = out[i] - out[i - 1] - slope
-        out[i] -= 2 * np.pi * np.round(step / (2 * np.pi))
-        slope = out[i] - out[i - 1]
-    return out
+    bend = np.diff(np.diff(phase), prepend=0.0)
+    slope = np.cumsum(bend - 2 * np.pi * np.round(bend / (2 * np.pi)))
+    return np.concatenate([phase[:1], phase[0] + np.cumsum(slope)])

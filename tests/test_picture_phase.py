@@ -171,3 +171,13 @@ def test_a_flipped_axis_is_measured_alike() -> None:
     plain, flipped = (motion.axes["x"] for motion in found)
     assert np.allclose(flipped.phase - plain.phase, np.pi, atol=1e-3)
     assert np.allclose(flipped.angle.read(), -plain.angle.read(), atol=1e-4)
+
+
+def test_phases_are_told_against_the_drive_that_pulls() -> None:
+    plain = devices.load("imaging")
+    lagging = {n: replace(a, terms={"drive-lag": {"f_c": 1.5e5}}) for n, a in plain.axes.items()}
+    device = replace(plain, axes=lagging)
+    recording, truth = run(Experiment(device=device, duration=0.01, sample_rate=RATE, drift={}), seed=5)
+    silent = without(recording, "sense")
+    found, _ = refined(silent, device, estimate(silent, device, "picture"), silent["intensity"], GRID, {})
+    assert max(rmse(found, truth).values()) < 0.2  # the lag alone turns the phase of x by 5 degrees

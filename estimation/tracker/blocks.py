@@ -21,7 +21,7 @@ from scanner.channel import Channel
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-CHUNK = 1 << 20  # samples read at a time
+CHUNK = 1 << 17  # samples read at a time: they stay in the cache
 CLIPPED_RUN = 8  # equal samples in a row at a block's extreme: noise would not let them be equal
 TABLE_REACH = 0.03  # cycles that the highest harmonic may slip against its table over a block
 
@@ -65,6 +65,7 @@ def project(
     omega: Array,
     settling: int = 0,
     prepared: Callable[[Array], Array] | None = None,
+    may_clip: bool = True,
 ) -> Projections:
     """Project a channel's blocks, reading it chunk by chunk.
 
@@ -73,6 +74,8 @@ def project(
         lines: as in ``basis``. omega: angular frequency of each reference in each block, shape (blocks, references).
         settling: samples at the channel's beginning that are left out.
         prepared: done to the samples before (a square).
+        may_clip: runs of equal samples at a block's extremes are a converter's end and left out. A drive's flat tops
+            are what the mirror feels.
     """
     blocks, m = starts.size, 1 + 2 * len(lines)
     sums, squares, tuned = np.zeros((blocks, m)), np.zeros(blocks), np.empty_like(omega)
@@ -95,8 +98,9 @@ def project(
             rows = _rows(values, starts[part] - first, length)
             _project(rows, folded, sums[part], squares[part])
             geometry[part] = whole
-            for i in np.flatnonzero(np.isnan(squares[part]) | _flat(rows)):
-                k, used = part.start + int(i), _usable(rows[i])
+            flat = _flat(rows) if may_clip else np.zeros(len(rows), np.bool_)
+            for i in np.flatnonzero(np.isnan(squares[part]) | flat):
+                k, used = part.start + int(i), _usable(rows[i]) if may_clip else np.isfinite(rows[i])
                 own, left = table[:, used], rows[i, used]
                 sums[k], squares[k], counts[k] = own @ left, left @ left, left.size
                 geometry[k] = len(grams)

@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.tracker.backward import run_smoother
 from estimation.tracker.orbit import SENSED, law_of, turn_of
 from estimation.tracker.signal import Prepared
-from estimation.tracker.smoother import GAIN, LOG, PHASE, STATES, predict, run_smoother
+from estimation.tracker.smoother import DAMPING, GAIN, LOG, PHASE, STATES, STIFFNESS, predict
 from scanner.harmonics import readout_response
 
 Array = NDArray[np.float64]
@@ -70,4 +71,6 @@ def _information(prepared: Prepared, k: int, x: Array) -> Array:
         gradient[at + PHASE] = np.real((1j * orders * turn.seen) @ turned)
         gradient[at + LOG] = np.real(turn.seen_by_log @ turned)
         gradient[at + GAIN] = np.real(turn.seen[1:] @ turned[1:])
+        for state, by in ((STIFFNESS, turn.by_stiffness), (DAMPING, turn.by_damping)):  # off the middle, by the rate
+            gradient[at + state] = offset * (by.imag * gradient[at + PHASE] + by.real * gradient[at + LOG])
     return gradient @ gradient.T

@@ -23,7 +23,8 @@ from scanner.laws import capacitance, capacitance_curvature, capacitance_slope
 
 Array = NDArray[np.float64]
 
-POINTS = 48  # a turn; exact for harmonics below the 24th
+POINTS = 32  # a turn; exact for harmonics below the 16th
+QUARTER = POINTS // 4
 SENSED = 8  # highest harmonic of the readout that is used
 MOVED = 5  # highest harmonic of the motion that is modelled
 DRIVEN = 4  # harmonics of the drive's force, the mean included
@@ -123,18 +124,25 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
     Returns:
         Turn.
     """
-    seen_at, slope_at = np.empty(POINTS), np.empty(POINTS)
-    bend_at = np.empty(POINTS)
-    for j in range(POINTS // 4 + 1):  # sin u takes each of its values twice in a turn
-        for theta_sign in (1, -1):
-            theta = theta_sign * amplitude * SIN[1, j]
-            value = capacitance(theta, law.C0, law.Cb, law.theta0, law.theta_th)
-            slope = capacitance_slope(theta, law.C0, law.theta0, law.theta_th)
-            bend = capacitance_curvature(theta, law.C0, law.theta0, law.theta_th)
-            first = j if theta_sign > 0 else (POINTS - j) % POINTS
-            for i in (first, (POINTS // 2 - first) % POINTS):
-                seen_at[i], slope_at[i], bend_at[i] = value, slope, bend
+    seen_at, slope_at, bend_at = np.empty(POINTS), np.empty(POINTS), np.empty(POINTS)
     square, square_slope = np.full(POINTS, force[0].real), np.zeros(POINTS)
+    torque, stiff, own = np.empty(POINTS), np.empty(POINTS), np.zeros(POINTS)
+    by_log, by_phase = np.empty(POINTS), np.empty(POINTS)
+    for j in range(QUARTER + 1):  # sin u takes each of its values twice in a turn, an even comb four times
+        theta = amplitude * SIN[1, j]
+        value = capacitance(theta, law.C0, law.Cb, law.theta0, law.theta_th)
+        slope = capacitance_slope(theta, law.C0, law.theta0, law.theta_th)
+        bend = capacitance_curvature(theta, law.C0, law.theta0, law.theta_th)
+        for i in (j, 2 * QUARTER - j):
+            seen_at[i], slope_at[i], bend_at[i] = value, slope, bend
+        if law.theta_th == 0.0:
+            slope = -slope
+        else:
+            value = capacitance(-theta, law.C0, law.Cb, law.theta0, law.theta_th)
+            slope = capacitance_slope(-theta, law.C0, law.theta0, law.theta_th)
+            bend = capacitance_curvature(-theta, law.C0, law.theta0, law.theta_th)
+        for i in ((POINTS - j) % POINTS, 2 * QUARTER + j):
+            seen_at[i], slope_at[i], bend_at[i] = value, slope, bend
     for m in range(1, DRIVEN):
         if force[m] != 0.0:
             n = m * law.turn
@@ -142,12 +150,10 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
             for j in range(POINTS):
                 square[j] += line.real * COS[n, j] - line.imag * SIN[n, j]
                 square_slope[j] += n * (line.real * SIN[n, j] + line.imag * COS[n, j])  # by phi, at fixed u
-    torque, stiff = np.empty(POINTS), np.empty(POINTS)
     for j in range(POINTS):
         torque[j] = law.pull * slope_at[j] * square[j] + law.push * square[j]
         stiff[j] = law.pull * bend_at[j] * square[j]
     moved = np.zeros(MOVED + 1, np.complex128)
-    own = np.zeros(POINTS)
     for n in range(MOVED + 1):
         if n != 1:
             held = k - n * n * w * w * law.J + 1j * n * w * b
@@ -156,18 +162,16 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
             moved[n] = _line(torque, n) / held
             for j in range(POINTS):
                 own[j] += moved[n].real * COS[n, j] - moved[n].imag * SIN[n, j]
-    by_log, by_phase = np.empty(POINTS), np.empty(POINTS)
     for j in range(POINTS):
+        swing = amplitude * SIN[1, j]
         torque[j] += stiff[j] * own[j]
-        by_log[j] = stiff[j] * amplitude * SIN[1, j]
+        by_log[j] = stiff[j] * swing
         by_phase[j] = (law.pull * (slope_at[j] + bend_at[j] * own[j]) + law.push) * square_slope[j]
         if law.position:
-            slope_at[j], bend_at[j] = 1.0, 0.0
-            seen_at[j] = amplitude * SIN[1, j] + own[j]
+            seen_at[j], slope_at[j] = swing + own[j], swing
         else:
             seen_at[j] += (slope_at[j] + 0.5 * bend_at[j] * own[j]) * own[j]
-            slope_at[j] += bend_at[j] * own[j]
-        slope_at[j] *= amplitude * SIN[1, j]
+            slope_at[j] = (slope_at[j] + bend_at[j] * own[j]) * swing
     inertia = 2j * w * law.J + b
     first = 1j * _line(torque, 1) / amplitude
     rate = (first + law.J * w * w - k - 1j * w * b) / inertia

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from estimation.reference import Reference
 from estimation.signals import Sense, drive_voltage, is_capacitive
 from estimation.tracker.blocks import Projections, project, residual_variance, solved
-from estimation.tracker.orbit import DRIVEN, SENSED, AxisLaw, axis_law
+from estimation.tracker.orbit import COS, DRIVEN, POINTS, SENSED, SIN, AxisLaw, axis_law
 from estimation.tracker.smoother import Signal
 from scanner.channel import Channel
 from scanner.device import Amdm, Axis, Device
 from scanner.errors import BadInput
-from scanner.harmonics import capacitance_harmonics, readout_response
+from scanner.harmonics import readout_response
+from scanner.laws import capacitance
 from scanner.recording import Recording
 
 Array = NDArray[np.float64]
@@ -162,7 +163,7 @@ def drive_force(channel: Channel | None, time: Array, width: float, psi: Array, 
     orders = orders[orders * law.turn * w.max() < 2 * np.pi * NYQUIST_SHARE * rate]
     lines = np.stack([np.zeros_like(orders), orders * law.turn], axis=1)
     square = np.square if law.pull else None
-    fitted = solved(project(channel, starts, length, lines, w[:, None], prepared=square))
+    fitted = solved(project(channel, starts, length, lines, w[:, None], prepared=square, may_clip=False))
     late = channel.start + (starts + 0.5 * (length - 1)) / rate - time
     force[:, 0] = fitted[:, 0]
     for m in range(1, min(DRIVEN, orders.size + 1)):
@@ -207,6 +208,7 @@ def _ladder(axis: Axis, sense: Sense) -> Array:
         return np.stack([amplitudes, amplitudes])
     comb = axis.require_capacitance()
     amplitudes = np.linspace(1e-4, 1.6, RUNGS) * comb.theta0
-    sizes = np.array([abs(capacitance_harmonics(float(a), comb, 2)[2]) for a in amplitudes])
+    seen = capacitance(amplitudes[:, None] * SIN[1], comb.C0, comb.Cb, comb.theta0, comb.theta_th)
+    sizes = np.abs(seen @ COS[2]) * (2.0 / POINTS)
     top = int(sizes.argmax())  # beyond it a larger swing gives no larger line
     return np.stack([np.minimum(amplitudes, amplitudes[top]), np.maximum.accumulate(sizes)])

@@ -1,4 +1,4 @@
-"""Kalman filter and fixed-interval smoother over blocks, compiled.
+"""Kalman filter over blocks, compiled; ``backward`` smooths what it leaves.
 
 State of each axis: phase phi, ln A, relative change of stiffness, its trend [1/s], relative change of damping, ln gain;
 then the readout's offset, one for all axes of an electrode. Between two blocks phase and amplitude follow the slow flow
@@ -77,7 +77,8 @@ class Signal(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
-    """One axis over ``h`` seconds: new state (6,), its Jacobian (6, 6) and the covariance (6, 6) that walking adds.
+    """One axis over ``h`` seconds: new state (6,), what phase and ln A take from the first five states (2, 5), and the
+    covariance (6, 6) that walking adds.
 
     walk: spectral densities of white noise on phase and ln A [1/s], trend [1/s^3], damping [1/s], gain [1/s].
     """
@@ -86,44 +87,34 @@ def _flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
     a11, a12 = turn.by_phase.imag, turn.by_log.imag
     a21, a22 = turn.by_phase.real, turn.by_log.real
     # e0, e1, e2: exp(a h) and its first two integrals, by their series; the h here is a fraction of the decay time
-    e0, e1, e2 = np.eye(2), np.eye(2) * h, np.eye(2) * (0.5 * h * h)
+    e = np.zeros((3, 2, 2))
     p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
-    for n in range(1, 9):
-        scale = h / n
-        p11, p12, p21, p22 = (
-            (a11 * p11 + a12 * p21) * scale,
-            (a11 * p12 + a12 * p22) * scale,
-            (a21 * p11 + a22 * p21) * scale,
-            (a21 * p12 + a22 * p22) * scale,
-        )
+    for n in range(9):
         one, two = h / (n + 1), h * h / ((n + 1) * (n + 2))
-        e0[0, 0] += p11
-        e0[0, 1] += p12
-        e0[1, 0] += p21
-        e0[1, 1] += p22
-        e1[0, 0] += p11 * one
-        e1[0, 1] += p12 * one
-        e1[1, 0] += p21 * one
-        e1[1, 1] += p22 * one
-        e2[0, 0] += p11 * two
-        e2[0, 1] += p12 * two
-        e2[1, 0] += p21 * two
-        e2[1, 1] += p22 * two
+        for i, scale in ((0, 1.0), (1, one), (2, two)):
+            e[i, 0, 0] += p11 * scale
+            e[i, 0, 1] += p12 * scale
+            e[i, 1, 0] += p21 * scale
+            e[i, 1, 1] += p22 * scale
+        p11, p12, p21, p22 = (
+            (a11 * p11 + a12 * p21) * one,
+            (a11 * p12 + a12 * p22) * one,
+            (a21 * p11 + a22 * p21) * one,
+            (a21 * p12 + a22 * p22) * one,
+        )
     stiff, damp = law.k * turn.by_stiffness / k, law.b * turn.by_damping / b
-    new, jacobian, added = x.copy(), np.eye(STATES), np.zeros((STATES, STATES))
+    new, taken, added = x.copy(), np.empty((2, DAMPING + 1)), np.zeros((STATES, STATES))
     early = np.zeros(STATES)  # what a kick of the trend in the middle of the step becomes
     for i in range(2):
-        rate_0, rate_1 = turn.rate.imag, turn.rate.real
-        by_trend = e2[i, 0] * stiff.imag + e2[i, 1] * stiff.real
-        new[i] += e1[i, 0] * rate_0 + e1[i, 1] * rate_1 + by_trend * x[TREND]
-        jacobian[i, 0], jacobian[i, 1] = e0[i, 0], e0[i, 1]
-        jacobian[i, STIFFNESS] = e1[i, 0] * stiff.imag + e1[i, 1] * stiff.real
-        jacobian[i, TREND] = by_trend
-        jacobian[i, DAMPING] = e1[i, 0] * damp.imag + e1[i, 1] * damp.real
+        by_trend = e[2, i, 0] * stiff.imag + e[2, i, 1] * stiff.real
+        new[i] += e[1, i, 0] * turn.rate.imag + e[1, i, 1] * turn.rate.real + by_trend * x[TREND]
+        taken[i, PHASE], taken[i, LOG] = e[0, i, 0], e[0, i, 1]
+        taken[i, STIFFNESS] = e[1, i, 0] * stiff.imag + e[1, i, 1] * stiff.real
+        taken[i, TREND] = by_trend
+        taken[i, DAMPING] = e[1, i, 0] * damp.imag + e[1, i, 1] * damp.real
         early[i] = 0.25 * by_trend
         added[i, i] = walk[0] * h
     new[STIFFNESS] += h * x[TREND]
-    jacobian[STIFFNESS, TREND] = h
     early[STIFFNESS], early[TREND] = 0.5 * h, 1.0
     for i in range(STATES):
         for j in range(STATES):
@@ -131,34 +122,43 @@ def _flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
     added[DAMPING, DAMPING] += walk[2] * h
     added[GAIN, GAIN] += walk[3] * h
     for i in range(2):
-        half = 0.5 * jacobian[i, DAMPING]
+        half = 0.5 * taken[i, DAMPING]
         added[i, DAMPING] += walk[2] * h * half
         added[DAMPING, i] += walk[2] * h * half
         added[i, i] += walk[2] * h * half * half
-    return new, jacobian, added
+    return new, taken, added
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _carried(matrix, at, taken, h):  # type: ignore[no-untyped-def]
+    """Multiply ``matrix`` in place from the left by the Jacobian of one axis's step, whose states begin at ``at``."""
+    for v in range(matrix.shape[1]):
+        phase, log = 0.0, 0.0
+        for j in range(DAMPING + 1):
+            phase += taken[0, j] * matrix[at + j, v]
+            log += taken[1, j] * matrix[at + j, v]
+        matrix[at + PHASE, v], matrix[at + LOG, v] = phase, log
+        matrix[at + STIFFNESS, v] += h * matrix[at + TREND, v]
 
 
 @njit(cache=True, error_model="numpy")
 def predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untyped-def]
-    """State and covariance of block k + 1 from those of block k, and the Jacobian of the step."""
+    """State and covariance of block k + 1 from those of block k, and the Jacobian of the step; ``x`` is changed."""
     n = x.size
-    F = np.eye(n)
+    P, F, h = P.copy(), np.eye(n), 0.5 * signal.step
     for half in range(2):
-        G, Q = np.eye(n), np.zeros((n, n))
         for a in range(len(laws)):
             law = law_of(laws[a])
             at = a * STATES
             w = (signal.psi[k + 1, a] - signal.psi[k, a]) / signal.step
-            new, jacobian, added = _flow(
-                law, x[at : at + STATES], w, signal.force[k + half, a], 0.5 * signal.step, walk[a]
-            )
+            new, taken, added = _flow(law, x[at : at + STATES], w, signal.force[k + half, a], h, walk[a])
             x[at : at + STATES] = new
-            G[at : at + STATES, at : at + STATES] = jacobian
-            Q[at : at + STATES, at : at + STATES] = added
+            _carried(F, at, taken, h)
+            _carried(P, at, taken, h)
+            _carried(P.T, at, taken, h)
+            P[at : at + STATES, at : at + STATES] += added
         x[:] = _bounded(laws, signal, x)
-        Q[n - 1, n - 1] = offset_walk * 0.5 * signal.step
-        P = G @ P @ G.T + Q
-        F = G @ F
+    P[n - 1, n - 1] += offset_walk * signal.step
     for a in range(len(laws)):
         for i, most in ((a * STATES + PHASE, UNKNOWN[0]), (a * STATES + LOG, UNKNOWN[1])):
             if P[i, i] > most * most:
@@ -170,29 +170,39 @@ def predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untype
 
 @njit(cache=True, error_model="numpy")
 def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
-    """Coefficients that block k's projections should show in the state ``x``, and their Jacobian (m, states).
+    """Coefficients that block k's projections should show in the state ``x``, and their Jacobian (2, m, states).
 
     A line changes over the block as exp(rate t): the coefficients (3, m) are its value and its first two derivatives,
-    the last one halved. In a free decay the second is worth half a degree.
+    the last one halved. In a free decay the second is worth half a degree. The rate follows stiffness and damping, so
+    that a block off its middle tells of them: left out of the Jacobian, an error of 0.1 % in k looks like a jump.
     """
     m = signal.roots.shape[2]
-    values, jacobian = np.zeros((3, m)), np.zeros((m, x.size))
-    values[0, 0], jacobian[0, x.size - 1] = x[x.size - 1], 1.0
+    values, jacobian = np.zeros((3, m)), np.zeros((2, m, x.size))
+    values[0, 0], jacobian[0, 0, x.size - 1] = x[x.size - 1], 1.0
     for a in range(len(laws)):
         law = law_of(laws[a])
         at = a * STATES
         stiff, damp = law.k * (1.0 + x[at + STIFFNESS]), law.b * (1.0 + x[at + DAMPING])
         turn = turn_of(law, np.exp(x[at + LOG]), x[at + PHASE], signal.w[k, a], stiff, damp, signal.force[k, a])
         values[0, 0] += signal.mean_gain * turn.seen[0].real
-        jacobian[0, at + LOG] = signal.mean_gain * turn.seen_by_log[0].real
-        values[1, 0] += jacobian[0, at + LOG] * turn.rate.real
+        jacobian[0, 0, at + LOG] = signal.mean_gain * turn.seen_by_log[0].real
+        values[1, 0] += jacobian[0, 0, at + LOG] * turn.rate.real
+        moves = (
+            (PHASE, turn.by_phase),
+            (LOG, turn.by_log),
+            (STIFFNESS, turn.by_stiffness * (law.k / stiff)),
+            (DAMPING, turn.by_damping * (law.b / damp)),
+        )
+        for s, by in moves:
+            jacobian[1, 0, at + s] = jacobian[0, 0, at + LOG] * by.real
         slip = signal.w[k, a] + turn.rate.imag - signal.tuned[k, a]
-        gain = np.exp(x[at + GAIN])
+        gain, u = np.exp(x[at + GAIN]), np.exp(1j * (signal.psi[k, a] + x[at + PHASE]))
         for i in range(signal.lines.shape[0]):
             if signal.lines[i, 0] == a:
                 order = signal.lines[i, 1]
                 passed = signal.passed[k, i] + signal.passed_by_w[k, i] * turn.rate.imag
-                turned = gain * passed * np.exp(1j * order * (signal.psi[k, a] + x[at + PHASE]))
+                by_passed = signal.passed_by_w[k, i] / passed if passed != 0.0 else 0.0j
+                turned = gain * passed * u**order
                 line, by_log = turned * turn.seen[order], turned * turn.seen_by_log[order]
                 by_phase = 1j * order * line
                 first = by_log * turn.rate.real + by_phase * slip
@@ -203,8 +213,11 @@ def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
                         (part * first).real,
                         (part * second).real,
                     )
-                    jacobian[j, at + PHASE], jacobian[j, at + LOG] = (part * by_phase).real, (part * by_log).real
-                    jacobian[j, at + GAIN] = values[0, j]
+                    jacobian[0, j, at + PHASE], jacobian[0, j, at + LOG] = (part * by_phase).real, (part * by_log).real
+                    jacobian[0, j, at + GAIN] = values[0, j]
+                    for s, by in moves:
+                        jacobian[0, j, at + s] += (part * line * by_passed).real * by.imag
+                        jacobian[1, j, at + s] = (part * (by_log * by.real + by_phase * by.imag)).real
     return values, jacobian
 
 
@@ -236,27 +249,43 @@ def _acquire(signal, k, a, x, P):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, error_model="numpy")
-def _update(signal, k, x, P, about, values, jacobian):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _update(signal, k, x, P, about, values, jacobian, noise):  # type: ignore[no-untyped-def]
     """Bring block k's measurements, linearised about ``about``, into ``x`` and ``P``, one at a time.
+
+    noise: variance of a sample [V^2].
 
     Returns:
         (log-likelihood, squared normalised innovations, measurements), the last two of the projections alone.
     """
-    n, roots, noise = x.size, signal.roots[signal.geometry[k]], signal.noise_var[k]
-    root = roots[0]
-    H, r = root @ jacobian, signal.whitened[k] - root @ values[0] - roots[1] @ values[1] - roots[2] @ values[2]
+    n, roots = x.size, signal.roots[signal.geometry[k]]
+    whitened, m = signal.whitened[k], values.shape[1]
+    PH, H = np.empty(n), np.empty(n)
     chi2, logdet, known, count = 0.0, 0.0, 0.0, 0  # a known phase that misfits is no jump of the motion
-    for i in range(r.size):
-        if (root[i] ** 2).sum() <= 0.0:  # a direction in which the block has no samples
+    for i in range(m):
+        e, size = whitened[i], 0.0
+        H[:] = 0.0
+        for j in range(m):
+            root = roots[0, i, j]
+            size += root * root
+            e -= root * values[0, j] + roots[1, i, j] * values[1, j] + roots[2, i, j] * values[2, j]
+            for u in range(n):
+                H[u] += root * jacobian[0, j, u] + roots[1, i, j] * jacobian[1, j, u]
+        if size <= 0.0:  # a direction in which the block has no samples
             continue
-        PH = P @ H[i]
-        S = H[i] @ PH + noise
-        e = r[i] - H[i] @ (x - about)
+        S = noise
         for u in range(n):
-            x[u] += PH[u] / S * e
+            held = 0.0
             for v in range(n):
-                P[u, v] -= PH[u] * PH[v] / S
+                held += P[u, v] * H[v]
+            PH[u] = held
+            S += H[u] * held
+            e -= H[u] * (x[u] - about[u])
+        for u in range(n):
+            gain = PH[u] / S
+            x[u] += gain * e
+            for v in range(n):
+                P[u, v] -= gain * PH[v]
         chi2 += e * e / S
         logdet += np.log(S)
         count += 1
@@ -271,6 +300,20 @@ def _update(signal, k, x, P, about, values, jacobian):  # type: ignore[no-untype
             P -= np.outer(PH, PH) / S
             known += e * e / S + np.log(S)
     return -0.5 * (chi2 + logdet + known), chi2, count
+
+
+@njit(cache=True, error_model="numpy")
+def _measured(laws, signal, k, before, P_before, noise):  # type: ignore[no-untyped-def]
+    """State and covariance with block k's measurements, linearised anew until they stay; what ``_update`` returns."""
+    about = before
+    for _ in range(TRIES):
+        x, P = before.copy(), P_before.copy()
+        values, jacobian = expected(laws, signal, k, about)
+        here = _update(signal, k, x, P, about, values, jacobian, noise)
+        if np.abs(x - about).max() < NONLINEAR:
+            break
+        about = _bounded(laws, signal, x)
+    return x, P, here
 
 
 @njit(cache=True, error_model="numpy")
@@ -322,35 +365,25 @@ def run_filter(laws, signal, x, P, live, walk, offset_walk, xs, Ps, xp, Pp, Fs):
             if (not live[a] or lost) and _acquire(signal, k, a, x, P):
                 F[at : at + 2, :] = 0.0
                 live[a] = True
-        about, reopened = x.copy(), False
-        for _ in range(TRIES):
-            xp[k], Pp[k], Fs[k] = x, P, F
-            values, jacobian = expected(laws, signal, k, about)
-            here = _update(signal, k, x, P, about, values, jacobian)
-            misfit = here[1] / max(here[2], 1)
-            if misfit > MISFIT and not reopened:  # the block is clean, so the model missed a jump: it is let in
-                x, P, reopened = xp[k].copy(), Pp[k].copy(), True
-                _reopen(laws, signal, k, x, P, F, misfit)
-                about = x.copy()
-            elif np.abs(x - about).max() > NONLINEAR:
-                about = _bounded(laws, signal, x)
-                x, P = xp[k].copy(), Pp[k].copy()
+        xp[k], Pp[k], Fs[k] = x, P, F
+        noise = signal.noise_var[k]
+        x, P, here = _measured(laws, signal, k, xp[k], Pp[k], noise)
+        misfit = here[1] / max(here[2], 1)
+        if misfit > MISFIT:  # the block is clean, so the model missed a jump: it is let in
+            _reopen(laws, signal, k, xp[k], Pp[k], Fs[k], misfit)
+            for _ in range(TRIES):
+                x, P, here = _measured(laws, signal, k, xp[k], Pp[k], noise)
+                misfit = here[1] / max(here[2], 1)
+                if misfit < MISFIT:
+                    break
+                noise *= misfit if misfit < BROKEN else BROKEN  # what no state explains counts as noise
             else:
-                break
+                x, P = xp[k].copy(), Pp[k].copy()
         x = _bounded(laws, signal, x)
-        total, chi2, count = total + here[0], chi2 + here[1], count + here[2]
+        total, count = total + here[0], count + here[2]
+        chi2 += here[1] * noise / signal.noise_var[k]
         xs[k], Ps[k] = x, P
     return total, chi2, count
-
-
-@njit(cache=True, error_model="numpy")
-def run_smoother(xs, Ps, xp, Pp, Fs):  # type: ignore[no-untyped-def]
-    """Rauch-Tung-Striebel, in place on ``xs`` and ``Ps``."""
-    for k in range(xs.shape[0] - 2, -1, -1):
-        gain = np.linalg.solve(Pp[k + 1], Fs[k + 1] @ Ps[k]).T
-        xs[k] += gain @ (xs[k + 1] - xp[k + 1])
-        P = Ps[k] + gain @ (Ps[k + 1] - Pp[k + 1]) @ gain.T
-        Ps[k] = 0.5 * (P + P.T)
 
 
 @njit(cache=True, error_model="numpy")

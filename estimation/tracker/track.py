@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.signals import intensity_clock, is_capacitive, reference_of, senses
-from estimation.tracker import smoother
+from estimation.tracker import backward, smoother
 from estimation.tracker.angle import SlowAngle, SlowMotion
 from estimation.tracker.orbit import MOVED
 from estimation.tracker.signal import Prepared, prepare
-from estimation.tracker.smoother import FLOOR, LOG, LOST, PHASE, SIGNIFICANT, STATES, Signal
+from estimation.tracker.smoother import DAMPING, FLOOR, LOG, LOST, PHASE, SIGNIFICANT, STATES, TREND, Signal
 from scanner.device import Amdm, Device, Position
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion
@@ -31,6 +31,8 @@ START_WALK = (1e-7, 0.1, 1e-5)  # white phase noise [rad2/s], trend [1/s3], damp
 LEAST_WALK = (1e-9, 1e-4, 1e-8)
 GAIN_WALK, OFFSET_WALK = 1e-8, 1e-8  # [1/s], [V2/s]: a readout's drift is slow against the scan
 TUNED_BLOCKS = 300  # in up to three stretches
+ROUNDS, SETTLED = 12, 0.2  # of the tuning, and the change of a logarithm at which it ends
+UNHEARD = 1e-3  # degrees of freedom that a density has in the track: below nothing tells it
 WINDOW, LAG = 4096, 512  # blocks smoothed at a time, and how far a window looks ahead of what it gives
 LISTENED = 64  # blocks that may be taken together to find a motion in noise
 PROBED = 200  # blocks from which the sign is told
@@ -185,23 +187,35 @@ def _walks(values: Array) -> Array:
 
 
 def tuned_walk(prepared: Prepared, start: Belief) -> Array:
-    """Process noise of each axis by maximum likelihood, to half a decade, shape (axes, 3): see ``START_WALK``."""
-    parts = _stretches(prepared.signal)
-    best = np.tile(START_WALK, (len(prepared.laws), 1))
+    """Process noise of each axis by maximum likelihood, shape (axes, 3): see ``START_WALK``.
 
-    def likelihood(values: Array) -> float:
-        return sum(_filtered(prepared, part, start, _walks(values))[0] for part in parts)
+    Where the likelihood's score vanishes, a state is kicked as much as the smoothed track says (``backward.kicks``);
+    until then each density grows by the ratio of the two. What has less than a degree of freedom is not waited for.
+    """
+    signal, axes = prepared.signal, len(prepared.laws)
+    parts = _stretches(signal)
+    walk = np.tile(START_WALK, (axes, 1))
+    for _ in range(ROUNDS):
+        squares, spreads = np.zeros((2, start.x.size))
+        for part in parts:
+            kept = _filtered(prepared, part, start, _walks(walk))[-1]
+            backward.run_smoother(*kept)
+            squares, spreads = np.add((squares, spreads), backward.kicks(*kept[:4]))
+        told, held = (_by_walk(sums, axes) for sums in (squares, spreads))
+        freedom = held * walk * signal.step
+        heard = freedom > UNHEARD
+        new = np.where(heard, np.maximum(walk * told / np.where(heard, held, 1.0), LEAST_WALK), walk)
+        settled = (np.abs(np.log(new / walk)) < SETTLED) | (freedom < 1.0)
+        walk = new
+        if settled.all():
+            break
+    return walk
 
-    top = likelihood(best)
-    for factor in (10.0, 10.0**0.5):
-        for at in np.ndindex(best.shape):
-            for step in (factor, 1.0 / factor):
-                trial = best.copy()
-                trial[at] *= step
-                while trial[at] >= LEAST_WALK[at[1]] and (value := likelihood(trial)) > top:
-                    best, top = trial.copy(), value
-                    trial[at] *= step
-    return best
+
+def _by_walk(sums: Array, axes: int) -> Array:
+    """Sums over states as sums over what walks, shape (axes, 3): phase and ln A together, trend, damping."""
+    own = sums[: axes * STATES].reshape(axes, STATES)
+    return np.stack([own[:, PHASE] + own[:, LOG], own[:, TREND], own[:, DAMPING]], axis=1)
 
 
 def _stretches(signal: Signal) -> list[Signal]:
@@ -258,7 +272,7 @@ def follow(prepared: Prepared, start: Belief, values: Array, causal: bool = Fals
             floor = np.log([2.0 * FLOOR * law.theta0 for law in prepared.laws])
             belief = Belief(xp[inner].copy(), Pp[inner].copy(), motion > floor)
         if not causal:
-            smoother.run_smoother(xs, Ps, xp, Pp, Fs)
+            backward.run_smoother(xs, Ps, xp, Pp, Fs)
         states[first:done] = xs[:inner]
         sds[first:done] = np.sqrt(np.maximum(np.diagonal(Ps[:inner], axis1=1, axis2=2), 0.0))
         total, chi2, count, first = total + ll, chi2 + squares, count + used, done
@@ -274,6 +288,8 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     axes = len(prepared.laws)
     if not is_capacitive(prepared.sense.readout):
         return start, ["known: position readout"] * axes
+    if not (prepared.signal.lines[:, 1] % 2).any():
+        return start, ["ambiguous"] * axes
     signal = window(prepared.signal, 0, PROBED)
     kept = _filtered(prepared, signal, start, _walks(np.tile(START_WALK, (axes, 1))))[-1]
     agreement, weight = np.zeros(axes), np.zeros(axes)

@@ -1,0 +1,76 @@
+"""The tracker's demodulation: against least squares, and through what is missing, clipped or swept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimation.tracker.blocks import CLIPPED_RUN, basis, project, residual_variance, solved
+from scanner.channel import Channel
+
+RATE = 5e6
+
+
+def channel(values: np.ndarray) -> Channel:
+    return Channel("sense", "V", RATE, 0.0, values, 0, values.size)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    length=st.integers(300, 900),
+    orders=st.lists(st.sampled_from([(0, 2), (0, 4), (1, 1), (1, 2), (1, 3)]), min_size=1, max_size=5, unique=True),
+    frequencies=st.tuples(st.floats(9e3, 3e4), st.floats(3e3, 8e3)),
+    seed=st.integers(0, 1000),
+)
+def test_demodulation_is_least_squares(length, orders, frequencies, seed):  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(seed)
+    lines, tuned = np.array(orders), 2 * np.pi * np.array(frequencies)
+    starts = np.arange(4) * length
+    values = rng.normal(size=4 * length + 7)
+    told = project(channel(values), starts, length, lines, np.tile(tuned, (4, 1)))
+    B = basis(length, RATE, lines, tuned)
+    for k in range(4):
+        y = values[starts[k] : starts[k] + length]
+        assert np.allclose(told.sums[k], B @ y, atol=1e-10)
+        assert told.squares[k] == pytest.approx(y @ y)
+        if np.linalg.cond(B) < 1e4:
+            fit = np.linalg.lstsq(B.T, y, rcond=None)[0]
+            assert np.allclose(solved(told)[k], fit, atol=1e-6 * max(1.0, np.abs(fit).max()))
+
+
+def test_demodulation_leaves_out_what_is_missing_or_clipped() -> None:
+    rng = np.random.default_rng(1)
+    lines, tuned = np.array([(0, 2), (0, 4)]), np.array([2 * np.pi * 13840.0])
+    length = 1000
+    turn = tuned[0] * np.arange(2 * length) / RATE
+    values = 1.0 + np.sin(2 * turn) + rng.normal(0.0, 0.01, turn.size)
+    values[300:500] = np.nan
+    values[length:] = np.minimum(values[length:], 1.7)
+    told = project(channel(values), np.array([0, length]), length, lines, np.tile(tuned, (2, 1)))
+    clipped = int(np.sum(values[length:] == 1.7))
+    assert told.counts[0] == 800
+    assert length - clipped <= told.counts[1] <= length - clipped + 3 * CLIPPED_RUN  # a noisy run's ends stay
+    amplitude = np.hypot(*solved(told)[:, 1:3].T)
+    assert np.allclose(amplitude, 1.0, atol=0.005)
+    assert np.allclose(residual_variance(told), 1e-4, rtol=0.2)
+
+
+def test_demodulation_follows_a_sweep_with_tables_of_its_own() -> None:
+    lines, length, blocks = np.array([(0, 2)]), 1500, 60
+    f = 13840.0 + 1e3 * (np.arange(blocks) + 0.5) / blocks
+    turn = 2 * np.pi * np.cumsum(np.repeat(f, length)) / RATE
+    told = project(channel(np.sin(2 * turn)), np.arange(blocks) * length, length, lines, 2 * np.pi * f[:, None])
+    assert 5 < len(told.grams) < blocks
+    assert np.allclose(np.hypot(*solved(told)[:, 1:3].T), 1.0, atol=0.01)
+
+
+def test_flat_tops_of_a_drive_are_not_left_out() -> None:
+    lines, length = np.array([(0, 1)]), 1000
+    tuned = np.array([2 * np.pi * RATE / 100])
+    square = np.sign(np.sin(tuned[0] * (np.arange(3 * length) + 0.5) / RATE))
+    starts = np.arange(3) * length
+    told = project(channel(square), starts, length, lines, np.tile(tuned, (3, 1)), may_clip=False)
+    assert (told.counts == length).all()
+    assert np.allclose(np.hypot(*solved(told)[:, 1:3].T), 4 / np.pi, rtol=2e-3)
