@@ -88,6 +88,7 @@ def main(data: Path, output: Path) -> None:
     (output / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
     print(f"Found in the decay from {FROM} s to {TO} s")
     print(told(found))
+    assert found.search is not None
     channel = found.search.comparison.runs[0].outputs[0]
     rate = 1 / channel.step
     unseen = held_out(channel.data.size, rate)

@@ -9,11 +9,12 @@ from estimation.mismatch.search import without
 
 def ladder(found: Diagnosis) -> dict[str, Fit]:
     """Fits from the linear device to the whole one, by the term that each adds, heaviest first."""
+    assert found.search is not None
+    rounds = sorted(found.search.rounds, key=lambda each: each.after.evidence - each.before.evidence)
     fits = [found.search.final]
-    for finding in reversed(found.findings):
-        candidate = next(each for each in fits[-1].model.candidates if each.term.effect == finding.effect)
-        fits.append(without(found.search.comparison, fits[-1], candidate))
-    names = ["linear", *(finding.effect for finding in found.findings)]
+    for each in reversed(rounds):
+        fits.append(without(found.search.comparison, fits[-1], each.candidate))
+    names = ["linear", *(each.candidate.term.effect for each in rounds)]
     return dict(zip(names, reversed(fits), strict=True))
 
 
