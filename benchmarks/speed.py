@@ -25,6 +25,7 @@ import numba
 import numpy as np
 from scipy.stats import binned_statistic_2d
 
+from benchmarks.tracker_bound import device_with, figures
 from estimation.filters import prepare, run_compiled
 from estimation.reference import absolute
 from estimation.reference_filters import run_reference
@@ -135,12 +136,25 @@ def scatter(index, values, sums, counts):  # type: ignore[no-untyped-def]
 
 
 def tracker() -> dict[str, float]:
-    """Tracker over two axes on one electrode, a second of it; the machine's memory."""
+    """Tracker over a second: axis by axis, each on an electrode of its own; both on one; the machine's memory."""
+    separate = device_with(shared=False)
+    recording, _ = simulate(separate, Plan(DRIVES, 1.0))
+    size = recording["sense_x"].size
+    alone = [replace(separate, axes={name: separate.axis(name)}, scan=None) for name in DRIVES]
+    axes = sum(best(partial(track, recording, device), 2) for device in alone)
     recording, _ = simulate(devices.load("imaging"), Plan(DRIVES, 1.0))
-    size = recording["sense"].size
-    seconds = best(lambda: track(recording, recording.device), 2)
+    both = best(partial(track, recording, recording.device), 2)
     block = np.ones(50_000_000)
-    return {"tracker.samples_per_s": size / seconds, "memory.read_gb_per_s": block.nbytes / best(block.sum) / 1e9}
+    return {
+        "tracker.samples_per_s": 2 * size / axes,
+        "tracker.shared_samples_per_s": size / both,
+        "memory.read_gb_per_s": block.nbytes / best(block.sum) / 1e9,
+    }
+
+
+def tracker_bound() -> dict[str, float]:
+    """Tracker against the posterior Cramer-Rao bound and the UKF: benchmarks/tracker_bound.py, over a few paths."""
+    return figures(4)
 
 
 def pipeline() -> dict[str, float]:
@@ -157,7 +171,7 @@ def pipeline() -> dict[str, float]:
 
 def main() -> None:
     # The pipeline first: the peak memory of a child counts what its parent held when it was forked.
-    parts = {part.__name__: part for part in (pipeline, filters, mapping, tracker)}
+    parts = {part.__name__: part for part in (pipeline, filters, mapping, tracker, tracker_bound)}
     wanted = sys.argv[1:] or list(parts)
     results: dict[str, float] = {} if wanted == list(parts) else json.loads(RESULTS.read_text())
     for name in wanted:

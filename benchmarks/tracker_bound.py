@@ -1,4 +1,4 @@
-"""Phase error of the tracker against the posterior Cramer-Rao bound (docs/bound.md), 40 to 0 dB, and its intervals.
+"""Phase error of the tracker against the posterior Cramer-Rao bound (docs/bound.md) and the UKF, from 40 to 0 dB.
 
 The stiffness of both axes drifts as an integrated random walk, drawn anew for every path; several noises are laid over
 each path. The tracker is not told the drift's law: it tunes its own. Run: python benchmarks/tracker_bound.py [paths]
@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.estimate import estimate
 from estimation.signals import reference_of, senses
 from estimation.tracker.bound import phase_bound
 from estimation.tracker.signal import prepare
@@ -20,6 +21,7 @@ from estimation.tracker.smoother import PHASE, STATES
 from estimation.tracker.track import follow, signed, starting_belief, tuned_walk
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
+from recon.score import axis_error
 from scanner import devices
 from scanner.device import Amdm, Device
 from scanner.drift import Drift, Factor
@@ -29,6 +31,7 @@ TREND_DENSITY = 0.4  # of the stiffness's trend [1/s3]: 0.2 % in 30 ms
 DURATION = 0.03
 SNR_DB = (40, 30, 20, 10, 0)  # of a sample: variance of the signal over variance of the noise
 NOISES = 4
+OFF = {"nominal": (1.0, 1.0), "k off by 0.1 %, b by 5 %": (1.001, 1.05)}  # what the device file says of k and b
 DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
 
 
@@ -102,9 +105,53 @@ def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
     return out
 
 
+def against_ukf(paths: int) -> dict[str, dict[str, dict[str, float]]]:
+    """Phase errors of UKF and tracker on the same recordings, both axes on one electrode [deg]; by device and axis."""
+    device = devices.load("imaging")
+    squares: dict[tuple[str, str, str], list[float]] = {}
+    for path in range(paths):
+        drift = {axis: Drift(wandering(np.random.default_rng(path))) for axis in DRIVES}
+        recording, truth = simulate(device, Plan(DRIVES, DURATION, drift=drift), seed=path)
+        for told, factors in OFF.items():
+            for method in ("ukf", "tracker"):
+                motion = estimate(recording, miscalibrated(device, *factors), method)
+                for name, axis in motion.axes.items():
+                    error = axis_error(axis, truth[f"angle_{name}"][0], axis.angle.sample_rate, axis.angle.start)
+                    squares.setdefault((told, name, method), []).append(error.phase_rmse**2)
+    out: dict[str, dict[str, dict[str, float]]] = {}
+    for told in OFF:
+        for name in DRIVES:
+            ukf, own = (float(np.rad2deg(np.sqrt(np.mean(squares[told, name, m])))) for m in ("ukf", "tracker"))
+            out.setdefault(told, {})[name] = {"ukf_deg": ukf, "tracker_deg": own, "ratio": ukf / own}
+    return out
+
+
+def miscalibrated(device: Device, k: float, b: float) -> Device:
+    """The device with every axis's stiffness and damping multiplied."""
+    axes = {}
+    for name, axis in device.axes.items():
+        own = axis.require_mechanics()
+        axes[name] = replace(axis, mechanics=replace(own, k=k * own.k, b=b * own.b))
+    return replace(device, axes=axes)
+
+
+def figures(paths: int) -> dict[str, float]:
+    """The worst point, the mean share that the intervals hold, and the least gain on the UKF."""
+    points = [
+        point for shared in (True, False) for by_axis in ratios(shared, paths).values() for point in by_axis.values()
+    ]
+    nominal, off = (min(axis["ratio"] for axis in by_axis.values()) for by_axis in against_ukf(paths).values())
+    return {
+        "tracker.rmse_over_crb": max(point["ratio"] for point in points),
+        "tracker.held_by_95_percent": float(np.mean([point["held"] for point in points])),
+        "tracker.ukf_rmse_over_own": nominal,
+        "tracker.ukf_rmse_over_own_miscalibrated": off,
+    }
+
+
 def main() -> None:
     paths = int(sys.argv[1]) if len(sys.argv) > 1 else 8
-    told = {"shared": ratios(True, paths), "separate": ratios(False, paths)}
+    told = {"shared": ratios(True, paths), "separate": ratios(False, paths), "UKF": against_ukf(paths)}
     print(json.dumps(told, indent=1))
 
 
