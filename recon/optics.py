@@ -21,28 +21,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.diagnosis import Estimate, Finding, Rival
-from estimation.mismatch.naming import LEAD_OVER_NEXT, LEAD_OVER_NOTHING
+from estimation.mismatch.diagnosis import Finding
+from estimation.mismatch.naming import LEAD_OVER_NOTHING
 from estimation.mismatch.sensitivity import APART
-from recon.optics_fit import AT_REST, AXES, COARSEST, Fit, Numbers, Scan, fit, foretold, look, measured_noise, scan_of
+from recon.optics_fit import AT_REST, AXES, COARSEST, MISLED, Fit, Numbers, Scan, fit, look, measured_noise, scan_of
+from recon.optics_told import Effect, finding_of, late_or_lagging, tell, told_name
 from recon.scene import Noise
 from scanner.channel import Channel
 from scanner.device import Amdm, Device
 from scanner.motion import Motion
-from scanner.terms import Scales, Term, catalogue
+from scanner.terms import Scales, catalogue
 
 Array = NDArray[np.float64]
 
 METRIC = "reduced chi-square of the intensity about the best picture, on blocks of time not used in the fit"
 
-MISLED = 0.1
-"""What detail finer than a cell of the picture misleads a place by [cells]; a whole cell where samples of one cell
-scatter more than ``RESOLVED`` times what neighbouring cells differ by: such a sample the picture does not resolve."""
+FLICKER = 0.01
+"""What detail finer than a cell of the picture misleads the light by, as a fraction, over the recording."""
 
 RESOLVED = 1.25
-
-FLICKER = 0.01
-"""What it misleads the light by, as a fraction, over the recording."""
+"""Variance of the samples of one cell over what neighbouring cells differ by, from which on the picture does not
+resolve the sample. ``MISLED`` and ``FLICKER`` are then a whole cell and half of the light: which sweep meets which
+detail is decided by the scan's pattern."""
 
 LATEST = 25e-6
 """Lateness of an intensity that is searched for [s]."""
@@ -59,35 +59,9 @@ SEARCHED = 40_000
 WANDER, SWELL = np.radians(0.3), 0.02
 """Slow change of phase, and of relative swing, over a recording that an estimator may have missed."""
 
-JUDGED = 60_000
-"""Samples by which a delay is told from a lag: every step of that runs through the detector many times."""
-
-BLURRED = 1.25
-"""Cells that a lag must smooth over before it can be told from a delay."""
-
-SHORT = 0.06
-"""Relative standard deviation of a lag that is told."""
-
 MOST_EFFECTS = 4
 
 MEASURED = ("late_x", "late_y", "slew_x", "slew_y", "swell_x", "swell_y", "fade", "move_x", "move_y")
-
-
-@dataclass(frozen=True)
-class Effect:
-    """What may be wrong: a direction among the measured numbers.
-
-    Attributes:
-        name: of the effect, told with its axis.
-        axis: that it belongs to.
-        direction: change of the measured numbers with its amplitude.
-        size: prior standard deviation of the amplitude.
-    """
-
-    name: str
-    axis: str
-    direction: Numbers
-    size: float
 
 
 @dataclass(frozen=True)
@@ -116,19 +90,6 @@ class Judgement:
     def to_json(self) -> list[dict[str, object]]:
         """What could be told, for diagnosis.json."""
         return [{"effect": v.effect, "axis": v.axis, "sigma": v.sigma, "told": v.sigma >= APART} for v in self.visible]
-
-
-@dataclass(frozen=True)
-class Told:
-    """An effect in the catalogue's words."""
-
-    axis: str
-    stage: str
-    effect: str
-    equation: str
-    source: str
-    parameters: tuple[Estimate, ...]
-    where: str
 
 
 @dataclass(frozen=True)
@@ -177,12 +138,13 @@ def judge_optics(motion: Motion, intensity: Channel, device: Device) -> Judgemen
     measured = Measured(found.information, found.information @ at + at / found.sd**2, prior)
     effects = possible_effects(scan, rates)
     named, rivals = named_effects(measured, effects)
+    named = _foretelling(scan, noise, measured, named)
     visible = tuple(Visible(each.name, each.axis, _sigma(measured, each)) for each in effects)
     visible += tuple(Visible("field-distortion", axis, 0.0) for axis in AXES)
     if not named:
         return Judgement((), visible, {})
     mean, covariance, _ = measured.posterior(named)
-    after = {**AT_REST, **dict(zip(MEASURED, _numbers(mean, named), strict=True))}
+    after = _numbers(mean, named)
     heldout = {
         "metric": METRIC,
         "before": fit(scan, {}, AT_REST, noise, scan.finest, 0).held_chi2,
@@ -194,12 +156,12 @@ def judge_optics(motion: Motion, intensity: Channel, device: Device) -> Judgemen
         value, sd = float(mean[k]), float(np.sqrt(covariance[k, k]))
         others = [each for each in named if each is not effect]
         lead = measured.posterior(others)[2] - measured.posterior(named)[2]
-        told = _told(effect, value, sd, scan, rates)
-        against = [(distance, _name(rival, value)) for distance, rival in rivals[effect.name, effect.axis]]
+        told = tell(effect, value, sd, scan, rates)
+        against = [(distance, told_name(rival, value)) for distance, rival in rivals[effect.name, effect.axis]]
         if told.effect == "intensity-delay":
-            told, distance, other = _late_or_lagging(scan, told, value, after)
+            told, distance, other = late_or_lagging(scan, told, value, after)
             against.append((distance, other))
-        findings.append((lead, _finding(told, lead, against, heldout)))
+        findings.append((lead, finding_of(told, lead, against, heldout)))
         if told.parameters and told.effect in catalogue() and told.stage == "optics":
             parameters = {each.name: each.value for each in told.parameters}
             terms.setdefault(told.axis, {})[told.effect] = parameters
@@ -256,9 +218,9 @@ def _starts(scan: Scan, rates: Mapping[str, float]) -> list[Numbers]:
 
 def _calibration(motion: Motion, device: Device, rates: Mapping[str, float], scan: Scan, noise: Noise) -> Array:
     """Covariance of the measured numbers where nothing is wrong but what is known to be uncertain."""
-    misled = MISLED if noise.scatter < RESOLVED * noise.contrast else 1.0
+    misled, flicker = (MISLED, FLICKER) if noise.scatter < RESOLVED * noise.contrast else (1.0, 0.5)
     blur = 2.0 * misled / scan.finest
-    sd = {"fade": FLICKER, **{f"move_{axis}": blur for axis in AXES}, **{f"swell_{axis}": SWELL for axis in AXES}}
+    sd = {"fade": flicker, **{f"move_{axis}": blur for axis in AXES}, **{f"swell_{axis}": SWELL for axis in AXES}}
     for axis in AXES:
         phase_sd = float(np.sqrt(np.nanmean(np.square(motion.axes[axis].phase_sd))))
         late = np.hypot(phase_sd / rates[axis], blur / scan.fastest[axis])
@@ -333,13 +295,27 @@ def named_effects(
     return named, rivals
 
 
-def _numbers(mean: Array, effects: list[Effect]) -> list[float]:
-    """The measured numbers that a posterior mean of (numbers, amplitudes) stands for."""
+def _foretelling(scan: Scan, noise: Noise, measured: Measured, named: list[Effect]) -> list[Effect]:
+    """Those of ``named`` without whose amplitude samples that no fit has seen are foretold worse."""
+    mean = measured.posterior(named)[0]
+
+    def error(amplitudes: Array) -> float:
+        p = _numbers(np.concatenate([mean[: len(MEASURED)], amplitudes]), named)
+        return fit(scan, {}, p, noise, scan.finest, 0).held_chi2
+
+    amplitudes = mean[len(MEASURED) :]
+    errors = [error(np.where(np.arange(len(named)) == i, 0.0, amplitudes)) for i in range(len(named))]
+    best = error(amplitudes)
+    return [each for each, without in zip(named, errors, strict=True) if without > best]
+
+
+def _numbers(mean: Array, effects: list[Effect]) -> Numbers:
+    """The optics that a posterior mean of (numbers, amplitudes) stands for."""
     n = len(MEASURED)
     total = mean[:n].copy()
     for amplitude, effect in zip(mean[n:], effects, strict=True):
         total += [amplitude * effect.direction.get(name, 0.0) for name in MEASURED]
-    return [float(value) for value in total]
+    return {**AT_REST, **dict(zip(MEASURED, total.tolist(), strict=True))}
 
 
 def _sigma(measured: Measured, effect: Effect) -> float:
@@ -347,102 +323,3 @@ def _sigma(measured: Measured, effect: Effect) -> float:
     spread = measured.prior + np.linalg.pinv(measured.information)
     way = np.array([effect.direction.get(name, 0.0) for name in MEASURED])
     return float(effect.size * np.sqrt(way @ np.linalg.solve(spread, way)))
-
-
-def _name(effect: Effect, value: float) -> str:
-    """In the catalogue's words; a phase of one axis that is off has no cause that the picture could tell."""
-    if effect.name == "phase" or (effect.name == "bleaching" and value < 0.0):
-        return "unknown"
-    return "channel-delay" if effect.name == "intensity-delay" and value < 0.0 else effect.name
-
-
-def _told(effect: Effect, value: float, sd: float, scan: Scan, rates: Mapping[str, float]) -> Told:
-    """An effect of one amplitude, told in the units of its term."""
-    name, axis, low, high = _name(effect, value), effect.axis, value - 1.96 * sd, value + 1.96 * sd
-    if effect.name == "phase":
-        turned = np.degrees(rates[axis])
-        where = (
-            f"forward and backward sweeps of {axis} lie apart and those of the other axis do not: its motion lags "
-            f"{1e6 * value:.3g} +- {1.96e6 * sd:.2g} us ({turned * value:.3g} deg) behind the estimate"
-        )
-        return Told(axis, "timing", name, f"θ_{axis}(t - {value:.3g} s)", "forward against backward sweeps", (), where)
-    if effect.name == "bleaching":
-        if name == "unknown":
-            where = f"the light grows by {100 * np.expm1(-value):.3g} % over the recording, wherever the beam is"
-            return Told(axis, "optics", name, f"I(t) = L e^({-value:.3g} t/T)", "samples of one place", (), where)
-        where = f"the light falls by {-100 * np.expm1(-value):.3g} % over the recording, wherever the beam is"
-        ends = (scan.duration / high, scan.duration / low)
-        return _listed(axis, name, scan.duration / value, ends, where)
-    if effect.name == "sample-motion":
-        speed = scan.half[axis] / scan.duration
-        where = f"sweeps in both directions move alike along {axis}, by {100 * value / 2:.3g} % of the swing in all"
-        return _listed(axis, name, speed * value, (speed * low, speed * high), where)
-    late, ends = (value, (low, high)) if value > 0.0 else (-value, (-high, -low))
-    who = "the intensity lags behind the motion" if value > 0.0 else "the estimated motion lags behind the intensity"
-    where = f"{who}: forward and backward sweeps of both axes lie apart by one time, {1e6 * late:.4g} us"
-    return _listed(axis, name, late, ends, where)
-
-
-def _listed(axis: str, effect: str, value: float, ends: tuple[float, float], where: str) -> Told:
-    term: Term = catalogue()[effect]
-    parameter = Estimate(term.parameters[0].name, value, (min(ends), max(ends)), term.parameters[0].unit)
-    return Told(axis, term.stage, effect, term.equation, term.source, (parameter,), where)
-
-
-def _late_or_lagging(scan: Scan, told: Told, late: float, p: Numbers) -> tuple[Told, float, str]:
-    """Delay or lag, whichever foretells samples better that it has not seen: that one, and how far behind the other is.
-
-    A lag's delay comes out short by up to a tenth where the sample has detail below a cell, hence ``SHORT``.
-    """
-    from scipy.optimize import minimize_scalar
-
-    few = scan.beginning(JUDGED)
-    early = {**p, **{f"late_{axis}": p[f"late_{axis}"] - late for axis in AXES}}
-
-    def error(name: str, size: float) -> float:
-        return foretold(few, {**early, name: size}, few.finest)
-
-    if late * max(few.fastest.values()) * few.finest / 2 < BLURRED:
-        return told, 0.0, "detector-lag"
-    lagging = minimize_scalar(
-        lambda lag: error("lag", lag), bounds=(0.7 * late, 1.5 * late), options={"xatol": late / 50}
-    )
-    lead = np.count_nonzero(few.held) * float(np.log(error("delay", late) / lagging.fun))
-    if lead < 0.0:
-        return told, -lead, "detector-lag"
-    lag = float(lagging.x)
-    sd = float(np.hypot(SHORT * lag, 2.0 * MISLED / few.finest / max(scan.fastest.values())))
-    corner, low, high = (1 / (2 * np.pi * max(each, 1e-12)) for each in (lag, lag + 1.96 * sd, lag - 1.96 * sd))
-    where = f"{told.where}, and detail along the sweep is smoothed as by a section of {1e6 * lag:.3g} us"
-    return _listed(told.axis, "detector-lag", corner, (low, high), where), lead, "intensity-delay"
-
-
-def _finding(told: Told, lead: float, against: list[tuple[float, str]], heldout: Mapping[str, object]) -> Finding:
-    """In the form of diagnosis.json."""
-    weights: dict[str, float] = {}
-    for distance, name in against:
-        if name != told.effect:
-            weights[name] = max(weights.get(name, 0.0), float(np.exp(-0.5 * min(distance, 1400.0))))
-    total = 1.0 + sum(weights.values()) + float(np.exp(-0.5 * min(lead, 1400.0)))
-    known = catalogue()
-    close = {name for distance, name in against if distance < LEAD_OVER_NEXT} - {told.effect}
-    advice = [
-        f"{name}: {text}"
-        for name in sorted(close)
-        if told.effect in known and (text := known[told.effect].lookalikes.get(name))
-    ]
-    ordered = sorted(weights.items(), key=lambda pair: -pair[1])
-    return Finding(
-        axis=told.axis,
-        stage=told.stage,
-        effect=told.effect,
-        equation=told.equation,
-        parameters=told.parameters,
-        where=told.where,
-        probability=1.0 / total,
-        rivals=tuple(Rival(name, weight / total) for name, weight in ordered if weight / total > 1e-4),
-        heldout=heldout,
-        channel="intensity",
-        source=told.source,
-        advice="; ".join(advice) or None,
-    )

@@ -30,6 +30,9 @@ FOLDS, HELD = 20, 5
 PATCH = 4
 """Cells along a side of what samples of one place share: detail that the picture does not resolve."""
 
+MISLED = 0.1
+"""What detail finer than a cell misleads a place by [cells]."""
+
 SAMPLES_PER_CELL = 6.0
 COARSEST, FINEST = 24, 200
 """Cells along a side of the picture: few have a wide reach and no detail, as many as the samples fill tell most."""
