@@ -50,14 +50,15 @@ def diagnose_files(
         nominal = Device.load(device) if device is not None else None
         with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
             diagnosis = diagnose_all(recordings, nominal, bar.set_description_str)
+            bar.set_description_str("report")
+            page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
         content = diagnosis.to_json()
-        names = [recording.name for recording in recordings]
         with replacing_folder(output) as folder:
             (folder / "diagnosis.json").write_text(
                 json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
             )
             (folder / "device.toml").write_text(diagnosis.device.to_toml(), encoding="utf-8")
-            (folder / "report.html").write_text(diagnosis_report(diagnosis, names), encoding="utf-8")
+            (folder / "report.html").write_text(page, encoding="utf-8")
     return content | {"output": str(output), "seconds": time.perf_counter() - began}
 
 

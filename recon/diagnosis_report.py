@@ -11,19 +11,21 @@ from estimation.mismatch.diagnosis import Diagnosis, Finding
 from estimation.mismatch.search import Round, Search
 from estimation.mismatch.sensitivity import APART, Visible, visibility
 from recon import views
+from recon.evidence import AFTER, BEFORE, HALF_LINE, draw_law, draw_phase_cost, law, phase_cost, portrait
 from recon.report import Figure, Section, Table, render
 from scanner.terms import catalogue
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BEFORE, AFTER = views.COLOURS[1], views.COLOURS[0]
-
 
 def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     """One diagnosis as a page."""
     lead = f"{', '.join(names)}: {diagnosis.verdict}. {_headline(diagnosis)}"
-    sections = [_overview(diagnosis), *(_finding_section(f, i) for i, f in enumerate(diagnosis.findings))]
+    sections = [
+        _overview(diagnosis),
+        *(_finding_section(f, i, diagnosis.search) for i, f in enumerate(diagnosis.findings)),
+    ]
     if diagnosis.search is not None:
         sections += _motion_sections(diagnosis, diagnosis.search)
     sections += [_optics(table) for table in diagnosis.optics]
@@ -56,16 +58,26 @@ def _overview(diagnosis: Diagnosis) -> Section:
     return Section("What was found", "", Table(["effect", "where", "probability", "held-out χ²"], rows))
 
 
-def _finding_section(finding: Finding, index: int) -> Section:
+def _finding_section(finding: Finding, index: int, found: Search | None) -> Section:
     text = f"{finding.equation}. {finding.where}. Source: {finding.source}."
     if finding.advice:
         text += f" To tell it from its rivals: {finding.advice}."
     rows = [[p.name, f"{p.value:.5g}", f"{p.ci95[0]:.5g} … {p.ci95[1]:.5g}", p.unit] for p in finding.parameters] + [
-        [f"rival: {r.effect}", f"{r.probability:.2%}", "", ""] for r in finding.rivals
+        [f"rival: {r.effect}", f"{r.probability:.2%}", "" if r.distance is None else f"{r.distance:.1f} σ away", ""]
+        for r in finding.rivals
     ]
     figures = [_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []
+    if found is not None:
+        figures += _law_figures(finding, found)
     table = Table(["", "value", "95 %", "unit"], rows) if rows else None
     return Section(f"{index + 1}. {finding.effect}", text, table, figures, least="26rem")
+
+
+def _law_figures(finding: Finding, found: Search) -> list[Figure]:
+    named = (finding.axis, finding.effect, finding.channel)
+    terms = [c for c in found.final.model.candidates if (c.axis, c.term.effect, c.channel) == named]
+    laws = [shown for each in terms if (shown := law(found.final, each)) is not None]
+    return [_figure(draw_law(each), f"{finding.effect}: the law along the motion, with its 95 % band") for each in laws]
 
 
 def _curve_figure(curve: Any) -> Figure:
@@ -81,13 +93,53 @@ def _curve_figure(curve: Any) -> Figure:
 
 def _motion_sections(diagnosis: Diagnosis, found: Search) -> list[Section]:
     """From the drive to the readout: what was compared with a prediction."""
-    sections = [_residuals(found)]
+    sections = [_residuals(found), _portraits(found)]
     if found.rounds:
+        sections.insert(0, _cost(found))
         text = "Distances in -2 log evidence: 10 over nothing is certain, a lead of 6 over the next names alone."
         rows = evidence_table(found.rounds)
         sections.append(Section("Candidates", text, Table(["effect", "behind", "over nothing"], rows)))
     told = visibility(found.comparison, found.final, catalogue().values())
     return [*sections, _visible(told), _nominal(diagnosis)]
+
+
+def _cost(found: Search) -> Section:
+    """What a picture would have had of the missing physics."""
+    rows, figures = [], []
+    for r, run in enumerate(found.comparison.runs):
+        for axis in run.inputs:
+            cost = phase_cost(found.nominal, found.final, axis, r)
+            if cost is not None:
+                before, after = cost.pixels(cost.before), cost.pixels(cost.after)
+                rows.append([f"{run.name}: {axis}", f"{before:.3g}", f"{after:.2g}"])
+                figures.append(_figure(draw_phase_cost(cost), f"{run.name}, axis {axis}: blur at the centre of a line"))
+    text = (
+        f"A phase error δφ moves the centre of a line by m δφ, m = {HALF_LINE} in a picture of {2 * HALF_LINE} pixels, "
+        "and p = 1 pixel is tolerated. Before: the motion that the nominal device, fitted as well as it can be, tells "
+        "without a sense signal to follow, against the improved one. After: how sure the improved one is."
+    )
+    if not rows:
+        return Section("What it costs a picture", "The axis follows its drive: its motion has no phase of its own.")
+    table = Table(["rms, pixels", "before", "after (95 %)"], rows)
+    return Section("What it costs a picture", text, table, figures, least="24rem")
+
+
+def _portraits(found: Search) -> Section:
+    """Where in the motion the residual stands."""
+    figures = []
+    pair = (found.nominal.residual, found.final.residual)
+    for r, run in enumerate(found.comparison.runs):
+        for channel, output in enumerate(run.outputs):
+            before, after = portrait(found.comparison, found.final, pair, r, channel)
+            drawing, axes = views.figure(1, 2, (6.0, 3.0))
+            largest = max(float(np.nanmax(before)), 2.0)
+            for each, values, name in zip(axes[0], (before, after), ("nominal", "improved"), strict=True):
+                image = each.imshow(values, origin="lower", extent=(-1, 1, -1, 1), norm="log", vmin=0.5, vmax=largest)
+                each.set(title=name, xlabel="angle / largest", ylabel="rate / largest")
+            drawing.colorbar(image, ax=axes, label="rms residual / noise", shrink=0.8)
+            caption = f"{run.name}: {output.name}, residual over angle and rate of axis {output.axes[0]}"
+            figures.append(Figure(views.figure_uri(drawing), caption))
+    return Section("Where in the motion", "", figures=figures, least="24rem")
 
 
 def _optics(table: Mapping[str, Any]) -> Section:
