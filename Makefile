@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint bench papers concealed wheel-check clean
+.PHONY: demo test lint docs notebooks bench papers concealed wheel-check clean
 
 $(STAMP): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed; run make PYTHON=python3.x" if sys.version_info < (3, 11) else 0)'
@@ -23,6 +23,12 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -W --keep-going -q docs docs/html
+
+notebooks: $(STAMP)
+	$(BIN)/sphinx_gallery_py2jupyter examples/[0-9]_*.py
+
 bench: $(STAMP)
 	$(BIN)/python benchmarks/speed.py
 
@@ -38,4 +44,4 @@ wheel-check: $(STAMP)
 	$(BIN)/python benchmarks/wheel.py
 
 clean:
-	rm -rf $(VENV) demo-output
+	rm -rf $(VENV) demo-output docs/html docs/api docs/gallery

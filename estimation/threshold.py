@@ -113,7 +113,7 @@ class CrossingLaw:
     """What a detected crossing tells at each rate of the motion there.
 
     Attributes:
-        rates: |theta'| at the threshold, shape (m,), increasing [rad/s].
+        rates: magnitude of theta' at the threshold, shape (m,), increasing [rad/s].
         angles: of the mirror when the filter's response is largest [rad]. Not quite theta_th unless that is zero: the
             signal is steepest where C'' theta'^2 + C' theta'' is largest, and theta'' vanishes at theta = 0.
         variances: of that angle, for the signal's noise [rad^2].
