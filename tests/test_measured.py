@@ -11,10 +11,7 @@ import pytest
 from estimation.mismatch import search as searching
 from estimation.mismatch.diagnosis import Diagnosis, judged
 from estimation.mismatch.experiment import experiment
-from estimation.mismatch.fit import Comparison, solve
-from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.prediction import predict
-from estimation.mismatch.start import first_whiteners
 from recon.convert import convert
 from scanner.device import Axis, Device, Mechanics, Position
 from scanner.recording import Recording
@@ -63,18 +60,10 @@ def test_the_beam_decays_by_its_laws_of_amplitude(measured_data: Path, found) ->
 
 
 def test_the_piezo_stage_has_hysteresis_and_drifts(measured_data: Path) -> None:
-    from afm_model import held_out, left, recordings
+    from afm_model import LAWS, by_laws, missed, recordings
 
     recording = recordings(measured_data / "afm_spiral/spiral_20hz.mat")["x"]
-    device = recording.device
-    run = experiment(recording, device)
-    missed = {}
-    for effects in (("offset-drift",), ("offset-drift", "hysteresis")):
-        model = Model([run], device, [Candidate(catalogue()[effect], "x", "sense") for effect in effects], ())
-        fit = solve(Comparison([run], first_whiteners(model)), model, np.zeros(len(model.free)), turns=8)
-        rest = left(fit)
-        missed[effects[-1]] = np.sqrt(np.mean(rest[held_out(rest.size)] ** 2))
-    assert missed["hysteresis"] < 0.3e-3 < 0.8e-3 < missed["offset-drift"]
+    assert missed(by_laws(recording, LAWS)) < 0.3 < 0.8 < missed(by_laws(recording, ("offset-drift",)))
 
 
 def test_a_device_without_a_drive_decays_freely() -> None:
