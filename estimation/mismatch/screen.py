@@ -58,6 +58,11 @@ def all_candidates(device: Device, model: Model, terms: Iterable[Term]) -> list[
     return found
 
 
+BURST = 1e9
+"""Change of the whitened residual by a unit of an amplitude from which the motion has burst its bounds (a force that
+outweighs the spring): no first order holds there, and its square would drown all other columns."""
+
+
 def _of_readout(term: Term) -> bool:
     """Whether a term changes what a readout gives, whichever axis it sees."""
     return term.stage in ("readout", "timing") and not term.of_axis
@@ -113,6 +118,8 @@ def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, mo
             if 0.05 < size * delta < 20.0:
                 break
             delta = float(np.clip(1.0 / size if size else 1e-2, 1e-6, 0.1))
+        if not np.linalg.norm(columns[rows, j]) < BURST:
+            columns[:, j] = 0.0
     return columns
 
 
