@@ -21,8 +21,9 @@ LEAD_OVER_NOTHING = 10.0
 LEAD_OVER_NEXT = 6.0
 """Lead from which a term is named alone; within it, the next is named beside it."""
 
-SHARE_HELD = 0.2
-"""Of what a term gains where it was fitted, the least that it must gain, sample for sample, where it was not."""
+SHARE_HELD = 0.3
+"""Of what a term gains where it was fitted, the least that it must gain, sample for sample, where it was not; a gain of
+``LEAD_OVER_NOTHING`` there is enough of any."""
 
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
@@ -63,7 +64,8 @@ def convincing(before: Fit, after: Fit) -> bool:
     changed = float(np.sum((before.residual[before.held] - after.residual[after.held]) ** 2))
     fitted = before.chi2 - after.chi2
     if fitted > before.penalty - after.penalty:
-        return gained > SHARE_HELD * fitted * int(after.held.sum()) / int(after.rows.sum())
+        share = SHARE_HELD * fitted * int(after.held.sum()) / int(after.rows.sum())
+        return gained > min(share, LEAD_OVER_NOTHING)
     return gained > -2.0 * np.sqrt(changed) - 2.0
 
 
@@ -79,8 +81,7 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], thr
     if promising and promising[0].gain > MUCH:
         for turns in (2, 3):
             fits = sorted((solve(comparison, *each, turns=turns) for each in running), key=lambda fit: fit.evidence)
-            half = max(FINALISTS, len(fits) // 2)
-            running = [(fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + HOPELESS][:half]
+            running = [(fit.model, fit.x) for fit in fits[: max(FINALISTS, len(fits) // 2)]]
     else:
         clear = [each for each in promising if each.gain > 0.5 * promising[0].gain]
         running = running[: max(FINALISTS, len(clear))]

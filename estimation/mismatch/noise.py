@@ -22,9 +22,9 @@ MEDIAN_OF_POWER = float(np.log(2.0))
 MEDIAN_SPREAD = 1.44
 """Relative standard deviation of a level from the median of n bins, times the root of n."""
 
-LEAST_BINS = 20
+LEAST_BINS = 14
 
-SLOPE_SD = 0.8
+SLOPE_SD = 0.3
 """Standard deviation of the power law that continues the spectrum below its first window."""
 
 
