@@ -65,7 +65,9 @@ def instead(
         for place, (_, estimate, group) in enumerate(promised):
             if place < TRIED or (size == 1 and _alike(seen[group[0]].candidate, gone)):
                 model, x = _start(fit, gone, [seen[i] for i in group], estimate)
-                fits.append(solve(comparison, model, x, turns=20, hopeless=fit.evidence + HOPELESS))
+                # Around a free correction the way is far; around a named fit, what is not soon as good never will be.
+                turns = 20 if pairs else 8
+                fits.append(solve(comparison, model, x, turns=turns, hopeless=fit.evidence + HOPELESS))
     return sorted((each for each in fits if possible(each)), key=lambda each: each.evidence)
 
 

@@ -180,8 +180,12 @@ def _by_name(comparison: Comparison, before: Fit, free: Fit, named: Sequence[Can
     others = [fit for fit in others if fit.evidence < free.evidence and convincing(before, fit)]
     if not others:
         return comparison, before, free
-    comparison = Comparison(comparison.runs, measured_whiteners(others[0].model, others[0].x))
-    return comparison, solve(comparison, before.model, before.x), solve(comparison, others[0].model, others[0].x)
+    found = others[0]
+    fewer = [fit for fit in others if len(fit.model.candidates) < len(found.model.candidates)]
+    if fewer and not convincing(fewer[0], found):  # the second of two is held to what any second effect is held to
+        found = fewer[0]
+    comparison = Comparison(comparison.runs, measured_whiteners(found.model, found.x))
+    return comparison, solve(comparison, before.model, before.x), solve(comparison, found.model, found.x)
 
 
 def _unnamed(state: _State) -> _State:
