@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Comparison, Fit, solve
+from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.screen import Screened, screen
 from scanner.terms.term import AMPLITUDES
@@ -27,6 +28,9 @@ SHARE_HELD = 0.3
 
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
+
+EXPLAINED = 1.02
+"""Reduced chi-square of the fitted samples at which there is nothing left for a free correction to do."""
 
 MUCH = 100.0
 """Fall of -2 log evidence beyond which first order is no judge of candidates."""
@@ -72,11 +76,22 @@ def convincing(before: Fit, after: Fit) -> bool:
 def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], threshold: float = 3.0) -> list[Fit]:
     """Fits of the candidates that first order around ``base`` promises anything of, best first.
 
-    Where much is missing, first order promises one ten times too little and the other ten times too much: all take a
-    step or two, and those that lag far behind drop out.
+    Free corrections, which cost most, are fitted only where no named term leaves noise alone.
     """
     promising = sorted((screen(comparison, base, each) for each in candidates), key=lambda s: -s.gain)
     promising = [each for each in promising if each.gain > threshold]
+    fits = _finalists(comparison, [each for each in promising if each.candidate.term.effect not in FREE])
+    if not any(fit.chi2 < EXPLAINED * fit.rows.sum() for fit in fits):
+        fits += _finalists(comparison, [each for each in promising if each.candidate.term.effect in FREE])
+    return sorted(fits, key=lambda fit: fit.evidence)
+
+
+def _finalists(comparison: Comparison, promising: Sequence[Screened]) -> list[Fit]:
+    """Possible fits of what is promised most.
+
+    Where much is missing, first order promises one ten times too little and the other ten times too much: all take a
+    step or two, and those that lag far behind drop out.
+    """
     running = [(each.model, each.x) for each in promising]
     if promising and promising[0].gain > MUCH:
         for turns in (2, 3):
@@ -85,8 +100,7 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], thr
     else:
         clear = [each for each in promising if each.gain > 0.5 * promising[0].gain]
         running = running[: max(FINALISTS, len(clear))]
-    fits = [solve(comparison, *each) for each in running]
-    return sorted((fit for fit in fits if possible(fit)), key=lambda fit: fit.evidence)
+    return [fit for fit in (solve(comparison, *each) for each in running) if possible(fit)]
 
 
 def race(
