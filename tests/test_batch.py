@@ -77,7 +77,8 @@ def test_a_worker_that_is_killed_is_told_of(scans: list[Path], tmp_path: Path) -
 
 
 def test_on_a_cluster(scans: list[Path], tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
+    import distributed
+
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
         summary = reconstruct_files(scans[:2], tmp_path / "all", OPTIONS, scheduler=cluster.scheduler_address)
     assert summary["failed"] == 0

@@ -62,16 +62,18 @@ def test_a_study_writes_table_summary_and_report(done: Path) -> None:
     assert_whole(done)
     summary = json.loads((done / "summary.json").read_text())
     assert (summary["cells"], summary["computed"], summary["failed"]) == (CELLS, CELLS, 0)
-    assert summary["estimators"]["tracker"]["phase_rmse_deg_median"] < summary["estimators"]["constant"][
-        "phase_rmse_deg_p95"
-    ]
+    assert (
+        summary["estimators"]["tracker"]["phase_rmse_deg_median"]
+        < summary["estimators"]["constant"]["phase_rmse_deg_p95"]
+    )
     page = (done / "report.html").read_text()
     assert page.count("data:image/svg") == 3
     assert "http" not in page.replace("http://www.w3.org", "")
 
 
 def test_parquet_holds_what_csv_holds(done: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet")
+    from pyarrow import parquet
+
     table = parquet.read_table(done / "table.parquet").to_pylist()
     with (done / "table.csv").open() as file:
         for row, text in zip(table, csv.DictReader(file), strict=True):

@@ -5,14 +5,13 @@ import signal
 import threading
 from pathlib import Path
 
+import distributed
 import pytest
 from study_worlds import small_study
 from test_study import assert_whole, until
 
 from recon.cli import main
 from recon.study.run import run_study
-
-distributed = pytest.importorskip("distributed")
 
 
 def test_no_cell_is_lost_with_a_worker(tmp_path: Path) -> None:

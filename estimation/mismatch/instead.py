@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 TRIED = 4
 """Singles, and pairs, that are fitted."""
 
+Leads = tuple[tuple[float, Candidate], ...]
+"""Rivals of a term, each with its distance behind in -2 log evidence."""
+
 SWAPS = 4
 """Exchanges of one term for another before they count as settled."""
 
@@ -35,11 +38,11 @@ class Settled:
 
     Attributes:
         fit: the best.
-        leads: by term, the others tried in its place with their distance behind in -2 log evidence.
+        leads: by term, the others tried in its place.
     """
 
     fit: Fit
-    leads: dict[str, tuple[tuple[float, Candidate], ...]]
+    leads: dict[str, Leads]
 
 
 def instead(
@@ -93,9 +96,14 @@ def _start(fit: Fit, gone: Candidate, added: Sequence[Screened], estimate: Array
     return model, x
 
 
+def behind(best: Fit, others: Sequence[Fit]) -> Leads:
+    """The newest terms of ``others``, each with its distance behind ``best``."""
+    return tuple((fit.evidence - best.evidence, fit.model.candidates[-1]) for fit in others)
+
+
 def settled(comparison: Comparison, fit: Fit, pool: Sequence[Candidate], newest: int) -> Settled:
     """Exchange each of the ``newest`` last terms for a better one as long as there is one."""
-    leads: dict[str, tuple[tuple[float, Candidate], ...]] = {}
+    leads: dict[str, Leads] = {}
     for _ in range(SWAPS):
         leads = {}
         better = None
@@ -104,7 +112,7 @@ def settled(comparison: Comparison, fit: Fit, pool: Sequence[Candidate], newest:
             if others and others[0].evidence < fit.evidence - 0.1:
                 better = others[0]
                 break
-            leads[each.key] = tuple((other.evidence - fit.evidence, other.model.candidates[-1]) for other in others)
+            leads[each.key] = behind(fit, others)
         if better is None:
             break
         fit = better

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.experiment import Run
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
-from estimation.mismatch.instead import instead, settled
+from estimation.mismatch.instead import Leads, behind, instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.naming import LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
@@ -22,8 +22,6 @@ from scanner.terms import Term
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
-Leads = tuple[tuple[float, Candidate], ...]
-"""Rivals of a term, each with its distance behind in -2 log evidence."""
 
 MOST_EFFECTS = 3
 """Effects looked for at a time."""
@@ -152,19 +150,21 @@ def _extended(
             yield _State(comparison, nominal, before, rivals)
             return
         named = [each for each in candidates if each.term.effect not in FREE]
-        found, leads = close[0], {close[0].model.candidates[-1].key: _leads(close[0], close[1:])}
+        found, leads = close[0], {close[0].model.candidates[-1].key: behind(close[0], close[1:])}
         if _is_free(found):
             say("named terms in the free correction's place")
             comparison, before, found = _by_name(comparison, before, found, named)
         if not _is_free(found):
             newest = len(found.model.candidates) - len(best.model.candidates)
+            if (
+                found.held_chi2 > TRACKED
+            ):  # the first to be taken imitated all: once the others are there, its place is free
+                newest = len(found.model.candidates)
             final = settled(comparison, found, named, newest)
             leads = {key: _merged(own, leads.get(key, ())) for key, own in final.leads.items()}
             found = final.fit
         rivals |= leads
         best = needed_only(comparison, found)
-        if not _is_free(best) and best.held_chi2 > TRACKED:
-            best = exchanged(comparison, best, [each for each in terms if each.effect not in FREE])
         yield _State(comparison, nominal, best, rivals)
         if _is_free(best):
             return
@@ -201,10 +201,6 @@ def _unnamed(state: _State) -> _State:
     return replace(state, best=found, rivals={**state.rivals, **leads})
 
 
-def _leads(best: Fit, others: Sequence[Fit]) -> Leads:
-    return tuple((fit.evidence - best.evidence, fit.model.candidates[-1]) for fit in others)
-
-
 def _merged(*parts: Leads) -> Leads:
     """All rivals, each with its smallest distance, the nearest first."""
     nearest: dict[str, tuple[float, Candidate]] = {}
@@ -227,20 +223,6 @@ def needed_only(comparison: Comparison, fit: Fit) -> Fit:
         less = without(comparison, fit, each)
         if less.evidence - fit.evidence < LEAD_OVER_NOTHING:
             return needed_only(comparison, less)
-    return fit
-
-
-def exchanged(comparison: Comparison, fit: Fit, terms: Sequence[Term]) -> Fit:
-    """The fit with another term in the place of an earlier one, where that is better.
-
-    Where several laws are at work, the first to be taken is the one that imitates them all best; once the others are
-    there, its place is free.
-    """
-    taken = {each.key for each in fit.model.candidates}
-    for each in fit.model.candidates[:-1]:
-        less = without(comparison, fit, each)
-        others = [c for c in all_candidates(less.model.device, less.model, terms) if c.key not in taken]
-        fit = min([fit, *near(comparison, less, others)], key=lambda tried: tried.evidence)
     return fit
 
 

@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.terms.term import Parameter, Term, View, section
-from scanner.trajectory import thirds
+from scanner.trajectory import halves, thirds
 
 Array = NDArray[np.float64]
 
 
 def voltage(voltage: Array, p: Sequence[float], view: View) -> Array:
-    half = np.append(voltage[:, :2].ravel(), voltage[-1, 2])
-    slow = section(half, p[0], 0.5 * view.step)
-    return thirds(slow)
+    return thirds(section(halves(voltage), p[0], 0.5 * view.step))
 
 
 TERM = Term(

@@ -9,6 +9,7 @@ from numba import float64, njit
 from numpy.typing import NDArray
 
 from scanner.terms.term import Parameter, Term, View
+from scanner.trajectory import halves, thirds
 
 Array = NDArray[np.float64]
 
@@ -41,9 +42,8 @@ def plays(v):  # type: ignore[no-untyped-def]
 
 
 def voltage(voltage: Array, p: Sequence[float], view: View) -> Array:
-    half = np.append(voltage[:, :2].ravel(), voltage[-1, 2])
-    moved = half + p[0] * plays(half)
-    return np.stack([moved[:-2:2], moved[1::2], moved[2::2]], axis=1)
+    half = halves(voltage)
+    return thirds(half + p[0] * plays(half))
 
 
 TERM = Term(
