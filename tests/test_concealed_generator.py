@@ -30,7 +30,7 @@ from benchmarks.concealed.motion import (
     capacitance_slope,
     integrate,
 )
-from benchmarks.concealed.readout import Noise, move, observe, settle
+from benchmarks.concealed.readout import AFTER_MOTION, Noise, move, observe, settle
 from benchmarks.concealed.scanner_truth import Truth
 from scanner.device import Device
 from scanner.recording import Recording
@@ -340,3 +340,16 @@ def test_what_a_look_alike_leaves_over(size, alike, strength):
     gram[1, 1] += 1.0
     exact = size * np.sqrt(1 - alike**2 * strength**2 / (strength**2 + 1))
     assert left_over(gram, 0, [1]) == pytest.approx(exact, rel=1e-6)
+
+
+def test_what_is_read_after_the_motion_leaves_the_motion_alone():
+    for family in ("tf", "ring"):
+        world = seal(order(family)).scene.world
+        truth = world.truth
+        other = truth._replace(**{name: 0.5 if np.isinf(v) else v + 0.5 for name, v in after(truth).items()})
+        np.testing.assert_array_equal(move(world, truth).states, move(world, other).states)
+        assert move(world, truth._replace(b=1.1 * truth.b)).states[-1, THETA] != move(world, truth).states[-1, THETA]
+
+
+def after(truth):
+    return {name: getattr(truth, name) for name in AFTER_MOTION}

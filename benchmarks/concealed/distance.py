@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from benchmarks.concealed.effects import CATALOGUE, Effect, Scene, Shape
 from benchmarks.concealed.generator import Hidden, Sealed
-from benchmarks.concealed.motion import RATE, THETA
-from benchmarks.concealed.readout import limited, observe, settle
+from benchmarks.concealed.motion import RATE, THETA, Trajectory
+from benchmarks.concealed.readout import AFTER_MOTION, limited, move, read, settle
 from benchmarks.concealed.scanner_truth import Truth
 from benchmarks.concealed.worlds import World
 
@@ -45,10 +45,12 @@ def _distance(sealed: Sealed, secret: Hidden) -> dict[str, Any]:
     others = [h for h in sealed.hidden if h is not secret]
     base = _hiding(scene, others)
     world = settle(scene.world, base)
-    here = _whitened(sealed, world, base)
+    motion = move(world, base)
+    here = _whitened(sealed, world, base, motion)
 
     def change(to: Truth, by: float, start: World = world) -> Array:
-        return (_whitened(sealed, start, to) - here) / by
+        unmoved = start is world and to == base._replace(**{name: getattr(to, name) for name in AFTER_MOTION})
+        return (_whitened(sealed, start, to, motion if unmoved else move(start, to)) - here) / by
 
     def column(effect: Effect, size: float, shape: Shape) -> Array:
         """What an effect adds, from a share of it small enough to be linear in."""
@@ -95,9 +97,9 @@ def left_over(gram: Array, i: int, projected: list[int]) -> float:
     return float(np.sqrt(max(gram[i, i] - outer @ np.linalg.pinv(inner, rcond=1e-11, hermitian=True) @ outer, 0.0)))
 
 
-def _whitened(sealed: Sealed, world: World, truth: Truth) -> Array:
+def _whitened(sealed: Sealed, world: World, truth: Truth, motion: Trajectory) -> Array:
     """All measured channels in units of their noise, one after another, (n,)."""
-    channels = observe(world, truth)
+    channels = read(world, truth, motion)
     volts = limited(channels["sense_x"], truth)
     noise, n = sealed.noise, world.samples
     if noise.is_coloured:

@@ -75,15 +75,17 @@ def integrate(truth: Truth, voltages: Array, start: float, step: float, initial:
     return Trajectory(start, step, states, slopes)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def capacitance(theta: float, p: Truth) -> float:  # numba compiles it for arrays as well
     """C0 exp(-u^2) (1 + shape u^4) + Cb with u = (theta - theta_c)/theta0, and a parasitic that saturates [F]."""
     u2 = ((theta - p.theta_c) / p.theta0) ** 2
-    stray = p.parasitic * p.parasitic_angle * np.tanh(theta / p.parasitic_angle)
-    return p.C0 * np.exp(-u2) * (1.0 + p.shape * u2 * u2) + p.Cb + stray
+    bell = p.C0 * np.exp(-u2) * (1.0 + p.shape * u2 * u2) + p.Cb
+    if p.parasitic == 0.0:
+        return bell
+    return bell + p.parasitic * p.parasitic_angle * np.tanh(theta / p.parasitic_angle)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def capacitance_slope(theta: float, p: Truth) -> float:
     """dC/dtheta of :func:`capacitance` [F/rad]."""
     u = (theta - p.theta_c) / p.theta0
@@ -94,7 +96,7 @@ def capacitance_slope(theta: float, p: Truth) -> float:
     return bell + p.parasitic / np.cosh(theta / p.parasitic_angle) ** 2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def detected(c: float, p: Truth) -> float:
     """What the envelope detector makes of a capacitance, in farads: c itself, its leaky modulus or its square."""
     if p.leak != 0.0:
@@ -105,7 +107,7 @@ def detected(c: float, p: Truth) -> float:
     return c
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def flat_output(theta: float, rate: float, section: float, bias: float, p: Truth) -> float:
     """What the readout makes of the motion before anything of its own goes wrong, offset apart [V]."""
     if p.R_s != 0.0:
@@ -115,7 +117,7 @@ def flat_output(theta: float, rate: float, section: float, bias: float, p: Truth
     return p.gain * theta
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def settled(change: float, tau: float, t: float) -> float:
     """change (1 - exp(-t/tau)) from t = 0 on."""
     if change == 0.0 or t <= 0.0:
@@ -123,7 +125,7 @@ def settled(change: float, tau: float, t: float) -> float:
     return change * (1.0 - np.exp(-t / tau))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def comb_voltage(command: float, amplifier: float, t: float, p: Truth) -> float:
     """Voltage that the actuator feels."""
     v = command
@@ -133,7 +135,7 @@ def comb_voltage(command: float, amplifier: float, t: float, p: Truth) -> float:
     return v * (1.0 - p.compression * v * v) + settled(p.charge, p.charge_tau, t)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def torque(t: float, s: Array, command: float, p: Truth) -> float:
     """All torque on the mirror but the dry friction's [N m]."""
     theta, rate = s[THETA], s[RATE]
@@ -142,7 +144,9 @@ def torque(t: float, s: Array, command: float, p: Truth) -> float:
         applied = p.torque_per_volt * v
     else:
         applied = 0.5 * capacitance_slope(theta, p) * (v * v + p.carrier)
-    k = p.scale * p.k * (1.0 + settled(p.dk, p.dk_tau, t) + p.wander * np.sin(p.wander_frequency * t))
+    k = p.scale * p.k * (1.0 + settled(p.dk, p.dk_tau, t))
+    if p.wander != 0.0:
+        k += p.scale * p.k * p.wander * np.sin(p.wander_frequency * t)
     b = p.scale * p.b * (1.0 + settled(p.db, p.db_tau, t) + p.warming * s[MEMORY])
     spring = theta * (k + theta * (p.k2 + theta * (p.k3 + theta * theta * p.k5))) + p.k_v * (theta - s[CREEP])
     if p.kink_stiffness != 0.0:
@@ -152,7 +156,7 @@ def torque(t: float, s: Array, command: float, p: Truth) -> float:
     return applied - spring - damping + mode
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def slope(t: float, s: Array, command: float, sliding: float, p: Truth, out: Array) -> None:
     """Time derivative of all states; ``sliding`` is the sign of the rate, or 0 while dry friction holds the mirror."""
     theta, rate = s[THETA], s[RATE]
@@ -178,24 +182,27 @@ def slope(t: float, s: Array, command: float, sliding: float, p: Truth, out: Arr
         out[READOUT] = p.readout_corner * (flat_output(theta, rate, s[SECTION_2], bias, p) - s[READOUT])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def advance(t: float, h: float, s: Array, commands: Array, sliding: float, p: Truth, K: Array, out: Array) -> None:
     """One Dormand-Prince step from ``s`` into ``out``; K (STAGES, STATES) is left holding the stage slopes."""
     for i in range(STAGES):
-        for m in range(STATES):
-            total = 0.0
-            for j in range(i):
-                total += A[i, j] * K[j, m]
-            out[m] = s[m] + h * total
+        _moved(s, h, A[i], K[:i], out)
         slope(t + NODES[i] * h, out, commands[i], sliding, p, K[i])
+    _moved(s, h, B, K, out)
+
+
+@njit(cache=True, error_model="numpy")
+def _moved(s: Array, h: float, weights: Array, K: Array, out: Array) -> None:
+    """s + h weights K into ``out``, states innermost: they lie side by side."""
+    out[:] = 0.0
+    for j in range(len(K)):
+        for m in range(STATES):
+            out[m] += weights[j] * K[j, m]
     for m in range(STATES):
-        total = 0.0
-        for j in range(STAGES):
-            total += B[j] * K[j, m]
-        out[m] = s[m] + h * total
+        out[m] = s[m] + h * out[m]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def between(commands: Array, x0: float, x1: float, out: Array) -> None:
     """Commands at the nodes of the part [x0, x1] of a step: Lagrange's polynomial through those of the whole."""
     for i in range(STAGES):
@@ -209,14 +216,14 @@ def between(commands: Array, x0: float, x1: float, out: Array) -> None:
             out[i] += weight * commands[j]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def released(t: float, s: Array, command: float, p: Truth) -> float:
     """Direction in which a mirror at rest starts to slide, 0 when dry friction holds it."""
     push = torque(t, s, command, p)
     return np.sign(push) if abs(push) > p.tau_c else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def advance_with_friction(
     t: float, h: float, s: Array, commands: Array, sliding: float, p: Truth, K: Array, out: Array
 ) -> float:
@@ -250,7 +257,7 @@ def advance_with_friction(
     return sliding
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _integrate(p: Truth, voltages: Array, start: float, step: float, initial: Array) -> tuple[Array, Array]:
     n = len(voltages)
     states, slopes = np.empty((n + 1, STATES)), np.empty((n + 1, STATES))

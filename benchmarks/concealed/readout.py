@@ -25,6 +25,14 @@ from benchmarks.concealed.worlds import LEAD, World
 Array = NDArray[np.float64]
 Rng = np.random.Generator
 
+# fmt: off
+AFTER_MOTION = (
+    "offset", "delay", "skew", "swing_delay", "jitter", "jitter_frequency", "rate_gain", "gain_drift",
+    "ripple", "ripple_frequency", "sensor_cubic", "tone", "tone_frequency", "tone_phase", "feedthrough",
+    "drift_1", "drift_2", "drift_3", "play", "play_width", "limit", "angle_cubic", "edge", "edge_loss",
+)
+# fmt: on
+"""Numbers of the truth that no state of the trajectory hears of: only :func:`read` and :func:`limited` take them."""
 SETTLING = 30e-3
 """Time that a driven mirror is given to reach its steady swing before anything is recorded [s]."""
 
@@ -48,7 +56,11 @@ def move(world: World, truth: Truth, refine: int = 1) -> Trajectory:
 
 def observe(world: World, truth: Truth, refine: int = 1) -> dict[str, Array]:
     """Every channel that is measured, without noise, each (samples,)."""
-    trajectory = move(world, truth, refine)
+    return read(world, truth, move(world, truth, refine))
+
+
+def read(world: World, truth: Truth, trajectory: Trajectory) -> dict[str, Array]:
+    """As :func:`observe`, of a motion that is there already."""
     channels = {"sense_x": sense(world, truth, trajectory)}
     if world.angle_sd is not None:
         channels["angle_x"] = angle(trajectory.at(world.times, THETA), truth)
