@@ -14,7 +14,7 @@ from scanner.errors import BadInput
 Array = NDArray[np.float64]
 
 _CYCLES = 4  # of the drive, a block: a sweep of an eighth of the frequency each way is followed
-_CHUNK = 1 << 17  # samples read at a time: they stay in the cache
+_CHUNK = 1 << 19  # samples read at a time
 _MOST = 1 << 18  # samples in which a line is looked for
 _FEW_PERIODS = 5.0
 _QUIET = 0.1  # of the largest amplitude: below it the drive counts as off and its phase goes on as it was
@@ -79,11 +79,11 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> Reference:
     times, phasors = [], []
     chunk = block * max(1, _CHUNK // block)
     for first in range(0, drive.size - block + 1, chunk):
-        values = drive.read(first, min(first + chunk, drive.size))
-        if values.size >= block:
-            t, z = block_phasors(values, drive.sample_rate, drive.start + first / drive.sample_rate, f, block)
-            times.append(t)
-            phasors.append(z)
+        values = drive.stored(first, min(first + chunk, drive.size))
+        start = drive.start + first / drive.sample_rate
+        t, z = block_phasors(values, drive.sample_rate, start, f, block, drive.gain)
+        times.append(t)
+        phasors.append(z)
     time, z = np.concatenate(times), np.concatenate(phasors)
     size = np.nan_to_num(np.abs(z))
     on = size > _QUIET * size.max()
@@ -103,6 +103,7 @@ def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf,
     """
     most = min(channel.size, _MOST, round(window * channel.sample_rate) if window else _MOST)
     few = round(min(most, _FEW_PERIODS * channel.sample_rate / low)) if low > 0.0 else most
+    few = 1 << (max(few, 1).bit_length() - 1)
     for n in (few, most):
         found = _strongest(channel.read(0, n), channel.sample_rate, low, high)
         if found is not None:
@@ -114,7 +115,7 @@ def _strongest(values: Array, rate: float, low: float, high: float) -> float | N
     """Frequency of the strongest line in (low, high) [Hz]; None where none stands out."""
     n = values.size
     values = np.nan_to_num(values - np.nanmean(values)) if np.isfinite(values).any() else np.zeros(n)
-    padded = 1 << (4 * n - 1).bit_length()  # a power of two: a prime would take six times as long
+    padded = 1 << (2 * n - 1).bit_length()  # a power of two: a prime would take six times as long
     spectrum = np.abs(np.fft.rfft(values * np.hanning(n), padded))
     frequency = np.fft.rfftfreq(padded, 1.0 / rate)
     spectrum[(frequency <= max(low, 2.0 * rate / n)) | (frequency >= high)] = 0.0

@@ -15,8 +15,8 @@ from scanner.hdf5 import DAMAGE
 
 Array = NDArray[np.float64]
 
-CHUNK = 1 << 20
-"""Samples that are looked at in one go where a whole channel has to pass by."""
+CHUNK = 1 << 17
+"""Samples that are looked at in one go where a whole channel has to pass by: they stay in the cache."""
 
 SLOWEST, FASTEST = 1e-6, 1e15
 """Sample rates that a clock can have [Hz]."""
@@ -98,7 +98,11 @@ class Channel:
         Raises:
             BadInput: the file does not give the samples back (truncated, damaged, a filter that is not installed).
         """
-        values = self.stored(first, stop).astype(np.float64)
+        return self.scaled(self.stored(first, stop))
+
+    def scaled(self, stored: NDArray[Any]) -> Array:
+        """Samples as they are stored, in ``unit``: gain * stored + offset, of the same shape."""
+        values = stored.astype(np.float64)
         if self.gain != 1.0:
             values *= self.gain
         if self.offset != 0.0:
@@ -181,15 +185,18 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
     low, high = np.inf, -np.inf
     for first in range(0, signal.size, CHUNK):
         values = signal.stored(first, first + CHUNK)
-        if values.dtype.kind == "f" and not (finite := np.isfinite(values).reshape(len(values), -1).all(axis=1)).all():
+        least, most = float(values.min()), float(values.max())
+        if not (isfinite(least) and isfinite(most)):  # the least of samples of which one is NaN is NaN
+            finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
             if not gaps_ok:
                 index = first + int(np.argmin(finite))
                 what = f"sample {index} at {signal.start + index / signal.sample_rate:.9g} s is not finite"
                 hint = "cut the recording there or repair the sample"
                 raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
-            values = values[finite]
-        if values.size:
-            low, high = min(low, float(values.min())), max(high, float(values.max()))
+            if not finite.any():
+                continue
+            least, most = float(values[finite].min()), float(values[finite].max())
+        low, high = min(low, least), max(high, most)
     if low > high:
         hint = "check that it was recorded"
         raise BadInput("holds no sample that can be used", file=signal.file, channel=signal.name, hint=hint)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from estimation.tracker.blocks import CLIPPED_RUN, basis, project, residual_variance, solved
 from scanner.channel import Channel
+from scanner.demodulate import block_products
 
 RATE = 5e6
 
@@ -38,6 +39,45 @@ def test_demodulation_is_least_squares(length, orders, frequencies, seed):  # ty
         if np.linalg.cond(B) < 1e4:
             fit = np.linalg.lstsq(B.T, y, rcond=None)[0]
             assert np.allclose(solved(told)[k], fit, atol=1e-6 * max(1.0, np.abs(fit).max()))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    length=st.integers(4, 1200),
+    blocks=st.integers(1, 7),
+    evens=st.integers(1, 4),
+    odds=st.integers(0, 3),
+    dtype=st.sampled_from(["<i2", "<f4", "<f8", ">i2", ">f4", "<u2"]),
+    squared=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_products_of_blocks_are_those_of_the_samples(length, blocks, evens, odds, dtype, squared, seed):  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(seed)
+    table = rng.normal(size=(evens + odds, length))
+    table[:evens] += table[:evens, ::-1]
+    table[evens:] -= table[evens:, ::-1]
+    values = rng.integers(0, 4000, 3 * blocks * length).astype(dtype)
+    starts = rng.integers(0, values.size - length + 1, blocks)
+    rows = np.array([1e-3 * values[s : s + length].astype(float) - 1.5 for s in starts]) ** (2 if squared else 1)
+    products, squares = block_products(values, starts, table, evens, 1e-3, -1.5, squared)
+    assert np.allclose(products, rows @ table.T, atol=1e-9)
+    assert np.allclose(squares, np.einsum("ij,ij->i", rows, rows))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    at=st.integers(0, 1000 - CLIPPED_RUN),
+    run=st.integers(1, 3 * CLIPPED_RUN),
+    low=st.booleans(),
+    edge=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_a_run_of_equal_samples_is_left_out_where_it_is_an_extreme(at, run, low, edge, seed):  # type: ignore[no-untyped-def]
+    values = np.random.default_rng(seed).normal(size=1000)
+    run = min(run, 1000 - at)
+    values[at : at + run] = (9.0 if edge else 0.5) * (-1.0 if low else 1.0)
+    told = project(channel(values), np.array([0]), 1000, np.array([(0, 2)]), np.full((1, 1), 2 * np.pi * 13840.0))
+    assert told.counts[0] == 1000 - (run if edge and run >= CLIPPED_RUN else 0)
 
 
 def test_demodulation_leaves_out_what_is_missing_or_clipped() -> None:

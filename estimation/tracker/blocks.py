@@ -3,13 +3,13 @@
 A block's samples are projected on a constant and on cosine and sine of every harmonic that can be there. The harmonics
 of two axes are not orthogonal over a block, so what is kept is the projection s = B'y and the Gram matrix G = B'B, of
 which whatever is linear in the harmonics loses nothing. One table of B serves all blocks as long as the reference's
-frequency stays, which makes the projection one matrix product; a block with missing or clipped samples gets a Gram
-matrix of its own from the samples that are left.
+frequency stays, which makes the projection one matrix product, taken from the samples as they are stored; a block with
+missing or clipped samples gets a Gram matrix of its own from the samples that are left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scanner.channel import Channel
+from scanner.demodulate import ROWS, block_products, plain
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -64,7 +65,7 @@ def project(
     lines: Index,
     omega: Array,
     settling: int = 0,
-    prepared: Callable[[Array], Array] | None = None,
+    squared: bool = False,
     may_clip: bool = True,
 ) -> Projections:
     """Project a channel's blocks, reading it chunk by chunk.
@@ -73,7 +74,7 @@ def project(
         starts: first sample of each block, increasing, shape (blocks,). length: of every block.
         lines: as in ``basis``. omega: angular frequency of each reference in each block, shape (blocks, references).
         settling: samples at the channel's beginning that are left out.
-        prepared: done to the samples before (a square).
+        squared: the samples' squares are projected.
         may_clip: runs of equal samples at a block's extremes are a converter's end and left out. A drive's flat tops
             are what the mirror feels.
     """
@@ -82,26 +83,32 @@ def project(
     geometry, counts = np.zeros(blocks, np.int64), np.full(blocks, length)
     grams: list[Array] = []
     offset = _offsets(length, channel.sample_rate)
+    by_parity = np.r_[0, 1:m:2, 2:m:2]  # a constant and cosines are even about the block's middle, sines odd
     highest = np.array([max(lines[lines[:, 0] == i, 1], default=1) for i in range(omega.shape[1])])
     for group in _steady_groups(omega * highest, 2 * np.pi * TABLE_REACH * channel.sample_rate / length):
         tuned[group] = 0.5 * (omega[group].min(axis=0) + omega[group].max(axis=0))
         table = basis(length, channel.sample_rate, lines, tuned[group.start])
         whole = len(grams)
         grams.append(_moments(table, offset))
-        folded = np.ascontiguousarray(table[:, (length + 1) // 2 :])
+        folded = table[by_parity]
         for part in _chunks(starts, length, group):
             first = int(starts[part.start])
-            values = channel.read(first, int(starts[part.stop - 1]) + length)
-            if first < settling:
-                values[: settling - first] = np.nan
-            values = values if prepared is None else prepared(values)
-            rows = _rows(values, starts[part] - first, length)
-            _project(rows, folded, sums[part], squares[part])
+            stored = plain(channel.stored(first, int(starts[part.stop - 1]) + length))
+            own_starts = starts[part] - first
+            products, squares[part] = block_products(
+                stored, own_starts, folded, 1 + len(lines), channel.gain, channel.offset, squared
+            )
+            sums[part.start : part.stop, by_parity] = products
             geometry[part] = whole
-            flat = _flat(rows) if may_clip else np.zeros(len(rows), np.bool_)
-            for i in np.flatnonzero(np.isnan(squares[part]) | flat):
-                k, used = part.start + int(i), _usable(rows[i]) if may_clip else np.isfinite(rows[i])
-                own, left = table[:, used], rows[i, used]
+            odd = ~np.isfinite(squares[part]) | (starts[part] < settling)
+            if may_clip:
+                odd |= _clipped(stored, own_starts, length)
+            for i in np.flatnonzero(odd):
+                k, row = part.start + int(i), stored[own_starts[i] : own_starts[i] + length]
+                used = _usable(row) if may_clip else np.isfinite(row)
+                used[: max(settling - int(starts[k]), 0)] = False
+                own, left = table[:, used], channel.scaled(row[used])
+                left = left**2 if squared else left
                 sums[k], squares[k], counts[k] = own @ left, left @ left, left.size
                 geometry[k] = len(grams)
                 grams.append(_moments(own, offset[used]))
@@ -152,70 +159,32 @@ def _group_starts(omega, reach):  # type: ignore[no-untyped-def]
 
 
 def _chunks(starts: Index, length: int, group: slice) -> Iterator[slice]:
-    step = max(1, CHUNK // length)
+    step = max(1, CHUNK // length // ROWS) * ROWS
     for first in range(group.start, group.stop, step):
         yield slice(first, min(first + step, group.stop))
 
 
-def _rows(values: Array, starts: Index, length: int) -> Array:
-    """One block a row: a view where the blocks follow each other without a gap."""
-    if starts[-1] == (starts.size - 1) * length:
-        return values[: starts.size * length].reshape(starts.size, length)
-    return np.lib.stride_tricks.sliding_window_view(values, length)[starts]
-
-
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _project(rows, table, sums, squares):  # type: ignore[no-untyped-def]
-    """B'y and y'y of each row; NaN where a sample is NaN.
-
-    About a block's middle the cosines are even and the sines odd, so the row is folded first and each product is
-    half as long. Four products share each load.
-    """
-    length, m = rows.shape[1], table.shape[0]
-    half, odd_length = length // 2, length % 2
-    even, odd = np.empty(half), np.empty(half)
-    for i in range(rows.shape[0]):
-        row, square = rows[i], 0.0
-        for j in range(half):
-            a, b = row[half - 1 - j], row[half + odd_length + j]
-            even[j], odd[j] = a + b, b - a
-            square += a * a + b * b
-        total = 0.0
-        for j in range(half):
-            total += even[j]
-        for c in range(1, m, 4):
-            last = min(c + 2, m - 2)  # a single line at the end is taken twice
-            c0, s0, c1, s1 = table[c], table[c + 1], table[last], table[last + 1]
-            p, q, r, s = 0.0, 0.0, 0.0, 0.0
-            for j in range(half):
-                p += even[j] * c0[j]
-                q += odd[j] * s0[j]
-                r += even[j] * c1[j]
-                s += odd[j] * s1[j]
-            sums[i, c], sums[i, c + 1], sums[i, last], sums[i, last + 1] = p, q, r, s
-        if odd_length:
-            middle = row[half]
-            square += middle * middle
-            total += middle
-            for c in range(1, m, 2):
-                sums[i, c] += middle
-        sums[i, 0], squares[i] = total, square
-
-
-@njit(cache=True, error_model="numpy", fastmath=True)
-def _flat(rows):  # type: ignore[no-untyped-def]
-    """Finite blocks in which enough samples lie at an extreme to be a clipped stretch, shape (blocks,)."""
-    out = np.zeros(rows.shape[0], np.bool_)
-    for i in range(rows.shape[0]):
-        row = rows[i]
-        low, high = row[0], row[0]
-        for j in range(row.size):
-            low, high = min(low, row[j]), max(high, row[j])
-        at_low, at_high = 0, 0
-        for j in range(row.size):
-            at_low += row[j] == low
-            at_high += row[j] == high
-        out[i] = max(at_low, at_high) >= CLIPPED_RUN
+@njit(cache=True, nogil=True)
+def _clipped(values, starts, length):  # type: ignore[no-untyped-def]
+    """Blocks in which equal samples in a row lie at an extreme, shape (blocks,): such a run covers a pair looked at."""
+    out, apart = np.zeros(starts.size, np.bool_), CLIPPED_RUN // 2
+    for i in range(starts.size):
+        row = values[starts[i] : starts[i] + length]
+        known, low, high = False, row[0], row[0]
+        for j in range(0, length - apart, apart):
+            if row[j] != row[j + apart]:
+                continue
+            first, stop = j, j + 1
+            while first > 0 and row[first - 1] == row[j]:
+                first -= 1
+            while stop < length and row[stop] == row[j]:
+                stop += 1
+            if stop - first >= CLIPPED_RUN:
+                if not known:
+                    known, low, high = True, row.min(), row.max()
+                if row[j] == low or row[j] == high:
+                    out[i] = True
+                    break
     return out
 
 

@@ -162,8 +162,8 @@ def drive_force(channel: Channel | None, time: Array, width: float, psi: Array, 
     orders = np.arange(1, DRIVEN + 2)  # one or two more than are used, so that they do not pass for these
     orders = orders[orders * law.turn * w.max() < 2 * np.pi * NYQUIST_SHARE * rate]
     lines = np.stack([np.zeros_like(orders), orders * law.turn], axis=1)
-    square = np.square if law.pull else None
-    fitted = solved(project(channel, starts, length, lines, w[:, None], prepared=square, may_clip=False))
+    squared = law.pull > 0.0
+    fitted = solved(project(channel, starts, length, lines, w[:, None], squared=squared, may_clip=False))
     late = channel.start + (starts + 0.5 * (length - 1)) / rate - time
     force[:, 0] = fitted[:, 0]
     for m in range(1, min(DRIVEN, orders.size + 1)):
