@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,18 +57,22 @@ def phase_errors(found: Reconstruction) -> dict[str, float]:
     return {axis: float(np.degrees(error.phase_rmse)) for axis, error in found.errors.items()}
 
 
-def close_the_loop(
-    duration: float = SCAN, target: str = "immunohistochemistry"
-) -> tuple[Reconstruction, Diagnosis, Reconstruction]:
+def scanned(
+    true: Device, nominal: Device, duration: float = SCAN, target: str = "immunohistochemistry"
+) -> Callable[[Device], Reconstruction]:
+    """A scan by the true device, waiting for the device by which it is reconstructed."""
+    scan, told = run(Experiment(true, target, duration=duration), SEED, nominal=nominal)
+    truth = told_truth(told)
+    return lambda device: reconstruct(replace(scan, device_toml=device.to_toml()), Options(), truth)
+
+
+def close_the_loop() -> tuple[Reconstruction, Diagnosis, Reconstruction]:
     """The scan by the nominal device, what the calibration recording tells, the scan by the improved device."""
     nominal = devices.load("imaging")
     true = with_terms(nominal, HIDDEN)
-    scan, told = run(Experiment(true, target, duration=duration), SEED, nominal=nominal)
-    truth = told_truth(told)
-    before = reconstruct(scan, Options(), truth)
+    scan = scanned(true, nominal)
     found = diagnose([calibration(true, nominal)], nominal)
-    after = reconstruct(replace(scan, device_toml=found.device.to_toml()), Options(), truth)
-    return before, found, after
+    return scan(nominal), found, scan(found.device)
 
 
 def draw(before: Picture, after: Picture, path: Path) -> None:

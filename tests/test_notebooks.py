@@ -55,12 +55,20 @@ def designed(told: str) -> None:
     assert best >= 85.0
 
 
+def found_missing(told: str) -> None:
+    before, after = (numbers(r"(\d+\.\d+)° in", line) for line in re.findall(r" device: (.*)", told))
+    assert max(before) > 3.0
+    assert max(after) < 0.1
+    assert re.search(r"^(readout-lag|  or readout-lag)", told, re.MULTILINE)
+
+
 CLAIMS: dict[str, Callable[[str], None]] = {
     "1_first_reconstruction": reconstructed,
     "2_bound_and_blur": bounded,
     "3_ringdown_to_device": identified,
     "4_estimators": estimated,
     "5_designing_a_scan": designed,
+    "6_missing_physics": found_missing,
 }
 
 
