@@ -9,12 +9,11 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import CancelledError, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from recon.executors import executor_of
+from recon.executors import executor_of, task
 from recon.output import check_folder, finite, replacing_folder, write_json
 from recon.pipeline import AXES, Options
 from recon.reconstructing import reconstruct_file
@@ -54,13 +53,13 @@ def reconstruct_files(
         output.mkdir(exist_ok=True)
         folders = dict(zip(paths, _folders(paths, output.absolute()), strict=True))
         jobs = {
-            executor.submit(partial(_one, path.absolute(), folder, options, mapping and mapping.absolute())): path
+            executor.submit(task(_one, path.absolute(), folder, options, mapping and mapping.absolute())): path
             for path, folder in folders.items()
         }
         rows: dict[Path, Row] = {}
         try:
-            for job in tqdm(as_completed(jobs), "reconstruct", len(jobs), unit="recording", file=sys.stderr):
-                rows[jobs[job]] = _row(job, jobs[job])
+            for done in tqdm(as_completed(jobs), "reconstruct", len(jobs), unit="recording", file=sys.stderr):
+                rows[jobs[done]] = _row(done, jobs[done])
         except KeyboardInterrupt:
             why = f"interrupted; {len(rows)} of {len(paths)} recordings are done"
             raise InterruptedError(errno.EINTR, why, str(output)) from None
@@ -95,9 +94,9 @@ def _one(path: Path, folder: Path, options: Options, mapping: Path | None) -> Ro
     return {"failed": None} | {key: summary[key] for key in KEPT}
 
 
-def _row(job: Any, path: Path) -> Row:
+def _row(done: Any, path: Path) -> Row:
     try:
-        return job.result()
+        return done.result()
     except (BrokenProcessPool, CancelledError) as error:
         return {"failed": f"{path}: its worker was killed (out of memory?): {error}", "exit": 1}
 

@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
@@ -57,6 +58,7 @@ def add_command(name: str, parser: argparse.ArgumentParser) -> ModuleType:
     """Add a command's arguments to its parser; returns its module."""
     module = importlib.import_module(f"recon.commands.{name.replace('-', '_')}")
     module.add_arguments(parser)
+    parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms that a device uses")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else, on stdout")
     return module
 
@@ -70,6 +72,10 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str) -> int:
     from scanner.errors import BadInput
 
     try:
+        if args.terms is not None:
+            from scanner.terms import register
+
+            register(args.terms)
         summary = module.run(args)
         print(json.dumps(summary, indent=1) if args.json else _printable(module.tell(summary)))
         return int(summary.get("exit", 0))  # of many, some may have failed

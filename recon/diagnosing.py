@@ -25,7 +25,6 @@ def diagnose_files(
     paths: Sequence[Path],
     output: Path,
     device: Path | None = None,
-    terms: Path | None = None,
     mapping: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -35,16 +34,13 @@ def diagnose_files(
         mapping: what makes instruments' files recordings, see :func:`recon.convert.open_any`.
 
     Raises:
-        BadInput: a recording, the device or the term file cannot be used.
+        BadInput: a recording or the device cannot be used.
     """
     from tqdm import tqdm
 
     from recon.diagnosis_report import diagnosis_report
-    from scanner.terms import register
 
     began = time.perf_counter()
-    if terms is not None:
-        register(terms)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = Device.load(device) if device is not None else None

@@ -6,11 +6,17 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
 
 from scanner.errors import BadInput
+from scanner.terms import register, registered
+
+T = TypeVar("T")
 
 
 def executor_of(scheduler: str | None = None, workers: int | None = None) -> AbstractContextManager[Executor]:
@@ -24,6 +30,18 @@ def executor_of(scheduler: str | None = None, workers: int | None = None) -> Abs
         BadInput: Dask is not installed, or no scheduler answers at the address.
     """
     return _cluster(scheduler) if scheduler else _processes(workers)
+
+
+def task(work: Callable[..., T], *given: object) -> Callable[[], T]:
+    """``work(*given)`` for an executor: whoever does it knows the users' term files that this process knows."""
+    return partial(_informed, registered(), work, *given)
+
+
+def _informed(files: tuple[Path, ...], work: Callable[..., T], *given: object) -> T:
+    for path in files:
+        if path not in registered():
+            register(path)
+    return work(*given)
 
 
 @contextmanager

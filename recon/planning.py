@@ -201,7 +201,6 @@ def plan_files(
     paths: Sequence[Path],
     output: Path,
     device: Path | None = None,
-    terms: Path | None = None,
     mapping: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -218,10 +217,7 @@ def plan_files(
     from estimation.mismatch.experiment import experiment
     from phantoms.experiment import device_named
     from recon.diagnosis_report import plan_report
-    from scanner.terms import register
 
-    if terms is not None:
-        register(terms)
     planned = {path: read_excitation(path) for path in paths if path.suffix == ".toml"}
     with ExitStack() as stack, tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
         recorded = {path: stack.enter_context(open_any(path, mapping)) for path in paths if path.suffix != ".toml"}

@@ -19,7 +19,6 @@ def predict_file(
     path: Path,
     output: Path,
     device: Path | None = None,
-    terms: Path | None = None,
     mapping: Path | None = None,
 ) -> dict[str, Any]:
     """Predict one recording and write predicted.h5 and summary.json into ``output``.
@@ -31,10 +30,7 @@ def predict_file(
         BadInput: the recording or the device cannot be used.
     """
     from estimation.mismatch.prediction import predict
-    from scanner.terms import register
 
-    if terms is not None:
-        register(terms)
     with open_any(path, mapping) as recording:
         used = Device.load(device) if device is not None else recording.device
         if used is None:

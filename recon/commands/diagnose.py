@@ -25,7 +25,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="device TOML in place of the recording's own; with --plan, or a name",
     )
-    parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms of your own")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -33,9 +32,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.planning import plan_files
 
     work = plan_files if args.plan else diagnose_files
-    return work(
-        args.recordings, args.output, device=args.device, terms=args.terms, mapping=args.mapping, quiet=args.json
-    )
+    return work(args.recordings, args.output, device=args.device, mapping=args.mapping, quiet=args.json)
 
 
 def tell(summary: dict[str, Any]) -> str:

@@ -12,13 +12,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the prediction")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
-    parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms that the device uses")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.predicting import predict_file
 
-    return predict_file(args.recording, args.output, device=args.device, terms=args.terms, mapping=args.mapping)
+    return predict_file(args.recording, args.output, device=args.device, mapping=args.mapping)
 
 
 def tell(summary: dict[str, Any]) -> str:

@@ -49,7 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--field-um", type=positive, default=250.0, help="width of the field on the sample, um (250)")
     parser.add_argument("--spot-um", type=float, default=0.4, help="sd of the beam spot, um (0.4)")
     parser.add_argument("--photons", type=positive, default=1000.0, help="photons a sample at full brightness (1000)")
-    parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms that the device uses")
     parser.add_argument("--angles", action="store_true", help="record the true angles as reference channels too")
     parser.add_argument("--seed", type=int, default=0, help="of all noise (0)")
 
@@ -58,10 +57,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from phantoms.experiment import Experiment, device_named, run
     from phantoms.optics import Detector
     from phantoms.waveforms import Sine
-    from scanner.terms import register
 
-    if args.terms is not None:
-        register(args.terms)
     experiment = Experiment(
         device=device_named(args.device),
         target=args.target,

@@ -18,6 +18,7 @@ from scanner.device import Device
 from scanner.device_toml import FINITE, NOT_NEGATIVE, POSITIVE, WHOLE, check_values, checked_number
 from scanner.errors import BadInput
 from scanner.files import read_toml
+from scanner.terms import registered
 
 T = TypeVar("T")
 
@@ -255,8 +256,9 @@ def _drive(value: object, name: str) -> tuple[float, float, float]:
 
 
 def _digest(phantom: str, design: Design, recording: Conditions) -> str:
-    """Of all that decides a result besides the cell's own numbers: another device, picture or version."""
+    """Of all that decides a result besides the cell's own numbers: another device, picture, term file or version."""
     picture = Path(phantom)
     bytes_of = hashlib.sha256(picture.read_bytes()).hexdigest() if picture.is_file() else phantom
-    told = json.dumps([version("lissajous"), bytes_of, asdict(design), asdict(recording)], sort_keys=True)
+    own_terms = [path.read_text(encoding="utf-8") for path in registered()]
+    told = json.dumps([version("lissajous"), bytes_of, asdict(design), asdict(recording), *own_terms], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()[:16]

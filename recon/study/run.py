@@ -20,7 +20,7 @@ from typing import IO, Any
 
 from tqdm import tqdm
 
-from recon.executors import executor_of
+from recon.executors import executor_of, task
 from recon.output import check_folder, finite, replacing_folder, write_json
 from recon.study.plan import Job, jobs, key, read_study, remaining
 from recon.study.table import columns, require_parquet, rows, statistics, write_csv, write_parquet
@@ -151,7 +151,7 @@ def _work(executor: Executor, left: Sequence[Job], done: dict[str, Record], file
         file=sys.stderr,
         mininterval=0.5 if sys.stderr.isatty() else 30.0,
     ) as bar:
-        for future in as_completed([executor.submit(do, job) for job in left]):
+        for future in as_completed([executor.submit(task(do, each)) for each in left]):
             records = future.result()
             file.write(b"".join(json.dumps(each).encode() + b"\n" for each in records))
             file.flush()

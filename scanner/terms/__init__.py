@@ -11,21 +11,38 @@ from pathlib import Path
 from scanner.errors import BadInput
 from scanner.terms.term import STAGES, Parameter, Scales, Term, View, section, shifted
 
-__all__ = ["STAGES", "Parameter", "Scales", "Term", "View", "catalogue", "load_terms", "register", "section", "shifted"]
+__all__ = [
+    "STAGES",
+    "Parameter",
+    "Scales",
+    "Term",
+    "View",
+    "catalogue",
+    "load_terms",
+    "register",
+    "registered",
+    "section",
+    "shifted",
+]
 
 
-_REGISTERED: dict[str, Term] = {}
+_REGISTERED: dict[Path, dict[str, Term]] = {}
 
 
 def catalogue() -> dict[str, Term]:
     """Every term of this package and of registered files by the effect's name, in the order of the stages."""
-    terms = [*_own_terms(), *_REGISTERED.values()]
+    terms = [*_own_terms(), *(term for each in _REGISTERED.values() for term in each.values())]
     return {term.effect: term for term in sorted(terms, key=lambda term: (STAGES.index(term.stage), term.effect))}
 
 
 def register(path: str | Path) -> None:
     """Take the terms of a user's own file into the catalogue; raises as :func:`load_terms`."""
-    _REGISTERED.update(load_terms(path))
+    _REGISTERED[Path(path).resolve()] = load_terms(path)
+
+
+def registered() -> tuple[Path, ...]:
+    """The term files taken into the catalogue."""
+    return tuple(_REGISTERED)
 
 
 @cache
