@@ -17,7 +17,7 @@ from recon.executors import executor_of, task
 from recon.output import check_folder, finite, replacing_folder, write_json
 from recon.pipeline import AXES, Options
 from recon.reconstructing import reconstruct_file
-from scanner.errors import BadInput
+from scanner.errors import BadInput, line_of
 
 KEPT = ("estimator", "samples", "fill", "phase_sd_deg", "within_bound", "sign", "trouble", "notes", "seconds")
 Row = Mapping[str, Any]
@@ -90,7 +90,7 @@ def _one(path: Path, folder: Path, options: Options, mapping: Path | None) -> Ro
     except MemoryError:
         return {"failed": f"{path}: needs more memory than there is; cut it into shorter ones", "exit": 2}
     except OSError as error:  # a full disk
-        return {"failed": f"{error.filename or folder}: {error.strerror or error}", "exit": 1}
+        return {"failed": line_of(error, folder), "exit": 1}
     return {"failed": None} | {key: summary[key] for key in KEPT}
 
 

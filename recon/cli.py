@@ -6,8 +6,10 @@ import argparse
 import importlib
 import json
 import os
+import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
@@ -39,6 +41,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The matrices here are small: threads inside BLAS cost more than they bring, several times over on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given = list(sys.argv[1:] if arguments is None else arguments)
+    with suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # what stops it tidies up, as Ctrl-C does
+    try:
+        return _command(given)
+    except KeyboardInterrupt:
+        print(f"lissajous {' '.join(given[:1])}: interrupted; nothing was written", file=sys.stderr)
+        return 1
+
+
+def _command(given: Sequence[str]) -> int:
     parser = _Parser(
         prog="lissajous", description="Resonant scanners: motion, pictures and missing physics from recordings."
     )
@@ -69,7 +81,7 @@ def reconstruct_main() -> int:
 
 
 def _run(module: ModuleType, args: argparse.Namespace, prog: str) -> int:
-    from scanner.errors import BadInput
+    from scanner.errors import BadInput, line_of
 
     try:
         if args.terms is not None:
@@ -86,10 +98,7 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str) -> int:
         print(f"{prog}: needs more memory than there is; cut the recording into shorter ones", file=sys.stderr)
         return 2
     except OSError as error:  # a full disk, a folder that may not be written
-        print(f"{prog}: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted; nothing was written", file=sys.stderr)
+        print(f"{prog}: {line_of(error, 'output')}", file=sys.stderr)
         return 1
 
 

@@ -33,6 +33,7 @@ from scanner.channel import Channel, checked_channel
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.files import read_toml
+from scanner.hdf5 import check_ends
 from scanner.recording import Recording
 
 TEXT_KEYS = ("format", "name", "notes", "acquired")
@@ -49,8 +50,9 @@ def open_any(path: Path, mapping: Path | Plan | None = None, growing: bool = Fal
     ``growing``, as :meth:`Recording.open` has it.
 
     Raises:
-        BadInput: as :meth:`Recording.open` or :func:`convert`.
+        BadInput: as :meth:`Recording.open` or :func:`convert`, or as :func:`scanner.hdf5.check_ends`.
     """
+    check_ends(path)
     return Recording.open(path, growing) if mapping is None else convert(path, mapping)
 
 
@@ -62,6 +64,7 @@ def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, 
         None) and, for each of ``channels``, ``variable``, ``unit``, ``sample_rate`` [Hz], ``start`` [s], ``shape``,
         ``stated_by`` (who stated unit, rate and start) and ``overruled`` (what the file states and the mapping denies).
     """
+    check_ends(source)
     plan, said_in = _plan(mapping)
     contents = _contents(source, plan, said_in)
     with _recording(contents, source, plan, said_in) as recording:

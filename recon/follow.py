@@ -23,7 +23,7 @@ from estimation.estimate import estimate
 from estimation.signals import device_of
 from estimation.tracker.angle import SlowAngle
 from recon import blur
-from recon.convert import open_any
+from recon.convert import convert
 from recon.mapping import Grid, Picture
 from recon.output import check_folder, write_tiff
 from recon.pipeline import Options, field_of, mapped, moved
@@ -34,6 +34,7 @@ from recon.views import save_picture
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.files import replacing
+from scanner.hdf5 import check_ends
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
@@ -98,7 +99,7 @@ def follow(
     ``quiet_time``, or at an interrupt.
 
     Args:
-        mapping: as for :func:`recon.convert.open_any`.
+        mapping: as for :func:`recon.convert.convert`.
         frame_time: of a frame [s]; the scan's repeat if not given.
         quiet_time: [s]. quiet: no progress.
 
@@ -106,6 +107,7 @@ def follow(
         BadInput: there is still no recording after ``quiet_time``, or ``output`` is no place for a folder.
     """
     check_folder(output)
+    check_ends(path)  # once: a look has to be quick
     live, shown, turn, wanted = Live(frame_time or np.nan), None, 0, FIRST
     arrivals: list[tuple[float, float]] = []  # samples up to ... [s on the recording's clock] were there at ... [s]
     with (
@@ -218,11 +220,11 @@ def common(recording: Recording) -> tuple[float, float]:
 def _opened(path: Path, mapping: Path | None) -> tuple[Recording, bool]:
     """The recording as far as it goes, and whether another program has it open to write."""
     try:
-        return open_any(path, mapping), False
+        return (Recording.open(path) if mapping is None else convert(path, mapping)), False
     except BadInput:
         if mapping is not None:
             raise
-        return open_any(path, growing=True), True
+        return Recording.open(path, growing=True), True
 
 
 def _first_repeat(recording: Recording, options: Options) -> float:

@@ -11,7 +11,7 @@ from recon.convert import open_any
 from recon.readers import read
 from recon.readers.contents import Variable
 from scanner.channel import CHANNEL_UNITS
-from scanner.hdf5 import attributes, open_hdf5
+from scanner.hdf5 import attributes, check_ends, open_hdf5
 from scanner.recording import FORMAT
 
 HEADING = f"""\
@@ -34,6 +34,7 @@ def info(path: Path, format: str | None = None, mapping: Path | None = None) -> 
     Raises:
         BadInput: as :func:`recon.readers.read` or :meth:`Recording.open`.
     """
+    check_ends(path)
     if mapping is not None or (format is None and _is_recording(path)):
         return _of_recording(path, mapping)
     contents = read(path, format)

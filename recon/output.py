@@ -11,33 +11,36 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.mapping import Grid, Picture
 from scanner.errors import BadInput
+from scanner.files import check_writable
+from scanner.hdf5 import new_hdf5
 from scanner.motion import Motion
 
 CHUNK = 1 << 20  # samples written at a time
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder for output that is a file, or that should stand in a folder that does not exist (BadInput)."""
+    """Refuse a folder for output that is a file, or that cannot be made or written into (BadInput)."""
     if folder.exists() and not folder.is_dir():
         raise BadInput("is a file where a folder should be", file=folder, hint="name another with -o")
     if not folder.parent.is_dir():
         raise BadInput("the folder to write into does not exist", file=folder.parent, hint="create it")
+    check_writable(folder if folder.exists() else folder.parent)
 
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
     """A folder to write into, beside ``folder``; its files take their places in ``folder`` when the block ends well.
 
-    When the block fails, ``folder`` is as it was: not there, or with its older files.
+    When the block fails, ``folder`` is as it was: not there, or with its older files. These are gone before the first
+    of the new ones comes: whoever ends the process in between leaves no mixture that looks whole.
 
     Raises:
-        BadInput: ``folder`` is a file, or the folder that it should stand in does not exist.
+        BadInput: as :func:`check_folder`.
     """
     check_folder(folder)
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
@@ -47,15 +50,22 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
             beside.chmod(0o755)
             beside.replace(folder)
         else:
-            for path in sorted(beside.iterdir()):
+            made = sorted(beside.iterdir())
+            for path in made:
+                (folder / path.name).unlink(missing_ok=True)
+            for path in made:
                 path.replace(folder / path.name)
+    except OSError as error:
+        # Where writing failed nothing names the file, or else a hidden one, which tells nobody anything.
+        error.filename = str(error.filename or folder).replace(str(beside), str(folder))
+        raise
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 
 
 def write_motion(path: Path, motion: Motion) -> None:
     """motion.h5: a group an axis with time, phase, amplitude, frequency, phase_sd and angle."""
-    with h5py.File(path, "w") as file:
+    with new_hdf5(path) as file:
         file.attrs["estimator"] = motion.estimator
         for name, axis in motion.axes.items():
             group = file.create_group(name)

@@ -27,6 +27,11 @@ class BadInput(ValueError):
         return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
 
 
+def line_of(error: OSError, place: object) -> str:
+    """What the system said, in one line; ``place`` where it names no file."""
+    return " ".join(f"{error.filename or place}: {error.strerror or ' '.join(map(str, error.args))}".split())
+
+
 class ChannelMissing(BadInput, KeyError):
     """A channel that the asked-for operation needs is not in the recording."""
 

@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from scanner.errors import BadInput
@@ -15,22 +16,45 @@ _DEFLATE_MOST = 1032  # bytes out of one byte: https://zlib.net/zlib_tech.html
 _HARMLESS = 1 << 26
 
 
+def check_place(path: Path) -> None:
+    """Refuse a file for output where it could not be written; for before the work whose result it is to hold.
+
+    Raises:
+        BadInput: the folder of ``path`` does not exist or may not be written into, or ``path`` is a folder.
+    """
+    if not path.parent.is_dir():
+        raise BadInput("the folder to write into does not exist", file=path, hint=f"create {path.parent}")
+    if path.is_dir():
+        raise BadInput("a folder stands where the file should go", file=path, hint="name a file")
+    check_writable(path.parent)
+
+
+def check_writable(folder: Path) -> None:
+    """Refuse a folder in which nothing can be made (BadInput)."""
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise BadInput(f"cannot be written into: {error.strerror}", file=folder, hint="name another place") from None
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A path to write to, beside ``path``: it takes ``path``'s place when the block ends and vanishes when it fails.
 
     Raises:
-        BadInput: the folder of ``path`` does not exist, or ``path`` is a folder.
+        BadInput: as :func:`check_place`.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise BadInput("the folder to write into does not exist", file=path, hint=f"create {path.parent}")
-    if path.is_dir():
-        raise BadInput("a folder stands where the file should go", file=path, hint="name a file")
+    check_place(path)
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield beside
         beside.replace(path)
+    except OSError as error:
+        # Where writing failed nothing names the file, or else the hidden one, which tells nobody anything.
+        error.filename = str(error.filename or path).replace(str(beside), str(path))
+        raise
     finally:
         beside.unlink(missing_ok=True)
 

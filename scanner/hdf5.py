@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
+import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,13 @@ MOST_VALUES = 1 << 16
 """Values that an attribute holds where HDF5 stores it with its object, a byte each."""
 
 
+DEEPEST = 8
+"""Groups within groups that are looked into."""
+
+CPU_SECONDS, SECONDS = 5, 60
+"""What HDF5 may take, of a processor and in all, to tell what a file holds: milliseconds where it is not damaged."""
+
+
 @contextmanager
 def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
     """For reading from a file that is open: what HDF5 cannot make sense of becomes BadInput."""
@@ -31,6 +41,46 @@ def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
         raise
     except DAMAGE as error:
         raise BadInput(f"cannot be read: {error}", file=path, channel=channel, hint="copy the file again") from None
+
+
+def check_ends(path: Path) -> None:
+    """Refuse a file on which HDF5 runs for ever, as it does on some that are damaged, or comes to grief.
+
+    Nothing stops the library once it does, so a fork of this process looks at all groups and attributes first, and is
+    ended by a timer. What else is wrong with the file is left to whoever opens it. Opening does not do this by itself:
+    a program with threads, or on a system without ``fork``, may not want it.
+
+    Raises:
+        BadInput: the fork did not come back.
+    """
+    if not hasattr(os, "fork") or not path.is_file() or not h5py.is_hdf5(path):
+        return
+    looking = os.fork()
+    if not looking:
+        with suppress(BaseException):
+            for which, number, limit in (
+                (signal.ITIMER_PROF, signal.SIGPROF, CPU_SECONDS),
+                (signal.ITIMER_REAL, signal.SIGALRM, SECONDS),
+            ):
+                signal.signal(number, signal.SIG_DFL)
+                signal.setitimer(which, limit)
+            with h5py.File(path, "r") as file:
+                _look(file)
+        os._exit(0)
+    _, status = os.waitpid(looking, 0)
+    if os.WIFSIGNALED(status):
+        ended = "runs without end" if os.WTERMSIG(status) in (signal.SIGPROF, signal.SIGALRM) else "fails"
+        raise BadInput(f"HDF5 {ended} on it: the file is damaged", file=path, hint="copy it again")
+
+
+def _look(group: h5py.Group, depth: int = DEEPEST) -> None:
+    attributes(group)
+    for name in group:
+        with suppress(*DAMAGE):
+            item = child(group, name, h5py.HLObject)
+            attributes(item)
+            if isinstance(item, h5py.Group) and depth:
+                _look(item, depth - 1)
 
 
 def open_hdf5(path: Path, growing: bool = False) -> h5py.File:
@@ -57,6 +107,34 @@ def open_hdf5(path: Path, growing: bool = False) -> h5py.File:
             raise BadInput("is not an HDF5 file", file=path, hint=hint) from None
         what = "the file is truncated" if "truncated" in str(error) else f"cannot be opened: {error}"
         raise BadInput(what, file=path, hint="copy it again") from None
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """A file to write into, whole when the block ends well.
+
+    HDF5 2.0 crashes where it finds out while closing that the disk is full. So it keeps no samples back, and writes
+    everything else before it is asked to close.
+
+    Raises:
+        OSError: the disk is full, or may not be written to.
+    """
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    access.set_sieve_buf_size(0)
+    create = h5py.h5p.create(h5py.h5p.FILE_CREATE)
+    try:
+        file = h5py.File(h5py.h5f.create(os.fsencode(path), h5py.h5f.ACC_TRUNC, create, access))
+        try:
+            yield file
+            file.flush()
+        finally:
+            file.close()
+    except (OSError, RuntimeError) as error:
+        told = re.search(r"(?:write failed|extend file|create file).*?errno = (\d+)", str(error), re.DOTALL)
+        if told is None:
+            raise
+        raise OSError(int(told[1]), os.strerror(int(told[1])), str(path)) from None
 
 
 def child(group: h5py.Group, name: str, kind: type) -> Any:

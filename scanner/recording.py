@@ -22,7 +22,7 @@ from scanner.channel import CHUNK, Channel, checked_channel
 from scanner.device import Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.files import replacing
-from scanner.hdf5 import attributes, child, open_hdf5, undamaged
+from scanner.hdf5 import attributes, child, new_hdf5, open_hdf5, undamaged
 from scanner.truth import Truth, write_truth
 
 FORMAT = "lissajous-recording"
@@ -202,7 +202,7 @@ class Recording:
             path: of the new file.
             truth: of a simulation, see :func:`scanner.truth.write_truth`.
         """
-        with replacing(path) as beside, h5py.File(beside, "w") as file:
+        with replacing(path) as beside, new_hdf5(beside) as file:
             file.attrs.update({**self.attrs, "format": FORMAT, "version": VERSIONS[-1]})
             group = file.create_group("channels")
             for each in self.channels.values():

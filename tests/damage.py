@@ -89,8 +89,8 @@ class Outcome:
         return self.code == 2 and self.told.count("\n") == 1 and "Traceback" not in self.told
 
 
-def tried(act: Callable[[], int], log: Path) -> Outcome:
-    """The outcome of ``act`` in a child process, with what it wrote to stderr."""
+def tried(act: Callable[[], int], log: Path, meanwhile: Callable[[int], None] = lambda pid: None) -> Outcome:
+    """The outcome of ``act`` in a child process, with what it wrote to stderr; ``meanwhile`` gets its number."""
     sys.stdout.flush()
     child = os.fork()
     if not child:
@@ -112,5 +112,6 @@ def tried(act: Callable[[], int], log: Path) -> Outcome:
         finally:
             sys.stderr.flush()
             os._exit(code)
+    meanwhile(child)
     _, status = os.waitpid(child, 0)
     return Outcome(os.waitstatus_to_exitcode(status), log.read_text(errors="replace"))

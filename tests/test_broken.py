@@ -6,10 +6,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import h5py
@@ -30,9 +26,6 @@ from scanner.devices import load
 from scanner.errors import BadInput
 from scanner.files import parse_toml
 from scanner.recording import Recording
-
-# HDF5 itself never comes back from these: a length of 0 in the heap of texts, see docs/reliability.md.
-ENDLESS = {("recording.h5", 160)}
 
 SEEDS = int(os.environ.get("LISSAJOUS_FUZZ", "6"))
 
@@ -66,8 +59,6 @@ def test_info_and_convert_of_damaged_files(whole: dict[str, bytes], tmp_path: Pa
 
     assert convert(stated) == 0
     for seed in range(SEEDS):
-        if (name, seed) in ENDLESS:
-            continue
         output.unlink(missing_ok=True)
         data, how = damaged(whole[name], seed)
         path.write_bytes(data)
@@ -79,6 +70,19 @@ def test_info_and_convert_of_damaged_files(whole: dict[str, bytes], tmp_path: Pa
         assert not left_behind(tmp_path)
         if output.exists():
             Recording.open(output).close()
+
+
+def test_a_file_on_which_hdf5_never_comes_back_is_refused(
+    whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("scanner.hdf5.CPU_SECONDS", 0.5)
+    path = tmp_path / "endless.h5"
+    path.write_bytes(damaged(whole["recording.h5"], 160)[0])  # a length of 0 in the heap of texts
+    for arguments in (["info", str(path)], ["reconstruct", str(path), "-o", str(tmp_path / "out")]):
+        outcome = tried(lambda given=arguments: main(given), tmp_path / "log")
+        assert outcome.is_clean(), outcome
+        assert f"{path}: HDF5 runs without end on it" in outcome.told
+        assert not (tmp_path / "out").exists()
 
 
 # --- recordings that are HDF5 and wrong ------------------------------------------------------------------------------
@@ -265,60 +269,3 @@ def test_any_mapping_is_used_or_refused(tmp_path_factory: pytest.TempPathFactory
     except BadInput as error:
         line = str(error)
         assert line.isprintable()
-
-
-# --- interrupted -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_conversion_leaves_nothing_that_looks_finished(tmp_path: Path, stop: signal.Signals) -> None:
-    np.savez(tmp_path / "a.npz", v=np.zeros(24_000_000, "f4"))
-    output = tmp_path / "out.h5"
-    command = [
-        sys.executable,
-        "-m",
-        "recon",
-        "convert",
-        tmp_path / "a.npz",
-        "--channel",
-        "intensity=v",
-        "--rate",
-        "1e6",
-    ]
-    stopped = 0
-    for wait in (0.0, 0.02, 0.06):
-        with subprocess.Popen(
-            [*command, "--unit", "V", "-o", output], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-        ) as run:
-            while run.poll() is None and not left_behind(tmp_path):
-                time.sleep(0.005)
-            time.sleep(wait)
-            run.send_signal(stop)
-            told = run.communicate()[1].decode()
-        stopped += run.returncode != 0
-        assert output.exists() == (run.returncode == 0)
-        if run.returncode and stop == signal.SIGINT:
-            assert told == "lissajous convert: interrupted; nothing was written\n"
-            assert not left_behind(tmp_path)
-        output.unlink(missing_ok=True)
-        for name in left_behind(tmp_path):
-            (tmp_path / name).unlink()
-    assert stopped
-
-
-def test_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
-    import resource
-
-    np.savez(tmp_path / "a.npz", v=np.zeros(2_000_000))
-    arguments = ["convert", str(tmp_path / "a.npz"), "--channel", "intensity=v", "--rate", "1e6", "--unit", "V"]
-
-    def little_room() -> int:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
-        return main([*arguments, "-o", str(tmp_path / "out.h5")])
-
-    outcome = tried(little_room, tmp_path / "log")
-    assert (outcome.code, outcome.told.count("\n")) == (1, 1), outcome
-    assert "Traceback" not in outcome.told
-    assert not (tmp_path / "out.h5").exists()
-    assert not left_behind(tmp_path)

@@ -49,6 +49,8 @@ def format_of(path: Path) -> str:
             begin = file.read(32)
     except OSError as error:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name the instrument's file") from None
+    if not begin:
+        raise BadInput("the file is empty", file=path, hint="copy it again")
     told = next((name for magic, name in _BEGINNINGS.items() if begin.startswith(magic)), None)
     told = told or _ENDINGS.get(path.suffix.lower())
     if told is None:

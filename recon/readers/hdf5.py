@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.readers.contents import Contents, Lazy, Variable
-from scanner.hdf5 import attributes, child, open_hdf5, undamaged
-
-DEEPEST = 8
-"""Groups within groups that are looked into."""
+from scanner.hdf5 import DEEPEST, attributes, child, open_hdf5, undamaged
 
 
 def read_hdf5(path: Path) -> Contents:
