@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from estimation.reference import drive_reference
 from scanner.channel import check_signal
 from scanner.clock import on_clock
 from scanner.demodulate import block_length, block_phasors
-from scanner.device import Amdm, Axis, Device, Position
+from scanner.device import DEFAULT_TOLERANCE, Amdm, Axis, Device, Position
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
@@ -21,6 +21,12 @@ Array = NDArray[np.float64]
 
 STRETCH_CYCLES = 200.0  # of the motion: a sweep is cut into stretches that count as one frequency
 STEADY = 0.02  # relative change of a stretch's amplitude above which it is not steady motion
+TORQUE = (("capacitance", "C0"), ("capacitance", "theta0"), ("drive", "torque_per_volt"), ("mechanics", "J"))
+"""Stage and key of what sets the torque's scale, in which J, k and b are measured; J itself where nothing else does."""
+
+Decay = tuple[Array, float, float]
+"""Angle of a free decay [rad], shape (n,), its rate [Hz], and the voltage on the combs [V]."""
+
 FLAT = 1e-3  # of its largest value: a drive that varies by less is none
 
 
@@ -29,8 +35,10 @@ class Identified:
     """What was found.
 
     Attributes:
-        device: the nominal one with the found values in place and their relative deviations as tolerances.
-        values: axis -> name -> value; a name is a key of the device, or ``delay``, ``resonance``, ``quality``.
+        device: the nominal one with the found values in place. Tolerances of J, b and k are those at the drive's
+            nominal torque: a factor that they and the torque share shows in no motion.
+        values: axis -> name -> value; a name is a key of the device, ``delay``, ``k_over_J`` or ``b_over_J``. The
+            intervals hold what the torque is uncertain by, too.
         used: axis -> which recording served as what.
         notes: what could not be told, and what would tell it.
     """
@@ -48,6 +56,11 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identified:
         BadInput: no recording tells anything of any axis, or one cannot be used.
     """
     axes, values, used, notes = dict(device.axes), {}, {}, []
+    if any("sense" in recording for recording in recordings):
+        notes.append(
+            "sense: of an electrode that both axes share nothing is identified, combs and readout stay nominal; "
+            "mechanics come from angle_x, angle_y"
+        )
     for name, axis in device.axes.items():
         found = _Axis(name, axis)
         for recording in recordings:
@@ -55,10 +68,12 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identified:
         found.conclude()
         notes += found.notes
         if found.values:
-            axes[name], values[name], used[name] = found.device_axis(), found.values, found.used
+            axes[name], values[name], used[name] = found.device_axis(), found.marginal(), found.used
     if not values:
         what = "no recording shows a rest, a free decay or a driven motion with a reference angle"
-        raise BadInput(what, file=recordings[0].path if recordings else None, hint="record angle_x beside sense_x")
+        names = ", ".join(sorted({name for recording in recordings for name in recording.channels}))
+        hint = f"record angle_x beside sense_x; there is {names or 'nothing'}"
+        raise BadInput(what, file=recordings[0].path if recordings else None, hint=hint)
     return Identified(replace(device, axes=axes), values, used, notes)
 
 
@@ -71,7 +86,8 @@ class _Axis:
         self.used: list[str] = []
         self.notes: list[str] = []
         self.driven: list[Driven] = []
-        self.inertia: Value | None = None
+        self.decays: list[Decay] = []
+        self.by_torque: dict[str, float] = {}  # standard deviation that the drive's torque adds to a value
 
     def look_at(self, recording: Recording) -> None:
         """Take what one recording tells of this axis."""
@@ -86,7 +102,7 @@ class _Axis:
         clock, values = on_clock(recording, names)
         angle = values[f"angle_{self.name}"]
         if kind == "free decay":
-            self._ringdown(recording, angle, clock.rate)
+            self.decays.append((angle, clock.rate, self._volt(recording)))
             frequency = self.axis.resonance
         else:
             reference = drive_reference(
@@ -101,56 +117,59 @@ class _Axis:
         sense = values.get(f"sense_{self.name}")
         if sense is not None and not isinstance(self.axis.require_readout(), Position):
             found = profile(self.axis, angle, sense, clock.rate, frequency).values
-            for key, value in found.items():
-                self._keep(key, value)
-
-    def _keep(self, key: str, value: Value) -> None:
-        """Several recordings' values of one constant, weighed by their variances."""
-        old = self.values.get(key)
-        if old is not None:
-            weights = 1 / old.sd**2, 1 / value.sd**2
-            mean = (weights[0] * old.value + weights[1] * value.value) / sum(weights)
-            value = Value(mean, float(np.sqrt(1 / sum(weights))))
-        self.values[key] = value
+            self.values = together([self.values, found])
 
     def _rest(self, recording: Recording) -> None:
         sense = recording[f"sense_{self.name}"].read()
         variance = float(sense.var(ddof=1))
         if isinstance(self.axis.require_readout(), Amdm):
-            self._keep("noise_var", Value(variance, variance * np.sqrt(2.0 / sense.size)))
+            found = {"noise_var": Value(variance, variance * np.sqrt(2.0 / sense.size))}
         else:
-            self._keep("noise_sd", Value(float(np.sqrt(variance)), float(np.sqrt(0.5 * variance / sense.size))))
+            found = {"noise_sd": Value(float(np.sqrt(variance)), float(np.sqrt(0.5 * variance / sense.size)))}
+        self.values = together([self.values, found])
 
-    def _ringdown(self, recording: Recording, angle: Array, rate: float) -> None:
-        bias = f"bias_{self.name}"
-        volt = float(recording[bias].read().mean()) if bias in recording else 0.0
-        if f"drive_{self.name}" in recording:
-            volt += float(recording[f"drive_{self.name}"].read().mean())
-        found, _ = ringdown(angle, rate, self.axis, volt)
-        for key in ("k_over_J", "b_over_J"):
-            self._keep(key, found[key])
-        self.inertia = found.get("J", self.inertia)
+    def _volt(self, recording: Recording) -> float:
+        """What the combs hold during a free decay [V]."""
+        names = [name for name in (f"bias_{self.name}", f"drive_{self.name}") if name in recording]
+        return sum(float(recording[name].read().mean()) for name in names)
 
     def conclude(self) -> None:
         """The torque's scale from driven motion, else what a bias tells of it, else the nominal J."""
         axis = self.device_axis()  # with the bell as found
-        frequencies = {round(record.frequency) for record in self.driven}
-        if len(frequencies) > 1:
-            self.values |= mechanics_from_driven(axis, self.driven)
-            return
-        if self.driven:
+        if self.decays:
+            self._take(axis, lambda axis: decayed(axis, self.decays))
+        several = len({round(record.frequency) for record in self.driven}) > 1
+        if several:
+            self._take(axis, lambda axis: mechanics_from_driven(axis, self.driven))
+        elif self.driven:
             self.notes.append(f"{self.name}: one drive frequency does not tell J; record two or more")
-        if "k_over_J" in self.values:
-            mechanics = self.axis.require_mechanics()
-            if self.inertia is None:
-                self.notes.append(
-                    f"{self.name}: J is the nominal one; a free decay tells k/J and b/J only, driven motion J"
-                )
-            inertia = self.inertia or Value(mechanics.J, 0.0)
-            self.values["J"] = inertia
-            for key, ratio in (("k", self.values["k_over_J"]), ("b", self.values["b_over_J"])):
-                sd = np.hypot(ratio.sd * inertia.value, ratio.value * inertia.sd)
-                self.values[key] = Value(ratio.value * inertia.value, float(sd))
+        if self.decays and not several and not any(volt for _, _, volt in self.decays):
+            self.notes.append(
+                f"{self.name}: J is the nominal one; a free decay tells k/J and b/J only, driven motion J"
+            )
+
+    def _take(self, axis: Axis, tell: Callable[[Axis], dict[str, Value]]) -> None:
+        """The mechanics that ``tell`` finds, and how far each goes with the constants of the torque (linear, 1 sd)."""
+        found = tell(axis)
+        self.values |= found
+        self.by_torque |= dict.fromkeys(found, 0.0)
+        for stage, key in TORQUE:
+            part = getattr(axis, stage)
+            value = getattr(part, key, None)
+            if value is None:
+                continue
+            sd = axis.tolerance.get(key, DEFAULT_TOLERANCE) * abs(value)
+            off = tell(replace(axis, **{stage: replace(part, **{key: value + sd})})) if sd else found
+            for name in found:
+                moved = off[name].value - found[name].value
+                self.by_torque[name] = float(np.hypot(self.by_torque[name], moved))
+
+    def marginal(self) -> dict[str, Value]:
+        """The values, each with all that is uncertain about it."""
+        return {
+            key: Value(value.value, float(np.hypot(value.sd, self.by_torque.get(key, 0.0))))
+            for key, value in self.values.items()
+        }
 
     def device_axis(self) -> Axis:
         """The axis with the values in place."""
@@ -165,6 +184,27 @@ class _Axis:
                 key: abs(self.values[key].sd / self.values[key].value) for key in keys if self.values[key].value
             }
         return replace(axis, tolerance=tolerance)
+
+
+def together(found: Sequence[Mapping[str, Value]]) -> dict[str, Value]:
+    """Several recordings' values, those of one constant weighed by their variances."""
+    values: dict[str, Value] = {}
+    for key in dict.fromkeys(key for each in found for key in each):
+        same = [each[key] for each in found if key in each]
+        weights = np.array([1.0 / each.sd**2 for each in same]) if len(same) > 1 else np.ones(1)
+        mean = float(np.average([each.value for each in same], weights=weights))
+        values[key] = Value(mean, float(weights.sum() ** -0.5) if len(same) > 1 else same[0].sd)
+    return values
+
+
+def decayed(axis: Axis, decays: Sequence[Decay]) -> dict[str, Value]:
+    """Mechanics from free decays; J is the nominal one, with its tolerance, where no bias tells it."""
+    found = together([ringdown(angle, rate, axis, volt)[0] for angle, rate, volt in decays])
+    J = found.setdefault("J", Value(axis.require_mechanics().J, 0.0))
+    for key in ("k", "b"):
+        ratio = found[f"{key}_over_J"]
+        found[key] = Value(ratio.value * J.value, float(np.hypot(ratio.sd * J.value, ratio.value * J.sd)))
+    return found
 
 
 def kind_of(recording: Recording, name: str) -> str | None:

@@ -15,7 +15,7 @@ from estimation.identify import Driven, mechanics_from_driven, profile, ringdown
 from phantoms.forward import Plan, Start, settled, simulate, trajectory
 from phantoms.waveforms import Constant, Sine
 from recon.cli import main
-from scanner.device import Device
+from scanner.device import Axis, Device
 from scanner.devices import load
 from scanner.drift import Drift
 from scanner.errors import BadInput
@@ -111,6 +111,78 @@ def test_the_bell_and_the_delay_between_the_channels(decay):
     for key, value in truth.items():
         assert np.mean([d[key].value for d in draws]) == pytest.approx(value, rel=0.01)
     assert min(coverage(draws, truth).values()) >= 0.8
+
+
+def misjudged(axis: Axis, rng: np.random.Generator) -> Axis:
+    """The axis with a comb as a data sheet has it, 2 % off."""
+    comb = axis.require_capacitance()
+    off = 1.0 + 0.02 * rng.standard_normal(2)
+    return replace(axis, capacitance=replace(comb, C0=off[0] * comb.C0, theta0=off[1] * comb.theta0))
+
+
+def test_intervals_hold_the_truth_where_the_torque_is_as_uncertain_as_the_comb(moving):
+    m = AXIS.require_mechanics()
+    draws, tolerances = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        recordings = [
+            Recording.from_arrays(
+                {
+                    "angle_x": (r.angle + PSD * rng.standard_normal(r.angle.size), "rad", RATE, 0.0),
+                    "drive_x": (r.voltage, "V", RATE, 0.0),
+                }
+            )
+            for r in moving
+        ]
+        found = identify(recordings, replace(DRIVEN, axes={"x": misjudged(AXIS, rng)}))
+        draws.append(dict(found.values["x"]))
+        tolerances.append([found.device.tolerance("x", key) for key in "Jbk"])
+    held = coverage(draws, {"J": m.J, "b": m.b, "k": m.k})
+    assert min(held.values()) >= 0.85
+    assert np.mean([d["J"].sd for d in draws]) < 0.06 * m.J  # 2 % of C0, twice 2 % of theta0
+    # The device keeps what does not depend on the torque's scale: the resonance, k / J.
+    assert np.max(tolerances) < 5e-3
+
+
+def test_a_free_decay_under_a_bias_tells_j_as_well_as_it_knows_the_comb(decay):
+    axis = sensing_axis()
+    J = axis.require_mechanics().J
+    draws = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        angle = decay[0][:20000] + 1e-6 * rng.standard_normal(20000)
+        channels = {"angle_x": (angle, "rad", 500e3, 0.0), "bias_x": (np.full(20000, 10.0), "V", 500e3, 0.0)}
+        found = identify([Recording.from_arrays(channels)], Device("decaying", {"x": misjudged(axis, rng)}))
+        draws.append(dict(found.values["x"]))
+    assert coverage(draws, {"J": J})["J"] >= 0.75
+    assert np.mean([d["J"].sd for d in draws]) > 0.02 * J
+
+
+def test_a_free_decay_without_bias_leaves_j_as_uncertain_as_it_was(decay):
+    axis = replace(sensing_axis(), tolerance={"J": 0.03})
+    channels = {"angle_x": (decay[0][:20000], "rad", 500e3, 0.0)}
+    found = identify([Recording.from_arrays(channels)], Device("decaying", {"x": axis}))
+    J, k = (found.values["x"][key] for key in "Jk")
+    assert J.sd == pytest.approx(0.03 * J.value)
+    assert k.sd == pytest.approx(0.03 * k.value, rel=0.01)
+    assert any("J is the nominal one" in note for note in found.notes)
+
+
+def test_a_shared_electrode_is_said_to_tell_mechanics_only(moving):
+    quiet = np.random.default_rng(0).standard_normal(moving[0].angle.size)
+    recordings = [
+        Recording.from_arrays(
+            {
+                "angle_x": (r.angle, "rad", RATE, 0.0),
+                "drive_x": (r.voltage, "V", RATE, 0.0),
+                "sense": (quiet, "V", RATE, 0.0),
+            }
+        )
+        for r in moving
+    ]
+    found = identify(recordings, DRIVEN)
+    assert {"J", "b", "k"} <= set(found.values["x"])
+    assert any(note.startswith("sense: of an electrode that both axes share") for note in found.notes)
 
 
 def calibration(folder) -> list:
