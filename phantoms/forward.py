@@ -227,9 +227,15 @@ def simulate(
         start: state of each axis at the first sample; by default that of a settled drive.
         nominal: the device that the recording is given, where its calibration differs from the truth.
 
+    Raises:
+        BadInput: the plan holds less than two samples, or the device lacks what it needs.
+
     Returns:
         the recording and the content of its ``/truth``: ``angle_x``, ``angle_y`` at every sample, and ``scene``.
     """
+    if round(plan.duration * plan.sample_rate) < 2:
+        what = f"{plan.duration:g} s at {plan.sample_rate:g} samples a second make no recording"
+        raise BadInput(what, hint="simulate for longer, or faster")
     rng = np.random.default_rng(seed)
     parts: dict[str, list[Array]] = {}
     lead: dict[str, Path] = {}

@@ -12,7 +12,7 @@ from recon import views
 from recon.coverage import fill_against_time
 from recon.design import PHASES, Band, Candidate, Wish, design, gap_against_time
 from recon.mapping import Grid, map_samples
-from recon.output import finite, replacing_folder, write_json
+from recon.output import check_folder, finite, replacing_folder, write_json
 from recon.report import Figure, Section, Table, render
 from scanner.device import Device
 
@@ -39,6 +39,7 @@ def design_scan(
     Raises:
         BadInput: see ``recon.design.design``; a device without a field of view where none is given.
     """
+    check_folder(output)
     if half_angles is None:
         view = device.require_scan()
         half_angles = view.half_angle_x, view.half_angle_y

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recon.convert import open_any
-from recon.output import replacing_folder
+from recon.output import check_folder, replacing_folder
 from scanner.device import Device
 from scanner.recording import Recording
 
@@ -40,6 +40,7 @@ def diagnose_files(
 
     from recon.diagnosis_report import diagnosis_report
 
+    check_folder(output)
     began = time.perf_counter()
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]

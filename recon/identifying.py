@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recon.convert import open_any
-from recon.output import replacing_folder
+from recon.output import check_folder, replacing_folder
 from scanner.device import Device
 from scanner.errors import BadInput
 
@@ -36,6 +36,7 @@ def identify_files(
     """
     from estimation.calibration import identify
 
+    check_folder(output)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = Device.load(device) if device else next((r.device for r in recordings if r.device), None)

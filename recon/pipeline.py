@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from recon.score import AxisError, Truth, axis_error
 from recon.slow_mapping import accumulate_slow
 from recon.trouble import Ranges, Trouble, samples, told, troubles, unknown, without
 from recon.undo import placed, with_light
-from scanner.channel import Channel, check_signal
+from scanner.channel import CHANNEL_UNITS, Channel, check_signal
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import Motion
@@ -143,7 +144,7 @@ def reconstruct(
         progress.update()
         errors = {axis: axis_error(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles} if truth else {}
         progress.update()
-    notes += told_of_motion
+    notes += [*unused(recording, device), *told_of_motion]
     for axis in AXES:
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
@@ -223,6 +224,23 @@ def _visited(motion: Motion, ranges: Ranges, grid: Grid) -> NDArray[np.bool_]:
             part = first, min(first + CHUNK, high)
             accumulate(x.read(*part), y.read(*part), np.zeros(part[1] - part[0]), grid, counts=counts)
     return counts > 0
+
+
+def unused(recording: Recording, device: Device) -> list[str]:
+    """A line for every channel and every key of the device that nothing here knows: most of them are slips."""
+    channels = [name for name in recording.channels if name not in CHANNEL_UNITS and name != "intensity"]
+    keys = _leaves({**device.extra, **{name: axis.extra for name, axis in device.axes.items()}})
+    told = [f"{name}: a channel of this name is not used" for name in channels]
+    return [*told, *(f"{key}: is no key of a device, and not used" for key in keys)]
+
+
+def _leaves(table: Mapping[str, Any], where: str = "") -> Iterator[str]:
+    """Dotted keys of all values in tables within tables."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{where}{key}.")
+        else:
+            yield where + key
 
 
 def _windows(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:

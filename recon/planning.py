@@ -19,7 +19,7 @@ import numpy as np
 from phantoms import waveforms
 from phantoms.waveforms import Constant, Multisine, Sine, Sweep, Waveform
 from recon.convert import open_any
-from recon.output import replacing_folder
+from recon.output import check_folder, replacing_folder
 from scanner.device import Device
 from scanner.device_toml import checked_number
 from scanner.errors import BadInput
@@ -218,6 +218,7 @@ def plan_files(
     from phantoms.experiment import device_named
     from recon.diagnosis_report import plan_report
 
+    check_folder(output)
     planned = {path: read_excitation(path) for path in paths if path.suffix == ".toml"}
     with ExitStack() as stack, tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
         recorded = {path: stack.enter_context(open_any(path, mapping)) for path in paths if path.suffix != ".toml"}

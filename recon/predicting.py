@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from recon.convert import open_any
-from recon.output import replacing_folder
+from recon.output import check_folder, replacing_folder
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -31,6 +31,7 @@ def predict_file(
     """
     from estimation.mismatch.prediction import predict
 
+    check_folder(output)
     with open_any(path, mapping) as recording:
         used = Device.load(device) if device is not None else recording.device
         if used is None:

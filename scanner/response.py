@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,8 @@ def added_terms(axis: Axis) -> tuple[Added, ...]:
 def _stated(axis: Axis, effect: str, values: dict[str, float], known: dict[str, Term]) -> Added:
     key = f"{axis.name}.terms.{effect}"
     if effect not in known:
-        hint = f"known effects: {', '.join(known)}; a term file of your own is given with --terms"
+        near = get_close_matches(effect, known) or known
+        hint = f"known effects: {', '.join(near)}; a term file of your own is given with --terms"
         raise BadInput("is an effect that nobody knows", file=axis.source, channel=key, hint=hint)
     term = known[effect]
     if missing := [p.name for p in term.parameters if p.name not in values]:

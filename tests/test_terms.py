@@ -203,6 +203,8 @@ def test_a_bad_term_file_is_one_clear_line(tmp_path, text: str, complaint: str) 
 
 def test_a_device_s_terms_are_checked() -> None:
     assert added_terms(replace(LINEAR, terms={"cubic-stiffness": {"k3": 2.0}}))[0].values == (2.0,)
+    with pytest.raises(BadInput, match=r"nobody knows; known effects: cubic-stiffness, .*--terms"):
+        added_terms(replace(LINEAR, terms={"cubic-stifness": {"k3": 2.0}}))
     with pytest.raises(BadInput, match="nobody knows"):
         added_terms(replace(LINEAR, terms={"no-such-effect": {}}))
     with pytest.raises(BadInput, match="lacks k3"):

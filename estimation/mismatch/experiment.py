@@ -116,7 +116,8 @@ def experiment(recording: Recording, device: Device, finer: int = 1) -> Run:
     """
     outputs = _output_channels(recording, device)
     if not outputs:
-        hint = "record sense or angle channels, or add the readout to the device"
+        holds = ", ".join(recording.channels)
+        hint = f"record sense or angle channels, or add the readout to the device; it holds {holds}"
         raise BadInput("holds no channel that the device could be held against", file=recording.path, hint=hint)
     axes = tuple(name for name in device.axes if any(name in seen for _, seen in outputs.values()))
     drives = {name: _drive_channels(recording, device.axis(name)) for name in axes}

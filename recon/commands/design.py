@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from recon.commands.reconstruct import size
-from recon.commands.simulate import positive
+from recon.commands.simulate import numbers, positive
 
 
-def _pair(text: str) -> tuple[float, float]:
-    first, second = (float(part) for part in text.split(","))
-    return first, second
+def _pair(text: str) -> tuple[float, ...]:
+    return numbers(text, 2, "30,30: of x and of y")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -27,10 +27,9 @@ def size(text: str) -> tuple[int, int]:
 
 def at_least_one(text: str) -> int:
     """A whole number above zero, for argparse."""
-    value = int(text)
-    if value < 1:
-        raise ValueError
-    return value
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number above 0")
+    return int(text)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -136,7 +135,7 @@ def tell(summary: dict[str, Any]) -> str:
         if live["frames"]:
             line += f", {live['latency_s']['median']:.2f} s late (at most {live['latency_s']['max']:.2f} s)"
         lines.append(f"{line}; {live['ended']}")
-    lines += [f"  {note}" for note in summary["notes"]] if summary["trouble"] else []
+    lines += [f"  {note}" for note in summary["notes"]]
     lines.append(f"  picture {summary['output']}/image.png, report {summary['output']}/report.html")
     return "\n".join(lines)
 

@@ -8,17 +8,25 @@ from typing import Any
 
 
 def _drive(text: str) -> tuple[float, ...]:
-    parts = tuple(float(part) for part in text.split(","))
-    if len(parts) != 3:
-        raise ValueError
-    return parts
+    return numbers(text, 3, "27680,30,30: frequency, amplitude, offset")
+
+
+def numbers(text: str, count: int, example: str) -> tuple[float, ...]:
+    """So many numbers with commas between them, for argparse."""
+    try:
+        found = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != count:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {count} numbers; give them as {example}")
+    return found
 
 
 def positive(text: str) -> float:
     """A number above zero, for argparse."""
-    value = float(text)
+    (value,) = numbers(text, 1, "1.5")
     if not 0.0 < value < float("inf"):
-        raise ValueError
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
     return value
 
 
@@ -57,6 +65,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from phantoms.experiment import Experiment, device_named, run
     from phantoms.optics import Detector
     from phantoms.waveforms import Sine
+    from scanner.files import check_place
+
+    check_place(args.output)
 
     experiment = Experiment(
         device=device_named(args.device),
