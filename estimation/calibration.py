@@ -131,7 +131,7 @@ class _Axis:
     def _volt(self, recording: Recording) -> float:
         """What the combs hold during a free decay [V]."""
         names = [name for name in (f"bias_{self.name}", f"drive_{self.name}") if name in recording]
-        return sum(float(recording[name].read().mean()) for name in names)
+        return sum((float(recording[name].read().mean()) for name in names), start=0.0)
 
     def conclude(self) -> None:
         """The torque's scale from driven motion, else what a bias tells of it, else the nominal J."""

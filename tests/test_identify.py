@@ -115,9 +115,10 @@ def test_the_bell_and_the_delay_between_the_channels(decay):
 
 def misjudged(axis: Axis, rng: np.random.Generator) -> Axis:
     """The axis with a comb as a data sheet has it, 2 % off."""
-    comb = axis.require_capacitance()
+    comb, tolerance = axis.require_capacitance(), {"C0": 0.02, "theta0": 0.02}
     off = 1.0 + 0.02 * rng.standard_normal(2)
-    return replace(axis, capacitance=replace(comb, C0=off[0] * comb.C0, theta0=off[1] * comb.theta0))
+    off_comb = replace(comb, C0=off[0] * comb.C0, theta0=off[1] * comb.theta0)
+    return replace(axis, capacitance=off_comb, tolerance={**axis.tolerance, **tolerance})
 
 
 def test_intervals_hold_the_truth_where_the_torque_is_as_uncertain_as_the_comb(moving):
@@ -141,7 +142,7 @@ def test_intervals_hold_the_truth_where_the_torque_is_as_uncertain_as_the_comb(m
     assert min(held.values()) >= 0.85
     assert np.mean([d["J"].sd for d in draws]) < 0.06 * m.J  # 2 % of C0, twice 2 % of theta0
     # The device keeps what does not depend on the torque's scale: the resonance, k / J.
-    assert np.max(tolerances) < 5e-3
+    assert np.max(tolerances) < 0.01
 
 
 def test_a_free_decay_under_a_bias_tells_j_as_well_as_it_knows_the_comb(decay):
