@@ -37,7 +37,8 @@ def _filter(y, voltage, parameters, measure, q, x, P, full, event, ahead, rates,
     gain, offset, R = measure
     chi2, logdet, k = 0.0, 0.0, 0
     for i in range(y.size):
-        th, om, f00, f01, f10, f11 = axis_step(th, om, voltage[i], voltage[i + 1], *parameters)
+        old = comb(th, *parameters)
+        (th, om), (f00, f01, f10, f11), _ = axis_step(th, om, old, voltage[i], voltage[i + 1], *parameters)
         g00, g01 = f00 * p00 + f01 * p01, f00 * p01 + f01 * p11
         g10, g11 = f10 * p00 + f11 * p01, f10 * p01 + f11 * p11
         p00, p01, p11 = g00 * f00 + g01 * f01 + q[0], g00 * f10 + g01 * f11 + q[1], g10 * f10 + g11 * f11 + q[2]

@@ -16,22 +16,30 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from estimation.bell import bell
 from scanner.device import Amdm, Axis, Capacitance, Device, Position, Readout
 from scanner.errors import DeviceInvalid
-from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, electrostatic_torque
+from scanner.laws import electrostatic_torque
 from scanner.lowpass import step_coefficients
 
 Array = NDArray[np.float64]
 
-AXIS_PARAMETERS = ("m11", "m12", "m21", "m22", "kick", "C0", "Cb", "theta0", "theta_th", "pull", "push")
+AXIS_PARAMETERS = ("m11", "m12", "m21", "m22", "kick", "pull", "push", "C0", "Cb", "narrow", "theta_th")
 
 
-@njit(cache=True)
-def axis_step(theta, omega, v0, v1, m11, m12, m21, m22, kick, C0, Cb, theta0, theta_th, pull, push):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", forceinline=True)
+def comb(theta, m11, m12, m21, m22, kick, pull, push, C0, Cb, narrow, theta_th):  # type: ignore[no-untyped-def]
+    """Capacitance [F] and its first two derivatives at ``theta``; takes an axis's parameters whole."""
+    return bell(theta, C0, Cb, narrow, theta_th)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+def axis_step(theta, omega, old, v0, v1, m11, m12, m21, m22, kick, pull, push, C0, Cb, narrow, theta_th):  # type: ignore[no-untyped-def]
     """One sample of the process model.
 
     Args:
         theta, omega: state [rad, rad/s].
+        old: ``comb`` at theta.
         v0, v1: drive voltage at the start and the end of the step [V].
         m11 ... m22: the free flow, exp([[0, 1], [-k/J, -b/J]] Ts).
         kick: Ts / (2 J).
@@ -39,28 +47,21 @@ def axis_step(theta, omega, v0, v1, m11, m12, m21, m22, kick, C0, Cb, theta0, th
         push: torque per volt of a linear drive [N m/V], 0 for an electrostatic one.
 
     Returns:
-        (theta, omega, d theta/d theta0, d theta/d omega0, d omega/d theta0, d omega/d omega0).
+        (theta, omega), (d theta/d theta0, d theta/d omega0, d omega/d theta0, d omega/d omega0) and the new ``comb``.
     """
-    torque = pull * electrostatic_torque(capacitance_slope(theta, C0, theta0, theta_th), v0) + push * v0
-    bend = kick * pull * electrostatic_torque(capacitance_curvature(theta, C0, theta0, theta_th), v0)
-    kicked = omega + kick * torque
-    angle = m11 * theta + m12 * kicked
-    rate = m21 * theta + m22 * kicked
+    _, slope, curvature = old
+    pulled = electrostatic_torque(kick * pull, v0)  # gain of rate by slope
+    bend = pulled * curvature
+    begun = omega + kick * push * v0
+    angle = (m11 * theta + m12 * begun) + (m12 * pulled) * slope  # the slope last: it is what is waited for
+    rate = (m21 * theta + m22 * begun) + (m22 * pulled) * slope
     a11, a21 = m11 + m12 * bend, m21 + m22 * bend
-    torque = pull * electrostatic_torque(capacitance_slope(angle, C0, theta0, theta_th), v1) + push * v1
-    bend = kick * pull * electrostatic_torque(capacitance_curvature(angle, C0, theta0, theta_th), v1)
-    rate += kick * torque
-    return angle, rate, a11, m12, a21 + bend * a11, m22 + bend * m12
-
-
-@njit(cache=True)
-def comb(theta, m11, m12, m21, m22, kick, C0, Cb, theta0, theta_th, pull, push):  # type: ignore[no-untyped-def]
-    """Capacitance [F] and its first two derivatives at ``theta``; takes an axis's parameters whole."""
-    return (
-        capacitance(theta, C0, Cb, theta0, theta_th),
-        capacitance_slope(theta, C0, theta0, theta_th),
-        capacitance_curvature(theta, C0, theta0, theta_th),
-    )
+    new = bell(angle, C0, Cb, narrow, theta_th)
+    _, slope, curvature = new
+    pulled = electrostatic_torque(kick * pull, v1)
+    bend = pulled * curvature
+    rate = (rate + kick * push * v1) + pulled * slope
+    return (angle, rate), (a11, m12, a21 + bend * a11, m22 + bend * m12), new
 
 
 @dataclass(frozen=True)
@@ -130,12 +131,12 @@ def filter_model(
         gain=gain,
         offset=own_offset if offset is None else offset,
         noise_var=readout.noise_sd**2,
-        section_noise=max((1e-6 * bell.C0) ** 2 for bell in bells) if (bells := _bells(device, axes)) else 0.0,
+        section_noise=max(((1e-6 * own.C0) ** 2 for own in _combs(device, axes)), default=0.0),
     )
 
 
-def _bells(device: Device, axes: tuple[str, ...]) -> list[Capacitance]:
-    return [bell for name in axes if (bell := device.axis(name).capacitance) is not None]
+def _combs(device: Device, axes: tuple[str, ...]) -> list[Capacitance]:
+    return [found for name in axes if (found := device.axis(name).capacitance) is not None]
 
 
 def axis_parameters(axis: Axis, step: float, readout: Readout) -> list[float]:
@@ -145,9 +146,9 @@ def axis_parameters(axis: Axis, step: float, readout: Readout) -> list[float]:
     mechanics, drive = axis.require_mechanics(), axis.require_drive()
     flow = expm(np.array([[0.0, 1.0], [-mechanics.k / mechanics.J, -mechanics.b / mechanics.J]]) * step)
     if drive.kind == "electrostatic" or not isinstance(readout, Position):
-        bell = axis.require_capacitance()
-        shape = [bell.C0, bell.Cb, bell.theta0, bell.theta_th]
+        capacitance = axis.require_capacitance()
+        shape = [capacitance.C0, capacitance.Cb, 1.0 / capacitance.theta0, capacitance.theta_th]
     else:
         shape = [0.0, 0.0, 1.0, 0.0]
     pull, push = (1.0, 0.0) if drive.kind == "electrostatic" else (0.0, drive.torque_per_volt or 0.0)
-    return [*flow.ravel(), step / (2.0 * mechanics.J), *shape, pull, push]
+    return [*flow.ravel(), step / (2.0 * mechanics.J), pull, push, *shape]

@@ -21,9 +21,10 @@ def process(model: FilterModel, x: Array, v0: Array, v1: Array) -> Array:
     out = np.array(x)
     old = new = 0.0
     for a, parameters in enumerate(model.parameters):
-        old += comb(x[2 * a], *parameters)[0]
-        out[2 * a : 2 * a + 2] = axis_step(x[2 * a], x[2 * a + 1], v0[a], v1[a], *parameters)[:2]
-        new += comb(out[2 * a], *parameters)[0]
+        start = comb(x[2 * a], *parameters)
+        out[2 * a : 2 * a + 2], _, end = axis_step(x[2 * a], x[2 * a + 1], start, v0[a], v1[a], *parameters)
+        old += start[0]
+        new += end[0]
     for s, (e, p, q) in enumerate(model.sections):
         u = 2 * len(model.axes) + s
         out[u] = e * x[u] + p * old + q * new
@@ -38,10 +39,11 @@ def process_jacobian(model: FilterModel, x: Array, v0: Array, v1: Array) -> Arra
     old, new = np.zeros(n), np.zeros(n)  # gradients of the section's input at the step's ends
     for a, parameters in enumerate(model.parameters):
         at = slice(2 * a, 2 * a + 2)
-        theta, _, *jacobian = axis_step(x[2 * a], x[2 * a + 1], v0[a], v1[a], *parameters)
+        start = comb(x[2 * a], *parameters)
+        _, jacobian, end = axis_step(x[2 * a], x[2 * a + 1], start, v0[a], v1[a], *parameters)
         F[at, at] = np.reshape(jacobian, (2, 2))
-        old[2 * a] = comb(x[2 * a], *parameters)[1]
-        new[at] = comb(theta, *parameters)[1] * F[2 * a, at]
+        old[2 * a] = start[1]
+        new[at] = end[1] * F[2 * a, at]
     for s, (e, p, q) in enumerate(model.sections):
         u = 2 * len(model.axes) + s
         before = np.eye(n)[u]

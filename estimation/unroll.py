@@ -19,8 +19,8 @@ Matrix = dict[tuple[int, int], str]
 
 
 def total(terms: Iterable[str]) -> str:
-    """A sum as source text."""
-    return " + ".join(terms) or "0.0"
+    """A sum as source text; empty terms are none."""
+    return " + ".join(filter(None, terms)) or "0.0"
 
 
 def product(a: str, b: str) -> str:

@@ -8,14 +8,15 @@ from scipy import stats
 from worlds import separate_electrodes, shared_electrode
 
 from estimation import estimate as registry
+from estimation.bell import FINE, bell, gaussian
 from estimation.estimate import estimate
 from estimation.filters import PRINTED_TORQUE_NOISE, follow, prepare, run_compiled, torque_noise, tuned_heights
-from estimation.model import axis_step
+from estimation.model import axis_step, comb
 from estimation.reference_filters import measurement, measurement_jacobian, process, process_jacobian, run_reference
 from phantoms.forward import Plan, Start, simulate
 from phantoms.waveforms import Constant, Multisine, Sine
 from recon.score import axis_error
-from scanner import devices
+from scanner import devices, laws
 from scanner.device import Amdm, Device, Drive, Position
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -102,6 +103,27 @@ def test_likelihood_gathers_the_logarithm_of_every_innovation_variance() -> None
     assert run_compiled(problem, "ekf", heights, n).logdet == pytest.approx(np.sum(logs), rel=1e-9)
 
 
+@pytest.mark.parametrize("size", [1e-3, 0.3, 4.0])
+def test_bell_is_the_law_of_the_comb_and_its_derivatives(size: float) -> None:
+    C0, Cb, theta0, theta_th = 3e-12, 5e-12, 0.06, 0.004
+    theta = theta_th + size * theta0 * np.random.default_rng(0).uniform(-1.0, 1.0, 5000)
+    value, slope, curvature = np.array([bell(t, C0, Cb, 1.0 / theta0, theta_th) for t in theta]).T
+    assert np.allclose(value, laws.capacitance(theta, C0, Cb, theta0, theta_th), rtol=1e-15, atol=0.0)
+    height = np.abs(value - Cb)
+    for own, law, unit in (
+        (slope, laws.capacitance_slope, height / theta0),
+        (curvature, laws.capacitance_curvature, height / theta0**2),
+    ):
+        assert np.abs(own - law(theta, C0, theta0, theta_th)).max() < 4e-15 * unit.max()
+
+
+def test_exponential_is_right_to_the_last_digits_and_leaves_no_number_where_there_is_none() -> None:
+    v = np.linspace(-50.0, 50.0, 20_001)
+    assert np.allclose([gaussian(at) for at in v], np.exp(-((v / FINE) ** 2)), rtol=1.5e-15, atol=0.0)
+    assert gaussian(60.0) == 0.0
+    assert np.isnan([gaussian(np.nan), gaussian(-np.nan), gaussian(np.inf)]).all()
+
+
 def test_jacobian_is_the_derivative_of_the_process() -> None:
     problem = prepare(*CASES["shared electrode, two sections"]())[0]
     model, x, v = problem.model, problem.x, problem.voltage[:, 7]
@@ -120,7 +142,7 @@ def test_process_step_keeps_the_energy_that_an_euler_step_adds() -> None:
     parameters = prepare_parameters(device)
     theta, omega = 0.1, 0.0
     for _ in range(50_000):
-        theta, omega, *_ = axis_step(theta, omega, 0.0, 0.0, *parameters)
+        (theta, omega), *_ = axis_step(theta, omega, comb(theta, *parameters), 0.0, 0.0, *parameters)
     w = 2 * np.pi * axis.resonance
     assert np.hypot(theta, omega / w) == pytest.approx(0.1, rel=1e-9)
 
