@@ -9,11 +9,10 @@ from pathlib import Path
 from recon.output import write_frames
 from recon.pipeline import Options, Reconstruction, mapped
 from recon.trouble import samples, unknown
-from scanner.channel import Channel
 from scanner.errors import BadInput
 
 
-def film(path: Path, result: Reconstruction, intensity: Channel, options: Options) -> None:
+def film(path: Path, result: Reconstruction, options: Options) -> None:
     """Write ``options.frames`` frames, or one for each ``options.frame_time``, as OME-TIFF.
 
     The last frame of a given time may be shorter than the others.
@@ -22,6 +21,7 @@ def film(path: Path, result: Reconstruction, intensity: Channel, options: Option
         BadInput: frames of less than a sample.
     """
     frame_time = options.frame_time or result.recorded / (options.frames or 1)
+    intensity = result.intensity
     length = frame_time * intensity.sample_rate
     if length < 1:
         what = f"has {intensity.sample_rate:.4g} samples a second, and frames of {frame_time:.3g} s would hold none"

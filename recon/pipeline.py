@@ -17,6 +17,7 @@ from estimation.estimate import default_estimator, estimate
 from estimation.signals import device_of
 from estimation.tracker.angle import SlowAngle
 from recon import blur
+from recon.leaps import leaps, longest_stretch
 from recon.mapping import Grid, Picture, accumulate, mean_picture
 from recon.picture_phase import refined
 from recon.registration import PhaseError, registered, slow_period
@@ -76,7 +77,7 @@ class Reconstruction:
         affected: pixels that hold samples from a stretch of trouble, shape (height, width).
         notes: what a reader has to know, a line each.
         seconds: taken, without writing.
-        recorded: length of the intensity [s].
+        intensity: as it was mapped: its light undone, and between leaps of the clock.
         name: of the recording.
     """
 
@@ -92,8 +93,13 @@ class Reconstruction:
     affected: NDArray[np.bool_]
     notes: list[str]
     seconds: float
-    recorded: float
+    intensity: Channel
     name: str
+
+    @property
+    def recorded(self) -> float:
+        """Length of the intensity [s]."""
+        return self.intensity.size / self.intensity.sample_rate
 
     def pixels(self, axis: str) -> int:
         """Pixels of the picture along an axis."""
@@ -117,6 +123,10 @@ def reconstruct(
         intensity = recording.require("intensity", "a picture needs it")
         check_signal(intensity, gaps_ok=True)
         device = device_of(recording, Device.load(options.device) if options.device else None)
+        jumped = leaps(recording)
+        begin, end = longest_stretch(recording, jumped)
+        if jumped:
+            recording = recording.slice(begin, end)
         recording = with_light(recording, device)
         intensity = recording["intensity"]
         for axis in AXES:
@@ -128,7 +138,7 @@ def reconstruct(
         progress.set_postfix_str("mapping")
         grid, notes = field_of(device, motion, options)
         beam = placed(motion, device, recording.start)
-        trouble = troubles(recording)
+        trouble = [*jumped, *troubles(recording)]
         lost = samples(unknown(motion, trouble), intensity)
         picture = mapped(beam, intensity, grid, lost)
         touched = samples(((each.start, each.stop) for each in trouble), intensity)
@@ -149,6 +159,11 @@ def reconstruct(
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
     notes += told(trouble)
+    if jumped:
+        notes.append(
+            f"a phase leaps as where samples were lost: {begin:.6g} s to {end:.6g} s are used, the longest stretch "
+            "between leaps; cut the recording there to see the rest"
+        )
     return Reconstruction(
         motion=motion,
         picture=picture,
@@ -162,7 +177,7 @@ def reconstruct(
         affected=affected,
         notes=notes,
         seconds=time.perf_counter() - began,
-        recorded=intensity.size / intensity.sample_rate,
+        intensity=intensity,
         name=recording.name,
     )
 

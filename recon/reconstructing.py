@@ -50,10 +50,10 @@ def reconstruct_file(
         if result.trouble:
             write_tiff(folder / "affected.tif", result.affected.astype(np.uint8), grid)
         if options.frames or options.frame_time:
-            film(folder / "frames.ome.tif", result, recording["intensity"], options)
+            film(folder / "frames.ome.tif", result, options)
         write_motion(folder / "motion.h5", result.motion)
         write_json(folder / "summary.json", summary)
         save_picture(folder / "image.png", result.picture, result.affected)
-        page = reconstruction_report(result, summary, recording["intensity"])
+        page = reconstruction_report(result, summary)
         (folder / "report.html").write_text(page, encoding="utf-8")
     return summary

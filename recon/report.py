@@ -12,7 +12,6 @@ from recon import views
 from recon.pipeline import AXES, Reconstruction
 from recon.summary import mirrored
 from recon.sweeps import sweeps
-from scanner.channel import Channel
 
 
 @dataclass(frozen=True)
@@ -64,12 +63,8 @@ def render(title: str, lead: str, sections: Sequence[Section], notes: Sequence[s
     return page.render(title=title, lead=lead, sections=sections, notes=notes, unvisited=views.UNVISITED)
 
 
-def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], intensity: Channel) -> str:
-    """One recording's report.
-
-    Args:
-        intensity: of the recording; a stretch of it goes into the page, for the phase sliders.
-    """
+def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) -> str:
+    """One recording's report; a stretch of the intensity goes into the page, for the phase sliders."""
     grid = result.picture.grid
     lead = (
         f"{result.motion.estimator}: {summary['samples']} samples of {result.recorded * 1e3:.4g} ms on {grid.width} × "
@@ -89,7 +84,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], in
         Section(
             "Phase", _phase_text(result), axis_table(summary), phase_figures({result.motion.estimator: result}), "26rem"
         ),
-        by_hand(result, intensity),
+        by_hand(result),
         Section(
             "Blur", BLUR_TEXT, figures=[blur_of({a: summary[a]["blur_px"] for a in AXES}, result.p)], least="30rem"
         ),
@@ -149,10 +144,10 @@ PICTURE_TEXT = (
 )
 
 
-def by_hand(result: Reconstruction, intensity: Channel) -> Section:
+def by_hand(result: Reconstruction) -> Section:
     """Sliders that add to the phases, for what chen2020 did by hand before its filter did it."""
     heading = "Phase by hand"
-    data = sweeps(result, intensity)
+    data = sweeps(result)
     if data is None:
         return Section(heading, "The scan is too short for the phase sliders.")
     first, stop = (1e3 * seconds for seconds in data["seconds"])

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from recon import views
 from recon.pipeline import AXES, REGISTERED, Reconstruction
 from recon.trouble import samples, unknown
-from scanner.channel import Channel
 from scanner.demodulate import block_length, block_phasors
 from scanner.motion import AxisMotion
 
@@ -31,13 +30,14 @@ SIDE = 256  # pixels of the longer side
 NONE = 0  # code of an intensity that is not there; the others are 1 to 255
 
 
-def sweeps(result: Reconstruction, intensity: Channel) -> dict[str, Any] | None:
+def sweeps(result: Reconstruction) -> dict[str, Any] | None:
     """What templates/sweeps.js takes, JSON-serialisable; None for a scan too short for a slow phase.
 
     The stretch is the scan's middle, as long as is registered of a scan at the most: sweeps that are further apart in
     time would show a drift of the device as a fault of the phase.
     """
-    first, count = _stretch(result, intensity)
+    intensity = result.intensity
+    first, count = _stretch(result)
     own = {axis: _slow(result.motion.axes[axis], first, count) for axis in AXES}
     if any(knots["amplitude"].size < 2 for knots in own.values()):
         return None
@@ -74,9 +74,10 @@ def sweeps(result: Reconstruction, intensity: Channel) -> dict[str, Any] | None:
     }
 
 
-def _stretch(result: Reconstruction, intensity: Channel) -> tuple[int, int]:
+def _stretch(result: Reconstruction) -> tuple[int, int]:
     """First sample and number of samples."""
     slowest = min(float(np.median(axis.frequency)) for axis in result.motion.axes.values())
+    intensity = result.intensity
     count = min(intensity.size, READ, round(REGISTERED * intensity.sample_rate / slowest))
     return (intensity.size - count) // 2, count
 

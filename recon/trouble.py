@@ -25,8 +25,8 @@ class Trouble:
     """A stretch of one channel, from ``start`` to ``stop`` [s].
 
     Attributes:
-        kind: ``"gap"`` (samples that are not finite), ``"clipped"``, or ``"missing"`` (the channel begins later or
-            ends earlier than the intensity).
+        kind: ``"gap"`` (samples that are not finite), ``"clipped"``, ``"missing"`` (the channel begins later or ends
+            earlier than the intensity), or ``"leap"`` (see :mod:`recon.leaps`).
     """
 
     channel: str
@@ -59,7 +59,7 @@ def unknown(motion: Motion, found: Sequence[Trouble]) -> list[tuple[float, float
         first, last = float(axis.time[0]) - 2 * SPARE * half, float(axis.time[-1]) + 2 * SPARE * half
         lost += [(-np.inf, first), (last, np.inf)]
         known = np.nan_to_num(axis.phase_sd, nan=np.inf) <= UNKNOWN
-        lost += [(float(axis.time[a]) - half, float(axis.time[b - 1]) + half) for a, b in _runs(~known)]
+        lost += [(float(axis.time[a]) - half, float(axis.time[b - 1]) + half) for a, b in runs(~known)]
     return [
         (max(low, each.start), min(high, each.stop))
         for each in found
@@ -118,7 +118,7 @@ def _gaps(channel: Channel) -> Ranges:
     for first, values in _chunks(channel):
         bad = ~np.isfinite(values)
         if bad.any():
-            found += [(first + a, first + b) for a, b in _runs(bad.reshape(len(bad), -1).any(axis=1))]
+            found += [(first + a, first + b) for a, b in runs(bad.reshape(len(bad), -1).any(axis=1))]
     return found
 
 
@@ -133,11 +133,11 @@ def _clipped(channel: Channel) -> Ranges:
                 found[side].clear()
             at = values == extremes[side]
             if np.count_nonzero(at) >= CLIPPED_RUN:
-                found[side].extend((first + a, first + b) for a, b in _runs(at) if b - a >= CLIPPED_RUN)
+                found[side].extend((first + a, first + b) for a, b in runs(at) if b - a >= CLIPPED_RUN)
     return sorted(found[0] + found[1])
 
 
-def _runs(mask: NDArray[np.bool_]) -> Ranges:
+def runs(mask: NDArray[np.bool_]) -> Ranges:
     """(first, stop) of the runs of True."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -87,7 +87,7 @@ def test_frames_are_the_pictures_of_their_time(
 ) -> None:
     intensity = imaging()[0]["intensity"]
     path = tmp_path / "frames.ome.tif"
-    film(path, result, intensity, options)
+    film(path, result, options)
     frames = tifffile.imread(path)
     assert frames.shape == (len(times) - 1, 60, 80)
     assert frames.dtype == np.float32
@@ -119,7 +119,7 @@ def test_frames_of_a_known_sample_and_several_detectors(tmp_path: Path) -> None:
 
 def test_frames_of_less_than_a_sample_are_refused(result: Reconstruction, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="fewer frames"):
-        film(tmp_path / "frames.ome.tif", result, imaging()[0]["intensity"], Options(frame_time=1e-7))
+        film(tmp_path / "frames.ome.tif", result, Options(frame_time=1e-7))
     assert not list(tmp_path.iterdir())
 
 

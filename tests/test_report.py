@@ -36,12 +36,12 @@ def result() -> Reconstruction:
 
 @pytest.fixture(scope="module")
 def data(result: Reconstruction) -> dict:
-    return sweeps(result, imaging()[0]["intensity"])
+    return sweeps(result)
 
 
 @pytest.fixture(scope="module")
 def page(result: Reconstruction) -> str:
-    return reconstruction_report(result, summarise(result), imaging()[0]["intensity"])
+    return reconstruction_report(result, summarise(result))
 
 
 def program(*names: str) -> str:
@@ -113,7 +113,7 @@ def test_a_long_scan_shows_its_middle_in_runs(
     monkeypatch.setattr(recon.sweeps, "READ", 60_000)
     monkeypatch.setattr(recon.sweeps, "SHOWN", 20_000)
     intensity = imaging()[0]["intensity"]
-    less = sweeps(result, intensity)
+    less = sweeps(result)
     assert less["seconds"] == pytest.approx([0.004, 0.016])
     codes = unpacked(less["intensity"], np.uint8)
     assert 19_000 < codes.size <= 20_000
@@ -125,9 +125,8 @@ def test_a_scan_too_short_for_a_slow_phase_has_no_sliders(
     result: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recon.sweeps, "READ", 5_000)
-    intensity = imaging()[0]["intensity"]
-    assert sweeps(result, intensity) is None
-    section = by_hand(result, intensity)
+    assert sweeps(result) is None
+    section = by_hand(result)
     assert section.sweeps is None
     assert "too short" in section.text
 
@@ -225,12 +224,12 @@ def test_trouble_is_marked_and_its_samples_have_no_place(result: Reconstruction)
     lost_x = replace(x, phase_sd=np.where((x.time > 0.006) & (x.time < 0.009), 10.0, x.phase_sd))
     motion = replace(result.motion, axes={**result.motion.axes, "x": lost_x})
     troubled = replace(result, motion=motion, trouble=gap, affected=affected)
-    codes = unpacked(sweeps(troubled, intensity)["intensity"], np.uint8)
+    codes = unpacked(sweeps(troubled)["intensity"], np.uint8)
     lost = samples(unknown(troubled.motion, gap), intensity)
     assert lost
     expected = np.concatenate([np.arange(*each) for each in lost])
     assert np.array_equal(np.flatnonzero(codes == NONE), expected)
-    assert "the trouble noted above" in reconstruction_report(troubled, summarise(troubled), intensity)
+    assert "the trouble noted above" in reconstruction_report(troubled, summarise(troubled))
     grey = np.full((160, 200, 3), 100, np.uint8)
     shown = marked(grey, affected)
     assert np.array_equal(shown[80:], grey[80:])
@@ -243,7 +242,7 @@ def test_several_detectors_are_averaged(result: Reconstruction, data: dict) -> N
     raw = np.stack([values + 0.3, values - 0.3], 1)
     pair = replace(intensity, raw=raw, first=0, stop=values.size, gain=1.0, offset=0.0)
     image = result.picture.image[..., None] + np.array([0.3, -0.3], np.float32)
-    several = sweeps(replace(result, picture=replace(result.picture, image=image)), pair)
+    several = sweeps(replace(result, picture=replace(result.picture, image=image), intensity=pair))
     codes, own = (unpacked(each["intensity"], np.uint8).astype(int) for each in (several, data))
     assert np.abs(codes - own).max() <= 1
     assert several["limits"] == pytest.approx(data["limits"], abs=0.1)

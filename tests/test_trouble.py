@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from worlds import imaging, separate_electrodes
 
 from recon.cli import main
+from recon.leaps import leaps
 from recon.pipeline import Options, Reconstruction, reconstruct
 from recon.score import told_truth
 from recon.trouble import Trouble, samples, troubles, without
@@ -112,6 +113,51 @@ def test_samples_of_which_no_one_can_say_where_the_mirror_was_are_dropped_and_co
     assert result.trouble == [Trouble("sense_x", "missing", 0.008, 0.012)]
     assert 0.6 * 20_000 < result.dropped < 20_000
     assert result.picture.coverage.sum() <= 60_000 - result.dropped
+
+
+CHANNELS = ("sense", "drive_x", "drive_y", "intensity")
+
+
+def without_samples(names: Iterable[str], first: int, count: int) -> Recording:
+    """The scan, ``count`` samples of the channels named lost on the way, and no gap in their time base."""
+    return damaged(**{name: np.delete(values(name), np.s_[first : first + count]) for name in names})
+
+
+@pytest.mark.parametrize(("names", "lost"), [(CHANNELS, 100), (CHANNELS, 2), (("sense",), 30), (("drive_x",), 5000)])
+def test_lost_samples_show_as_a_leap(names: tuple[str, ...], lost: int) -> None:
+    found = leaps(without_samples(names, 60_000, lost))
+    assert found
+    assert {each.channel for each in found} <= set(names)
+    assert all(each.start < 0.012 < each.stop and each.stop - each.start < 0.006 for each in found)
+
+
+def test_what_moves_evenly_does_not_leap() -> None:
+    time = np.arange(200_000) / 2e6
+    sweep = np.sin(2 * np.pi * (2e4 * time + 0.5 * 2e3 / 0.1 * time**2))
+    steps = np.sin(2 * np.pi * np.cumsum(np.where(time < 0.05, 2e4, 2.02e4)) / 2e6)
+    settling = np.sin(2 * np.pi * 2e4 * time + 2.0 * np.exp(-time / 0.004))
+    noise = np.random.default_rng(0).standard_normal(time.size)
+    off = np.where(time < 0.06, np.sin(2 * np.pi * 2e4 * time), 1e-3 * noise)
+    drive = np.sin(2 * np.pi * 2e4 * time)
+    for drives, sense in ((sweep, sweep), (steps, drive), (drive, settling), (drive, drive + noise), (off, off)):
+        channels = {"drive_x": (drives, "V", 2e6, 0.0), "sense_x": (sense, "V", 2e6, 0.0)}
+        assert leaps(Recording.from_arrays(channels)) == []
+
+
+def test_the_longest_stretch_between_leaps_is_reconstructed(whole: Reconstruction) -> None:
+    first, lost = 30_000, 100
+    result = of(without_samples(CHANNELS, first, lost))
+    assert {each.kind for each in result.trouble} == {"leap"}
+    begin = max(each.stop for each in result.trouble)
+    assert result.motion.axes["x"].angle.start >= begin - 1 / RATE
+    assert result.picture.coverage.sum() <= (0.02 - begin) * RATE
+    assert any("leaps as where samples were lost" in note for note in result.notes)
+    x, y = (result.motion.axes[axis].angle.read() for axis in "xy")
+    at = round(result.motion.axes["x"].angle.start * RATE) + lost  # where these samples were in the whole scan
+    for angle, axis in ((x, "x"), (y, "y")):
+        same = whole.motion.axes[axis].angle.read()[at : at + angle.size]
+        error = angle - np.sign(angle @ same) * same  # an even capacitance does not know the sign
+        assert np.sqrt(np.mean(error**2)) < 2e-3 * np.abs(angle).max()
 
 
 def test_the_folder_and_the_summary_say_so(tmp_path: Path) -> None:

@@ -1,0 +1,94 @@
+"""Samples that were lost on the way, without a gap in the time base: the phase of a line leaps.
+
+A drive goes on evenly and a resonant mirror cannot follow a leap, so one shows that the channel's clock jumped. How
+many samples are missing a phase tells only up to whole periods, so nothing is mended: what lies between leaps is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.reference import dominant_frequency
+from recon.trouble import Trouble, runs
+from scanner.channel import Channel
+from scanner.demodulate import block_length, block_phasors
+from scanner.errors import BadInput
+from scanner.recording import Recording
+
+Array = NDArray[np.float64]
+
+CYCLES = 8.0  # of a line, a look at its phase
+APART = 2e-3  # s from one look to the next
+MOST_LOOKS = 400  # at a line; further apart in a long recording
+SIDE = 8  # looks on either side that tell how the phase goes on
+LEAST = {"drive": 0.02, "sense": 0.3}  # rad: a mirror's phase wanders, a drive's does not
+OVER_NOISE = 12.0  # in standard deviations of what the phase does otherwise
+ALONE = 4.0  # times what the phase does in the steps around
+STEADY = 0.3  # of a line's median amplitude: below it there is no phase to tell
+
+
+def leaps(recording: Recording) -> list[Trouble]:
+    """Where the phase of a drive, or of a sense signal at a drive's line, leaps."""
+    lines: dict[str, float] = {}
+    found: list[Trouble] = []
+    for name, channel in recording.channels.items():
+        if name.startswith("drive_"):
+            try:
+                lines[name[-1]] = dominant_frequency(channel)
+            except BadInput:  # it does not oscillate: nothing that could leap
+                continue
+            found += _leaps(channel, lines[name[-1]], LEAST["drive"])
+    for name, channel in recording.channels.items():
+        if name.startswith("sense"):
+            for axis, frequency in lines.items():
+                if name in ("sense", f"sense_{axis}"):
+                    found += _leaps(channel, frequency, LEAST["sense"])
+    return found
+
+
+def longest_stretch(recording: Recording, found: Sequence[Trouble]) -> tuple[float, float]:
+    """Begin and end [s] of the longest stretch without a leap."""
+    edges = sorted((each.start, each.stop) for each in found)
+    begins = [recording.start, *(max(stop for _, stop in edges[: i + 1]) for i in range(len(edges)))]
+    ends = [*(start for start, _ in edges), recording.end]
+    return max(zip(begins, ends, strict=True), key=lambda stretch: stretch[1] - stretch[0])
+
+
+def _leaps(channel: Channel, frequency: float, least: float) -> Iterator[Trouble]:
+    time, phase, size = _looks(channel, frequency)
+    if time.size < 2 * SIDE:
+        return
+    step = _turned(np.diff(phase))
+    step = _turned(step - np.angle(np.nanmean(np.exp(1j * step))))
+    usual = np.array([np.nanmedian(step[max(0, i - SIDE) : i + SIDE + 1]) for i in range(step.size)])
+    excess = step - usual
+    pair = _turned(excess[:-1] + excess[1:])  # a leap within a look is shared by the steps before and behind it
+    limit = max(least, OVER_NOISE * 1.48 * float(np.nanmedian(np.abs(pair))))
+    beside = np.maximum(np.abs(excess[:-3]), np.abs(excess[3:]))  # a transient shows in the steps around it too
+    steady = size > STEADY * np.nanmedian(size)
+    alone = (np.abs(pair[1:-1]) > np.maximum(limit, ALONE * beside)) & steady[1:-3] & steady[3:-1]
+    for low, high in runs(alone):
+        yield Trouble(channel.name, "leap", float(time[low + 1]), float(time[high + 2]))
+
+
+def _looks(channel: Channel, frequency: float) -> tuple[Array, Array, Array]:
+    """Times [s], phases against the line [rad] and amplitudes, each of shape (looks,)."""
+    block = block_length(frequency, channel.sample_rate, CYCLES)
+    stride = max(block, round(APART * channel.sample_rate), channel.size // MOST_LOOKS)
+    stride = max(block, min(stride, channel.size // (4 * SIDE)))
+    times, phasors = [], []
+    for first in range(0, channel.size - block + 1, stride):
+        start = channel.start + first / channel.sample_rate
+        time, z = block_phasors(channel.read(first, first + block), channel.sample_rate, start, frequency, block)
+        times.append(time[0])
+        phasors.append(z[0] * np.exp(-2j * np.pi * frequency * time[0]))
+    z = np.array(phasors)
+    return np.array(times), np.angle(z), np.abs(z)
+
+
+def _turned(angle: Array) -> Array:
+    """Angles in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
