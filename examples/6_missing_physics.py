@@ -3,7 +3,8 @@ Finding missing physics
 =======================
 
 Behind the demodulator the amplifier has one more low-pass than its data sheet says. The picture is blurred; a bench
-recording is held against the nominal device; what is missing is named, and the same scan comes out sharp.
+recording is held against the nominal device; what is missing is named, and the same scan comes out sharp. The device
+and its recordings are those of ``missing_physics.py``, which stands beside this in ``examples``.
 """
 
 import matplotlib.pyplot as plt

@@ -45,7 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # what stops it tidies up, as Ctrl-C does
     try:
         return _command(given)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not isinstance(error, KeyboardInterrupt) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise  # h5py turns an interrupt inside one of its callbacks into a SystemError
         print(f"lissajous {' '.join(given[:1])}: interrupted; nothing was written", file=sys.stderr)
         return 1
 

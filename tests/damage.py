@@ -89,14 +89,16 @@ class Outcome:
         return self.code == 2 and self.told.count("\n") == 1 and "Traceback" not in self.told
 
 
-def tried(act: Callable[[], int], log: Path, meanwhile: Callable[[int], None] = lambda pid: None) -> Outcome:
+def tried(
+    act: Callable[[], int], log: Path, meanwhile: Callable[[int], None] = lambda pid: None, seconds: int = SECONDS
+) -> Outcome:
     """The outcome of ``act`` in a child process, with what it wrote to stderr; ``meanwhile`` gets its number."""
     sys.stdout.flush()
     child = os.fork()
     if not child:
         code = 70
         try:
-            signal.alarm(SECONDS)
+            signal.alarm(seconds)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

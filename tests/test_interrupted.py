@@ -135,7 +135,7 @@ def test_a_command_that_is_stopped_leaves_nothing_that_looks_finished(
             os.kill(pid, by)
 
         given = [*case.arguments, "-o", str(output)]
-        outcome = tried(lambda given=given: main(given), tmp_path / "log", stop)
+        outcome = tried(lambda given=given: main(given), tmp_path / "log", stop, seconds=90)
         lines = [line for line in outcome.told.replace("\r", "\n").splitlines() if line.startswith("lissajous")]
         assert "Traceback" not in outcome.told, outcome
         assert looks_finished(output, case) == (outcome.code == 0), (number, outcome)
@@ -157,7 +157,7 @@ def test_a_full_disk_leaves_nothing(cases: Mapping[str, Case], tmp_path: Path, n
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
         return main([*case.arguments, "-o", str(output)])
 
-    outcome = tried(little_room, tmp_path / "log")
+    outcome = tried(little_room, tmp_path / "log", seconds=90)
     lines = [line for line in outcome.told.replace("\r", "\n").splitlines() if line.startswith("lissajous")]
     assert (outcome.code, len(lines)) == (1, 1), outcome
     assert "Traceback" not in outcome.told

@@ -101,6 +101,9 @@ def _telling(output: Path) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         raise _stopped(InterruptedError, errno.EINTR, "interrupted", output) from None
+    except OSError as error:
+        error.filename = error.filename or str(output)  # a full disk does not say where
+        raise
     except BrokenExecutor:
         raise _stopped(ChildProcessError, errno.ECHILD, "a worker was killed (out of memory?)", output) from None
     except CancelledError:
