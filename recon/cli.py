@@ -6,13 +6,13 @@ import argparse
 import importlib
 import json
 import os
-import signal
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
+
+from recon.stopping import stoppable
 
 COMMANDS = {
     "reconstruct": "track the motion of a recording and map its intensities to a picture",
@@ -41,15 +41,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The matrices here are small: threads inside BLAS cost more than they bring, several times over on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given = list(sys.argv[1:] if arguments is None else arguments)
-    with suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # what stops it tidies up, as Ctrl-C does
-    try:
-        return _command(given)
-    except (KeyboardInterrupt, SystemError) as error:
-        if not isinstance(error, KeyboardInterrupt) and not isinstance(error.__cause__, KeyboardInterrupt):
-            raise  # h5py turns an interrupt inside one of its callbacks into a SystemError
-        print(f"lissajous {' '.join(given[:1])}: interrupted; nothing was written", file=sys.stderr)
-        return 1
+    with stoppable() as stop:
+        try:
+            return _command(given)
+        except BaseException as error:
+            if not stop.came or isinstance(error, SystemExit):
+                raise
+            # Compiled code makes of an interrupt in a callback whatever it likes, a TypeError for one.
+            print(f"lissajous {' '.join(given[:1])}: interrupted; nothing was written", file=sys.stderr)
+            return 1
 
 
 def _command(given: Sequence[str]) -> int:

@@ -28,6 +28,7 @@ from recon.mapping import Grid, Picture
 from recon.output import check_folder, write_tiff
 from recon.pipeline import Options, field_of, mapped, moved
 from recon.registration import slow_period
+from recon.stopping import heard
 from recon.trouble import samples, troubles, unknown
 from recon.undo import placed, with_light
 from recon.views import save_picture
@@ -135,6 +136,7 @@ def follow(
                 late = f", {live.latency_s[-1]:.2f} s late" if live.latency_s else ""
                 bar.set_postfix_str(f"{live.dropped} dropped{late}")
             live.ended = ended or live.ended
+    heard()
     return live
 
 

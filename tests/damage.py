@@ -94,6 +94,7 @@ def tried(
 ) -> Outcome:
     """The outcome of ``act`` in a child process, with what it wrote to stderr; ``meanwhile`` gets its number."""
     sys.stdout.flush()
+    log.write_text("")  # a child that is ended at once does not get to it
     child = os.fork()
     if not child:
         code = 70

@@ -10,6 +10,7 @@ import resource
 import signal
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from damage import tried
 from study_worlds import small_study
 
 from recon.cli import main
+from recon.stopping import stoppable
 from scanner import devices
 from scanner.recording import Recording
 
@@ -139,7 +141,7 @@ def test_a_command_that_is_stopped_leaves_nothing_that_looks_finished(
         lines = [line for line in outcome.told.replace("\r", "\n").splitlines() if line.startswith("lissajous")]
         assert "Traceback" not in outcome.told, outcome
         assert looks_finished(output, case) == (outcome.code == 0), (number, outcome)
-        if by != signal.SIGKILL:
+        if by != signal.SIGKILL and (outcome.code, outcome.told) != (-by, ""):  # which came before the command began
             assert not left_behind(tmp_path), outcome
             assert outcome.code in (0, 1), outcome
             assert len(lines) == outcome.code, outcome
@@ -165,3 +167,48 @@ def test_a_full_disk_leaves_nothing(cases: Mapping[str, Case], tmp_path: Path, n
     assert lines[0].endswith((": File too large", " written"))
     assert not looks_finished(output, case)
     assert not left_behind(tmp_path)
+
+
+# --- an interrupt that compiled code loses ---------------------------------------------------------------------------
+
+
+def test_an_interrupt_that_got_lost_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recon.stopping.AGAIN", 0.05)
+    before = signal.getsignal(signal.SIGINT)
+    with stoppable() as stop:
+        assert not stop.came
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert stop.came
+        try:
+            time.sleep(5.0)
+        except KeyboardInterrupt:
+            time.sleep(0.2)  # whoever tidies up is left alone
+        else:
+            pytest.fail("it did not come again")
+    assert signal.getsignal(signal.SIGINT) == before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("made_of_it", [TypeError, SystemError, RuntimeError])
+def test_whatever_becomes_of_an_interrupt_is_one_line(
+    made_of_it: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(args: object) -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise made_of_it("'sig'") from None
+
+    monkeypatch.setattr("recon.commands.info.run", work)
+    assert main(["info", "a.h5"]) == 1
+    assert capsys.readouterr().err == "lissajous info: interrupted; nothing was written\n"
+
+
+def test_an_error_of_its_own_is_not_taken_for_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+    def work(args: object) -> None:
+        raise TypeError("a fault of ours")
+
+    monkeypatch.setattr("recon.commands.info.run", work)
+    with pytest.raises(TypeError, match="of ours"):
+        main(["info", "a.h5"])
