@@ -79,14 +79,12 @@ def _looks(channel: Channel, frequency: float) -> tuple[Array, Array, Array]:
     block = block_length(frequency, channel.sample_rate, CYCLES)
     stride = max(block, round(APART * channel.sample_rate), channel.size // MOST_LOOKS)
     stride = max(block, min(stride, channel.size // (4 * SIDE)))
-    times, phasors = [], []
-    for first in range(0, channel.size - block + 1, stride):
-        start = channel.start + first / channel.sample_rate
-        time, z = block_phasors(channel.read(first, first + block), channel.sample_rate, start, frequency, block)
-        times.append(time[0])
-        phasors.append(z[0] * np.exp(-2j * np.pi * frequency * time[0]))
-    z = np.array(phasors)
-    return np.array(times), np.angle(z), np.abs(z)
+    firsts = np.arange(0, channel.size - block + 1, stride)
+    looks = np.concatenate([channel.read(first, first + block) for first in firsts.tolist()] or [np.empty(0)])
+    _, z = block_phasors(looks, channel.sample_rate, 0.0, frequency, block)  # phases at the looks' own centres
+    time = channel.start + (firsts + 0.5 * (block - 1)) / channel.sample_rate
+    phase = np.angle(z * np.exp(-2j * np.pi * frequency * time))
+    return np.asarray(time, np.float64), np.asarray(phase, np.float64), np.asarray(np.abs(z), np.float64)
 
 
 def _turned(angle: Array) -> Array:
