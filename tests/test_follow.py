@@ -72,6 +72,8 @@ def written(scan: Path, tmp_path: Path):
         path = tmp_path / "growing.h5"
         arguments = [str(scan), str(path), str(parts), str(pause), end]
         started.append(subprocess.Popen([sys.executable, "-c", WRITER, *arguments]))
+        while end != "close" and not path.exists():  # on a busy machine it takes longer than the quiet time
+            time.sleep(0.01)
         return path
 
     yield start
