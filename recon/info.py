@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import h5py
-
 from recon.convert import open_any
 from recon.readers import read
 from recon.readers.contents import Variable
 from scanner.channel import CHANNEL_UNITS
-from scanner.hdf5 import attributes, check_ends, open_hdf5
+from scanner.hdf5 import attributes, check_ends, is_hdf5, open_hdf5
 from scanner.recording import FORMAT
 
 HEADING = f"""\
@@ -66,7 +64,7 @@ def suggestion(variables: Any, format: str | None = None) -> str:
 
 
 def _is_recording(path: Path) -> bool:
-    if not path.is_file() or not h5py.is_hdf5(path):
+    if not is_hdf5(path):
         return False
     with open_hdf5(path) as file:
         return attributes(file).get("format") == FORMAT

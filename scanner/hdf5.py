@@ -43,6 +43,14 @@ def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
         raise BadInput(f"cannot be read: {error}", file=path, channel=channel, hint="copy the file again") from None
 
 
+def is_hdf5(path: Path) -> bool:
+    """Whether there is a file that begins as HDF5 does, and may be read."""
+    try:
+        return path.is_file() and h5py.is_hdf5(path)
+    except OSError:
+        return False
+
+
 def check_ends(path: Path) -> None:
     """Refuse a file on which HDF5 runs for ever, as it does on some that are damaged, or comes to grief.
 
@@ -53,7 +61,7 @@ def check_ends(path: Path) -> None:
     Raises:
         BadInput: the fork did not come back.
     """
-    if not hasattr(os, "fork") or not path.is_file() or not h5py.is_hdf5(path):
+    if not hasattr(os, "fork") or not is_hdf5(path):
         return
     looking = os.fork()
     if not looking:
@@ -92,17 +100,17 @@ def open_hdf5(path: Path, growing: bool = False) -> h5py.File:
     Raises:
         BadInput: it is not there, empty, no HDF5, or cut short.
     """
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "no such file"
-        raise BadInput(what, file=path, hint="name a recording (HDF5)")
-    if path.stat().st_size == 0:
-        raise BadInput("the file is empty", file=path, hint="copy it again")
     try:
+        if not path.is_file():
+            what = "is a folder" if path.is_dir() else "no such file"
+            raise BadInput(what, file=path, hint="name a recording (HDF5)")
+        if path.stat().st_size == 0:
+            raise BadInput("the file is empty", file=path, hint="copy it again")
         return h5py.File(path, "r", swmr=growing)
     except PermissionError:
         raise BadInput("may not be read", file=path, hint="check its permissions") from None
     except OSError as error:
-        if not h5py.is_hdf5(path):
+        if not is_hdf5(path):
             hint = "name a recording, or make one with `lissajous convert`"
             raise BadInput("is not an HDF5 file", file=path, hint=hint) from None
         what = "the file is truncated" if "truncated" in str(error) else f"cannot be opened: {error}"

@@ -85,6 +85,21 @@ def test_a_file_on_which_hdf5_never_comes_back_is_refused(
         assert not (tmp_path / "out").exists()
 
 
+def test_what_may_not_be_read_is_refused(
+    whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*args: object, **kwargs: object) -> None:  # as h5py does; whoever runs tests as root may read anything
+        raise PermissionError(13, "Unable to open file (unable to open file, errno = 13, ...)")
+
+    monkeypatch.setattr("h5py.is_hdf5", refuse)
+    monkeypatch.setattr("h5py.File", refuse)
+    path = tmp_path / "rec.h5"
+    path.write_bytes(whole["recording.h5"])
+    for arguments in (["info", str(path)], ["reconstruct", str(path), "-o", str(tmp_path / "out")]):
+        assert main(arguments) == 2
+        assert capsys.readouterr().err == f"lissajous {arguments[0]}: {path}: may not be read; check its permissions\n"
+
+
 # --- recordings that are HDF5 and wrong ------------------------------------------------------------------------------
 
 
