@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 _CYCLES = 4  # of the drive, a block: a sweep of an eighth of the frequency each way is followed
 _CHUNK = 1 << 19  # samples read at a time
 _MOST = 1 << 18  # samples in which a line is looked for
-_FEW_PERIODS = 5.0
+_FEW_PERIODS = 3.0
 _QUIET = 0.1  # of the largest amplitude: below it the drive counts as off and its phase goes on as it was
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,13 +34,18 @@ def block_phasors(
         (centre times [s], Z), both of shape (n // block,).
     """
     starts = np.arange(values.size // block) * block
-    offset = (np.arange(block) - 0.5 * (block - 1)) / rate
-    turn = 2 * np.pi * frequency * offset
+    fitted, _ = block_products(values, starts, _phasor_weights(block, frequency / rate), 1, gain)
+    centres = start + (starts + 0.5 * (block - 1)) / rate
+    return np.asarray(centres, np.float64), np.asarray(fitted[:, 1] + 1j * fitted[:, 0], np.complex128)
+
+
+@lru_cache(maxsize=4)
+def _phasor_weights(block: int, turns: float) -> Array:
+    """What the fit of ``block_phasors`` takes of each sample, ``turns`` from one to the next: cosine's share, sine's."""
+    turn = 2 * np.pi * turns * (np.arange(block) - 0.5 * (block - 1))
     basis = np.stack([np.ones(block), np.cos(turn), np.sin(turn)])
-    window = np.sin(np.pi * (np.arange(block) + 0.5) / block) ** 2
-    weights = np.linalg.inv((basis * window) @ basis.T)[1:] @ (basis * window)
-    fitted, _ = block_products(values, starts, weights, 1, gain)
-    return np.asarray(start + (starts + 0.5 * (block - 1)) / rate), np.asarray(fitted[:, 1] + 1j * fitted[:, 0])
+    windowed = basis * np.sin(np.pi * (np.arange(block) + 0.5) / block) ** 2
+    return np.asarray(np.linalg.inv(windowed @ basis.T)[1:] @ windowed)
 
 
 def plain(values: NDArray[Any]) -> NDArray[Any]:

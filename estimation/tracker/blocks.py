@@ -22,7 +22,7 @@ from scanner.demodulate import ROWS, block_products, plain
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-CHUNK = 1 << 17  # samples read at a time: they stay in the cache
+CHUNK = 1 << 18  # samples read at a time
 CLIPPED_RUN = 8  # equal samples in a row at a block's extreme: noise would not let them be equal
 TABLE_REACH = 0.03  # cycles that the highest harmonic may slip against its table over a block
 
@@ -53,8 +53,10 @@ def basis(length: int, rate: float, lines: Index, tuned: Array) -> Array:
     Args:
         lines: (reference, order) of each line, shape (lines, 2). tuned: of each reference [rad/s].
     """
-    turn = (lines[:, 1] * tuned[lines[:, 0]])[:, None] * _offsets(length, rate)
-    rows = np.stack([np.cos(turn), np.sin(turn)], axis=1).reshape(-1, length)
+    turn = np.exp(1j * np.outer(tuned, _offsets(length, rate)))
+    powers = np.cumprod(np.broadcast_to(turn, (lines[:, 1].max(initial=1), *turn.shape)), axis=0)
+    turned = powers[lines[:, 1] - 1, lines[:, 0]]
+    rows = np.stack([turned.real, turned.imag], axis=1).reshape(-1, length)
     return np.concatenate([np.ones((1, length)), rows])
 
 
@@ -116,7 +118,7 @@ def project(
 
 
 def _moments(table: Array, offset: Array) -> Array:
-    return np.stack([table * offset**n @ table.T for n in range(3)])
+    return np.stack([table @ table.T, (table * offset) @ table.T, (table * offset * offset) @ table.T])
 
 
 def _offsets(length: int, rate: float) -> Array:
