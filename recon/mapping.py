@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from scanner.errors import BadInput
 
 BLOCK = 256  # samples whose pixels are found before they are added up
-OUTSIDE = 1 << 29  # beyond every index, and twice it is an int32 still
+BITS = 18  # of a position's fraction, in an int32
+WIDEST = 1 << 12  # pixels across whose positions do fit
+OUTSIDE = 1 << 29  # beyond every index, an int32 still
 
 
 @dataclass(frozen=True)
@@ -98,36 +100,59 @@ def pixel_index(angle: NDArray[Any] | float, half_angle: float, n: int) -> NDArr
     return _pixels(angle, half_angle, n)
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
-def block_pixels(angles, half_angle, n, stride, out):  # type: ignore[no-untyped-def]
-    """``stride`` times the pixels of a block, OUTSIDE outside the field: `pixel_of` without a branch, for SIMD."""
-    for i in range(angles.size):
-        position = angles[i] / half_angle
-        pixel = max(math.ceil(0.5 * n * (position + 1.0)) - 1.0, 0.0)
-        out[i] = np.int32(pixel * stride) if abs(position) <= 1.0 else np.int32(OUTSIDE)
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _found(x, y, values, half_x, half_y, width, height, index):  # type: ignore[no-untyped-def]
+    """`_indices` without a branch or a division, for SIMD: False where it cannot tell.
 
-
-@numba.njit(cache=True, error_model="numpy", inline="always")
-def add_block(columns, index, values, sums, counts):  # type: ignore[no-untyped-def]
-    """Add a block to flat sums and counts; ``index`` holds the rows times the width and is written over."""
-    for i in range(values.size):  # apart from the adding up, so that it is done side by side
-        index[i] = index[i] + columns[i] if values[i] == values[i] else OUTSIDE
+    Positions are whole numbers of 2^-BITS pixels; what lies next to an edge could belong to either side. Every number
+    stays an int32: twice as many fit a register.
+    """
+    if max(width, height) > WIDEST:
+        return False
+    one, fraction, stride = np.int32(1), np.int32((1 << BITS) - 1), np.int32(width)
+    right, top = np.int32(width << BITS), np.int32(height << BITS)
+    middle_x, middle_y = 0.5 * right, 0.5 * top
+    scale_x, scale_y = middle_x / half_x, middle_y / half_y
+    nearest = np.int32(2)
     for i in range(values.size):
+        column = np.int32(max(min(x[i] * scale_x + middle_x, right + 2.0), -2.0))
+        row = np.int32(max(min(y[i] * scale_y + middle_y, top + 2.0), -2.0))
+        nearest = min(nearest, np.int32(np.int32(column + one) & fraction), np.int32(np.int32(row + one) & fraction))
+        inside = (column >= 0) & (column < right) & (row >= 0) & (row < top) & (values[i] == values[i])
+        pixel = np.int32(np.int32(np.int32(row >> BITS) * stride) + np.int32(column >> BITS))
+        index[i] = pixel if inside else np.int32(OUTSIDE)
+    return nearest >= 2
+
+
+@numba.njit(cache=True)
+def _indices(x, y, values, half_x, half_y, width, height, index):  # type: ignore[no-untyped-def]
+    """Flat indices of the pixels of a block, OUTSIDE outside the field and where there is no value."""
+    for i in range(values.size):
+        column, row = pixel_of(x[i], half_x, width), pixel_of(y[i], half_y, height)
+        inside = column >= 0 and row >= 0 and values[i] == values[i]
+        index[i] = row * width + column if inside else OUTSIDE
+
+
+@numba.njit(cache=True, error_model="numpy")
+def add_block(x, y, values, half_x, half_y, index, sums, counts):  # type: ignore[no-untyped-def]
+    """Add a block of samples to sums and counts; ``index`` is room for as many int32."""
+    height, width = counts.shape
+    flat_sums, flat_counts = sums.reshape(-1), counts.reshape(-1)
+    if not _found(x, y, values, half_x, half_y, width, height, index):
+        _indices(x, y, values, half_x, half_y, width, height, index)
+    for i in range(values.size):  # apart from the indices, so that those are found side by side
         if index[i] < OUTSIDE:
             pixel = np.uint32(index[i])
-            counts[pixel] += np.uint32(1)
-            sums[pixel] += values[i]
+            flat_counts[pixel] += np.uint32(1)
+            flat_sums[pixel] += values[i]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _accumulate(theta_x, theta_y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
-    height, width = counts.shape
-    flat_sums, flat_counts = sums.reshape(-1), counts.reshape(-1)
-    columns, index = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    index = np.empty(BLOCK, np.int32)
     for at in range(0, theta_x.size, BLOCK):
-        block_pixels(theta_x[at : at + BLOCK], half_x, width, 1.0, columns)
-        block_pixels(theta_y[at : at + BLOCK], half_y, height, float(width), index)
-        add_block(columns, index, intensity[at : at + BLOCK], flat_sums, flat_counts)
+        x, y, values = theta_x[at : at + BLOCK], theta_y[at : at + BLOCK], intensity[at : at + BLOCK]
+        add_block(x, y, values, half_x, half_y, index, sums, counts)
 
 
 @numba.njit(cache=True, nogil=True)

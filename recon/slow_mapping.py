@@ -13,22 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.tracker.angle import FINE, SEGMENT, SlowAngle, segment_angles
-from recon.mapping import Grid, add_block, block_pixels
+from recon.mapping import Grid, add_block
 from scanner.errors import BadInput
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _accumulate(x, y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
-    height, width = counts.shape
-    angles, re, im = np.empty(SEGMENT), np.empty(FINE), np.empty(FINE)
-    columns, index = np.empty(SEGMENT, np.int32), np.empty(SEGMENT, np.int32)
-    flat_sums, flat_counts = sums.reshape(-1), counts.reshape(-1)
+    theta_x, theta_y, re, im = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(FINE), np.empty(FINE)
+    index = np.empty(SEGMENT, np.int32)
     for s in range(x[0].size):
-        segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, angles)
-        block_pixels(angles, half_x, width, 1.0, columns)
-        segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, angles)
-        block_pixels(angles, half_y, height, float(width), index)
-        add_block(columns, index, intensity[s * SEGMENT : (s + 1) * SEGMENT], flat_sums, flat_counts)
+        segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, theta_x)
+        segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, theta_y)
+        values = intensity[s * SEGMENT : (s + 1) * SEGMENT]
+        add_block(theta_x, theta_y, values, half_x, half_y, index, sums, counts)
 
 
 def accumulate_slow(

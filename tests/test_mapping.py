@@ -10,6 +10,7 @@ from scipy.stats import binned_statistic_2d
 from recon.coverage import fill_against_time, time_for_fill
 from recon.mapping import (
     BLOCK,
+    WIDEST,
     Grid,
     Picture,
     accumulate,
@@ -76,6 +77,19 @@ def test_samples_go_where_bincount_puts_them(scan):
     expected_sums, expected_counts = by_numpy(*scan)
     assert_array_equal(counts, expected_counts)
     assert_array_equal(sums, expected_sums)  # same order of additions: equal to the last bit
+
+
+@pytest.mark.parametrize("width", [WIDEST, WIDEST + 1])
+def test_pictures_of_any_width_and_angles_of_any_size_go_where_bincount_puts_them(width):
+    grid, rng = Grid(width, 3, 0.18, 0.16), np.random.default_rng(width)
+    x, y = rng.uniform(-0.2, 0.2, 3000), rng.uniform(-0.2, 0.2, 3000)
+    x[::3] = (2 * rng.integers(0, width + 1, 1000) / width - 1) * 0.18  # edges, and next to them
+    x[::6] *= 1 + rng.choice([-1e-9, -1e-16, 1e-16, 1e-9], 500)
+    x[5::200], y[7::200] = rng.choice([1e300, -1e300, np.inf, -np.inf, np.nan], (2, 15))
+    sums, counts = accumulate(x, y, np.ones(3000), grid)
+    expected = by_numpy(grid, x, y, np.ones(3000))
+    assert_array_equal(counts, expected[1])
+    assert_array_equal(sums, expected[0])
 
 
 @patient
