@@ -198,7 +198,7 @@ def together(found: Sequence[Mapping[str, Value]]) -> dict[str, Value]:
 
 
 def decayed(axis: Axis, decays: Sequence[Decay]) -> dict[str, Value]:
-    """Mechanics from free decays; J is the nominal one, with its tolerance, where no bias tells it."""
+    """Mechanics from free decays; J is the axis's own where no bias tells it."""
     found = together([ringdown(angle, rate, axis, volt)[0] for angle, rate, volt in decays])
     J = found.setdefault("J", Value(axis.require_mechanics().J, 0.0))
     for key in ("k", "b"):

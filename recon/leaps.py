@@ -62,13 +62,13 @@ def _leaps(channel: Channel, frequency: float, least: float) -> Iterator[Trouble
     if time.size < 2 * SIDE:
         return
     step = _turned(np.diff(phase))
-    step = _turned(step - np.angle(np.nanmean(np.exp(1j * step))))
-    usual = np.array([np.nanmedian(step[max(0, i - SIDE) : i + SIDE + 1]) for i in range(step.size)])
+    step = _turned(step - np.angle(np.mean(np.exp(1j * step))))
+    usual = np.array([np.median(step[max(0, i - SIDE) : i + SIDE + 1]) for i in range(step.size)])
     excess = step - usual
     pair = _turned(excess[:-1] + excess[1:])  # a leap within a look is shared by the steps before and behind it
-    limit = max(least, OVER_NOISE * 1.48 * float(np.nanmedian(np.abs(pair))))
+    limit = max(least, OVER_NOISE * 1.48 * float(np.median(np.abs(pair))))
     beside = np.maximum(np.abs(excess[:-3]), np.abs(excess[3:]))  # a transient shows in the steps around it too
-    steady = size > STEADY * np.nanmedian(size)
+    steady = size > STEADY * np.median(size)
     alone = (np.abs(pair[1:-1]) > np.maximum(limit, ALONE * beside)) & steady[1:-3] & steady[3:-1]
     for low, high in runs(alone):
         yield Trouble(channel.name, "leap", float(time[low + 1]), float(time[high + 2]))
@@ -83,8 +83,9 @@ def _looks(channel: Channel, frequency: float) -> tuple[Array, Array, Array]:
     looks = np.concatenate([channel.read(first, first + block) for first in firsts.tolist()] or [np.empty(0)])
     _, z = block_phasors(looks, channel.sample_rate, 0.0, frequency, block)  # phases at the looks' own centres
     time = channel.start + (firsts + 0.5 * (block - 1)) / channel.sample_rate
-    phase = np.angle(z * np.exp(-2j * np.pi * frequency * time))
-    return np.asarray(time, np.float64), np.asarray(phase, np.float64), np.asarray(np.abs(z), np.float64)
+    seen = np.isfinite(z)  # through a gap the phase runs on
+    time, z = time[seen], z[seen] * np.exp(-2j * np.pi * frequency * time[seen])
+    return np.asarray(time, np.float64), np.asarray(np.angle(z), np.float64), np.asarray(np.abs(z), np.float64)
 
 
 def _turned(angle: Array) -> Array:

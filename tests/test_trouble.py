@@ -139,7 +139,16 @@ def test_what_moves_evenly_does_not_leap() -> None:
     noise = np.random.default_rng(0).standard_normal(time.size)
     off = np.where(time < 0.06, np.sin(2 * np.pi * 2e4 * time), 1e-3 * noise)
     drive = np.sin(2 * np.pi * 2e4 * time)
-    for drives, sense in ((sweep, sweep), (steps, drive), (drive, settling), (drive, drive + noise), (off, off)):
+    gap = np.where((time > 0.03) & (time < 0.08), np.nan, drive)
+    for drives, sense in (
+        (gap, drive),
+        (drive, gap),
+        (sweep, sweep),
+        (steps, drive),
+        (drive, settling),
+        (drive, drive + noise),
+        (off, off),
+    ):
         channels = {"drive_x": (drives, "V", 2e6, 0.0), "sense_x": (sense, "V", 2e6, 0.0)}
         assert leaps(Recording.from_arrays(channels)) == []
 
