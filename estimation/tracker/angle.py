@@ -32,7 +32,7 @@ class SlowMotion:
 
     Attributes:
         reference: gives psi.
-        time: uniform, shape (blocks,) [s].
+        time: not decreasing, shape (knots,) [s]; twice the same where the motion bends or its reference jumps.
         phase, phase_rate: phi and its slope [rad, rad/s]. log, log_rate: of the amplitude [1, 1/s].
         lines: harmonics over the amplitude, shape (blocks, lines); the first harmonic is -i.
     """
@@ -54,11 +54,15 @@ class SlowMotion:
 @njit(cache=True, error_model="numpy")
 def _between(time, knots, phase, phase_rate, log, log_rate, lines):  # type: ignore[no-untyped-def]
     """Phase by cubics, amplitude by the exponential of cubics, harmonics over the amplitude by straight lines."""
-    step = knots[1] - knots[0]
     out, out_lines = np.empty(time.size), np.empty((time.size, lines.shape[1]), np.complex128)
+    k = 0
     for i in range(time.size):
-        at = (time[i] - knots[0]) / step
-        k = int(min(max(math.floor(at), 0.0), knots.size - 2.0))
+        if time[i] < knots[k] or time[i] >= knots[min(k + 2, knots.size - 1)]:
+            k = min(max(np.searchsorted(knots, time[i], side="right") - 1, 0), knots.size - 2)
+        elif k < knots.size - 2 and time[i] >= knots[k + 1]:
+            k += 1
+        step = knots[k + 1] - knots[k]
+        at = k + (time[i] - knots[k]) / step
         out[i] = _hermite(phase, phase_rate, k, at - k, step)
         amplitude = math.exp(_hermite(log, log_rate, k, at - k, step))
         share = min(max(at - k, 0.0), 1.0)

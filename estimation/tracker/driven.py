@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from estimation.signals import Sense, drive_voltage, intensity_clock, reference_of
 from estimation.tracker.orbit import axis_law, law_of, turn_of
-from estimation.tracker.signal import Prepared, drive_force, mean_phase
+from estimation.tracker.signal import Driven, Prepared, driven_blocks
 from estimation.tracker.smoother import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND, Signal
 from estimation.tracker.track import (
     LEAST_WALK,
@@ -34,7 +34,6 @@ from scanner.motion import Motion
 from scanner.recording import Recording
 
 Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 BLOCK_CYCLES = 2.0
 UNREAD = Position(gain=1.0, noise_sd=0.0)  # stands where a readout is asked for; no sample is seen through it
@@ -86,11 +85,9 @@ def prepare_driven(recording: Recording, device: Device, name: str) -> Prepared:
     reference = reference_of(recording, device, name)
     law = axis_law(device.axis(name), UNREAD)
     time, width = _blocks(channel, reference.frequency)
-    psi = mean_phase(reference, time, width)
-    w = np.gradient(psi, time)
-    force = drive_force(drive_voltage(recording, name), time, width, psi, w, law)
-    signal = _silent(psi, w, force, width, 2 if law.pull else 1, LARGEST * law.theta0)
-    return Prepared(Sense(channel, UNREAD, (name,)), {name: reference}, (law,), time, signal, 0.0)
+    driven = driven_blocks(drive_voltage(recording, name), reference, time, width, law)
+    signal = _silent(driven, width, 2 if law.pull else 1, LARGEST * law.theta0)
+    return Prepared(Sense(channel, UNREAD, (name,)), {name: driven.reference}, (law,), time, signal, 0.0)
 
 
 def _blocks(channel: Channel, frequency: float) -> tuple[Array, float]:
@@ -100,20 +97,22 @@ def _blocks(channel: Channel, frequency: float) -> tuple[Array, float]:
     return channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate), length / channel.sample_rate
 
 
-def _silent(psi: Array, w: Array, force: Complex, step: float, main: int, largest: float) -> Signal:
+def _silent(driven: Driven, step: float, main: int, largest: float) -> Signal:
     """A signal of no lines: its one projection, the mean, has no samples in any block."""
-    blocks = psi.size
+    blocks = driven.psi.size
     nothing = np.zeros((blocks, 1))
     return Signal(
-        psi=psi[:, None],
-        w=w[:, None],
-        force=np.ascontiguousarray(force[:, None]),
+        psi=driven.psi[:, None],
+        w=driven.w[:, None],
+        force=np.ascontiguousarray(driven.force[:, None]),
+        share=driven.share[:, None],
         step=step,
         lines=np.zeros((0, 2), np.int64),
         passed=np.zeros((blocks, 0), np.complex128),
         passed_by_w=np.zeros((blocks, 0), np.complex128),
         mean_gain=0.0,
-        tuned=w[:, None],
+        mean_delay=0.0,
+        tuned=driven.w[:, None],
         whitened=nothing,
         roots=np.zeros((1, 3, 1, 1)),
         unroots=np.zeros((1, 1, 1)),

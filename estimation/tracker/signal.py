@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from estimation.signals import Sense, drive_voltage, is_capacitive
 from estimation.tracker.blocks import Projections, project, residual_variance, solved
 from estimation.tracker.orbit import COS, DRIVEN, POINTS, SENSED, SIN, AxisLaw, axis_law
 from estimation.tracker.smoother import Signal
+from estimation.tracker.switches import pieces, project_one, project_pieces, shares, switch_times, with_switches
 from scanner.channel import Channel
 from scanner.device import Amdm, Axis, Device
 from scanner.errors import BadInput
@@ -28,6 +30,7 @@ SLOWEST_CYCLES = 2.0  # of the slowest axis in a block, at the least
 DECAY_SHARE = 0.2  # of the fastest decay time, where that is longer
 NYQUIST_SHARE = 0.45  # of the sampling rate: the highest harmonic that is used
 SETTLING = 15.0  # time constants of the readout's sections; at the beginning nobody knows their state
+SLOW = 1.0  # Hz, at which a readout's delay of slow changes is taken
 RUNGS = 400  # of the ladder from line to amplitude
 POSITION_LINES = 3
 MODEL_SHARE = 3e-3  # of the signal's rms: what laws linearised over a block leave unexplained, however quiet the signal
@@ -79,43 +82,51 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
     starts = np.arange(count) * length
     width = length / channel.sample_rate
     time: Array = channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate)
-    own = [references[name] for name in sense.axes]
-    psi = np.stack([mean_phase(reference, time, width) for reference in own], axis=1)
-    w = np.gradient(psi, time, axis=0)
+    laws = tuple(axis_law(axis, sense.readout) for axis in axes)
+    driven = [
+        driven_blocks(drive_voltage(recording, name, gaps_ok=True), references[name], time, width, law)
+        for name, law in zip(sense.axes, laws, strict=True)
+    ]
+    psi, w, force, share = (
+        np.ascontiguousarray(np.stack([getattr(own, name) for own in driven], axis=1))
+        for name in ("psi", "w", "force", "share")
+    )
     lines = _lines(axes, sense, w, channel.sample_rate)
     settling = 0
     if isinstance(sense.readout, Amdm) and sense.readout.lpf_hz:
         settling = int(SETTLING / (2 * np.pi * min(sense.readout.lpf_hz)) * channel.sample_rate)
     projections = project(channel, starts, length, lines, w, settling)
+    switches = np.concatenate([own.switches for own in driven])
+    cut = pieces(starts, length, channel.sample_rate, channel.start, switches)
+    if switches.size:
+        projections = project_pieces(projections, channel, starts, cut, lines, w)
     if not projections.counts.any():
         raise BadInput("holds no sample that can be used", file=channel.file, channel=channel.name)
-    laws = tuple(axis_law(axis, sense.readout) for axis in axes)
-    forces = [
-        drive_force(drive_voltage(recording, name, gaps_ok=True), time, width, psi[:, i], w[:, i], laws[i])
-        for i, name in enumerate(sense.axes)
-    ]
     passed, passed_by_w = _passed(sense, lines, w)
     whitened, roots, unroots = _whitened(projections)
     signal = Signal(
-        psi=np.ascontiguousarray(psi),
-        w=np.ascontiguousarray(w),
-        force=np.ascontiguousarray(np.stack(forces, axis=1)),
+        psi=psi,
+        w=w,
+        force=force,
+        share=share,
         step=width,
         lines=lines,
         passed=np.ascontiguousarray(passed),
         passed_by_w=np.ascontiguousarray(passed_by_w),
         mean_gain=float(readout_response(sense.readout, 0.0).real),
+        mean_delay=float(readout_response(sense.readout, SLOW).imag / (2 * np.pi * SLOW)),
         tuned=np.ascontiguousarray(projections.tuned),
         whitened=whitened,
         roots=np.ascontiguousarray(roots),
         unroots=unroots,
         geometry=projections.geometry,
-        noise_var=_noise(projections),
+        noise_var=_noise(projections, channel, starts, cut, lines, w),
         known=np.zeros(psi.shape),
         known_var=np.full(psi.shape, np.inf),
         ladder=np.stack([_ladder(axis, sense) for axis in axes]),
         main=2 if is_capacitive(sense.readout) else 1,
     )
+    references = {name: own.reference for name, own in zip(sense.axes, driven, strict=True)}
     return Prepared(sense, references, laws, time, signal, float(projections.counts.sum()) / (count * length))
 
 
@@ -123,12 +134,6 @@ def _block_length(axes: list[Axis], frequencies: list[float], rate: float) -> in
     width = SLOWEST_CYCLES / min(frequencies)
     decays = [axis.quality / (np.pi * axis.resonance) for axis in axes if axis.mechanics is not None]
     return max(64, round(max([width, DECAY_SHARE * min(decays)] if decays else [width]) * rate))
-
-
-def mean_phase(reference: Reference, time: Array, width: float) -> Array:
-    """Reference phase averaged over each block (Simpson): what a demodulation with a straight line sees of a sweep."""
-    before, middle, after = (reference.phase(time + shift * width) for shift in (-0.5, 0.0, 0.5))
-    return (before + 4.0 * middle + after) / 6.0
 
 
 def _lines(axes: list[Axis], sense: Sense, w: Array, rate: float) -> Index:
@@ -143,11 +148,31 @@ def _lines(axes: list[Axis], sense: Sense, w: Array, rate: float) -> Index:
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
-def drive_force(channel: Channel | None, time: Array, width: float, psi: Array, w: Array, law: AxisLaw) -> Complex:
-    """Harmonics of the drive's force about each block, shape (blocks, DRIVEN); zero where nothing was recorded."""
-    force = np.zeros((time.size, DRIVEN), np.complex128)
+class Driven(NamedTuple):
+    """One axis's drive, block by block.
+
+    Attributes:
+        reference: with bends and jumps where the drive switched. switches: when it did, shape (switches,) [s].
+        psi, w, force, share: as in ``smoother.Signal``, shape (blocks, ...).
+    """
+
+    reference: Reference
+    switches: Array
+    psi: Array
+    w: Array
+    force: Complex
+    share: Array
+
+
+def driven_blocks(channel: Channel | None, reference: Reference, time: Array, width: float, law: AxisLaw) -> Driven:
+    """Reference and force about each block of ``width`` [s]; no force where none was recorded.
+
+    Raises:
+        BadInput: the drive does not cover the blocks.
+    """
+    psi, w = _course(reference, time, time - 0.5 * width, time + 0.5 * width)
     if channel is None:
-        return force
+        return Driven(reference, np.empty(0), psi, w, np.zeros((time.size, DRIVEN), np.complex128), shares(time))
     rate = channel.sample_rate
     length = round(width * rate)
     wanted = np.round((time - channel.start) * rate - 0.5 * (length - 1)).astype(np.int64)
@@ -160,16 +185,35 @@ def drive_force(channel: Channel | None, time: Array, width: float, psi: Array, 
             hint="record both over the same time",
         )
     orders = np.arange(1, DRIVEN + 2)  # one or two more than are used, so that they do not pass for these
-    orders = orders[orders * law.turn * w.max() < 2 * np.pi * NYQUIST_SHARE * rate]
-    lines = np.stack([np.zeros_like(orders), orders * law.turn], axis=1)
+    orders = law.turn * orders[orders * law.turn * w.max() < 2 * np.pi * NYQUIST_SHARE * rate]
+    lines = np.stack([np.zeros_like(orders), orders], axis=1)
     squared = law.pull > 0.0
-    fitted = solved(project(channel, starts, length, lines, w[:, None], squared=squared, may_clip=False))
+    told = project(channel, starts, length, lines, w[:, None], squared=squared, may_clip=False)
+    switches = switch_times(channel, reference, starts, length, told, orders, squared)
+    if switches.size:
+        reference = with_switches(reference, switches)
+        cut = pieces(starts, length, rate, channel.start, switches)
+        low, high = channel.start + (starts + cut[:, 0]) / rate, channel.start + (starts + cut[:, 1] - 1) / rate
+        psi, w = _course(reference, time, low, high)
+        told = project_pieces(told, channel, starts, cut, lines, w[:, None], squared, may_clip=False)
     late = channel.start + (starts + 0.5 * (length - 1)) / rate - time
+    fitted = solved(told)
+    force = np.zeros((time.size, DRIVEN), np.complex128)
     force[:, 0] = fitted[:, 0]
     for m in range(1, min(DRIVEN, orders.size + 1)):
         turned = np.exp(-1j * m * law.turn * (psi + w * late))
         force[:, m] = (fitted[:, 2 * m - 1] - 1j * fitted[:, 2 * m]) * turned
-    return force
+    return Driven(reference, switches, psi, w, force, shares(time, switches))
+
+
+def _course(reference: Reference, time: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """(phase at ``time`` [rad], rate [rad/s]) of the straight line that stands for the reference from low to high [s].
+
+    Its mean is the reference's (Simpson): what a demodulation with a straight line sees of a sweep.
+    """
+    before, middle, after = reference.phase(low), reference.phase(0.5 * (low + high)), reference.phase(high)
+    w = (after - before) / (high - low)
+    return (before + 4.0 * middle + after) / 6.0 + w * (time - 0.5 * (low + high)), w
 
 
 def _passed(sense: Sense, lines: Index, w: Array) -> tuple[Complex, Complex]:
@@ -180,12 +224,23 @@ def _passed(sense: Sense, lines: Index, w: Array) -> tuple[Complex, Complex]:
     return readout_response(sense.readout, f), (high - low) / (2.0 * step * w[:, lines[:, 0]])
 
 
-def _noise(projections: Projections) -> Array:
-    """Variance of each block's samples, shape (blocks,): that of most blocks, more where one holds a disturbance."""
+def _noise(projections: Projections, channel: Channel, starts: Index, cut: Index, lines: Index, w: Array) -> Array:
+    """Variance of each block's samples, shape (blocks,): that of most blocks, more where one holds a disturbance.
+
+    Lines that slip or decay within a block leave much of themselves about a steady fit, and are no disturbance: blocks
+    that seem to hold one are fitted with lines beside each line as well, which make it free to change.
+    """
     own = residual_variance(projections)
     samples = np.maximum(projections.counts, 1)
     swing = float(np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2))
     usual = max(float(np.nanmedian(own)), MODEL_SHARE**2 * swing)
+    length = int(cut[:, 1].max())
+    beside = channel.sample_rate / length  # [rad/s]: a turn of 1 rad over the block
+    axes = w.shape[1]
+    free = np.concatenate([*(lines + np.array([i * axes, 0]) for i in range(3)), [[3 * axes, 1]]])
+    for k in np.flatnonzero(own > DISTURBED * usual):
+        omega = np.concatenate([w[k], w[k] - beside, w[k] + beside, [np.pi * beside]])
+        own[k] = residual_variance(project_one(channel, int(starts[k]), cut[k], length, free, omega))[0]
     return np.where(own > DISTURBED * usual, own, usual)
 
 

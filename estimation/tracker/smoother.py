@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from estimation.tracker.orbit import law_of, turn_of
+from estimation.tracker.orbit import MOVED, law_of, turn_of
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -41,11 +41,12 @@ class Signal(NamedTuple):
         psi: reference phase at the block's middle, shape (blocks, axes) [rad].
         w: its rate there, shape (blocks, axes) [rad/s].
         force: harmonics of the drive's force, shape (blocks, axes, DRIVEN).
+        share: part of the step to the next block over which a block's force lasts, shape (blocks, axes).
         step: time from one block to the next [s].
         lines: (axis, order) of each line, shape (lines, 2).
         passed: readout's response at each line, shape (blocks, lines); passed_by_w: its derivative by the motion's
             angular frequency.
-        mean_gain: of the readout at rest, 0 where it does not pass a mean.
+        mean_gain: of the readout at rest, 0 where it does not pass a mean; mean_delay: what it adds of a mean's rate.
         tuned: angular frequency of the projections' tables, shape (blocks, axes).
         whitened: R's with R R' the inverse of the Gram matrix, shape (blocks, m).
         roots: R' times the moments of each geometry, shape (geometries, 3, m, m). unroots: R. geometry: of each block.
@@ -58,11 +59,13 @@ class Signal(NamedTuple):
     psi: Array
     w: Array
     force: Complex
+    share: Array
     step: float
     lines: NDArray[np.int64]
     passed: Complex
     passed_by_w: Complex
     mean_gain: float
+    mean_delay: float
     tuned: Array
     whitened: Array
     roots: Array
@@ -76,7 +79,7 @@ class Signal(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
+def flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
     """One axis over ``h`` seconds: new state (6,), what phase and ln A take from the first five states (2, 5), and the
     covariance (6, 6) that walking adds.
 
@@ -129,6 +132,39 @@ def _flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
     return new, taken, added
 
 
+@njit(cache=True, error_model="numpy")
+def _switched(law, x, signal, k, a):  # type: ignore[no-untyped-def]
+    """Phase and ln A after the drive switched between blocks k and k + 1, from the state before.
+
+    Angle and speed go on; the motion's own harmonics, which the drive makes, and the slow rates do not, and the first
+    harmonic takes the difference: a third of a degree when the imaging scanner's drive stops.
+
+    Args:
+        x: the axis's state, its phase against the reference of block k + 1.
+    """
+    stiff, damp = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
+    psi = signal.psi[k + 1, a] - (1.0 - signal.share[k, a]) * signal.step * signal.w[k + 1, a]
+    behind = signal.psi[k, a] + signal.share[k, a] * signal.step * signal.w[k, a] - psi
+    phase, log, theta, speed = x[PHASE], x[LOG], 0.0, 0.0
+    for i in range(1 + TRIES):
+        j = k + min(i, 1)
+        own = phase - (0.0 if i else behind)
+        turn = turn_of(law, np.exp(log), own, signal.w[j, a], stiff, damp, signal.force[j, a])
+        w, u = signal.w[j, a] + turn.rate.imag, psi + phase
+        rest, rest_speed = 0.0, np.exp(log) * turn.rate.real * np.sin(u)
+        for n in range(MOVED + 1):
+            line = turn.moved[n] * np.exp(1j * n * u)
+            rest += line.real
+            rest_speed -= n * w * line.imag
+        if i == 0:
+            theta, speed = np.exp(log) * np.sin(u) + rest, np.exp(log) * w * np.cos(u) + rest_speed
+        else:
+            side, front = theta - rest, (speed - rest_speed) / w
+            phase += np.arctan2(side * np.cos(u) - front * np.sin(u), front * np.cos(u) + side * np.sin(u))
+            log = 0.5 * np.log(side * side + front * front)
+    return phase, log
+
+
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _carried(matrix, at, taken, h):  # type: ignore[no-untyped-def]
     """Multiply ``matrix`` in place from the left by the Jacobian of one axis's step, whose states begin at ``at``."""
@@ -145,13 +181,19 @@ def _carried(matrix, at, taken, h):  # type: ignore[no-untyped-def]
 def predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untyped-def]
     """State and covariance of block k + 1 from those of block k, and the Jacobian of the step; ``x`` is changed."""
     n = x.size
-    P, F, h = P.copy(), np.eye(n), 0.5 * signal.step
-    for half in range(2):
+    P, F = P.copy(), np.eye(n)
+    for later in range(2):
         for a in range(len(laws)):
             law = law_of(laws[a])
             at = a * STATES
-            w = (signal.psi[k + 1, a] - signal.psi[k, a]) / signal.step
-            new, taken, added = _flow(law, x[at : at + STATES], w, signal.force[k + half, a], h, walk[a])
+            parts = signal.step * signal.share[k, a], signal.step * (1.0 - signal.share[k, a])
+            if later:  # against this block's reference, continued straight to where its drive begins
+                psi = signal.psi[k, a] + parts[0] * signal.w[k, a]
+                x[at + PHASE] += psi - (signal.psi[k + 1, a] - parts[1] * signal.w[k + 1, a])
+                if signal.share[k, a] != 0.5:
+                    x[at + PHASE], x[at + LOG] = _switched(law, x[at : at + STATES], signal, k, a)
+            w, h = signal.w[k + later, a], parts[later]
+            new, taken, added = flow(law, x[at : at + STATES], w, signal.force[k + later, a], h, walk[a])
             x[at : at + STATES] = new
             _carried(F, at, taken, h)
             _carried(P, at, taken, h)
@@ -170,43 +212,53 @@ def predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untype
 
 @njit(cache=True, error_model="numpy")
 def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
-    """Coefficients that block k's projections should show in the state ``x``, and their Jacobian (2, m, states).
+    """Coefficients that block k's projections should show in the state ``x``, and their Jacobian (3, m, states).
 
     A line changes over the block as exp(rate t): the coefficients (3, m) are its value and its first two derivatives,
     the last one halved. In a free decay the second is worth half a degree. The rate follows stiffness and damping, so
     that a block off its middle tells of them: left out of the Jacobian, an error of 0.1 % in k looks like a jump.
     """
     m = signal.roots.shape[2]
-    values, jacobian = np.zeros((3, m)), np.zeros((2, m, x.size))
+    values, jacobian = np.zeros((3, m)), np.zeros((3, m, x.size))
     values[0, 0], jacobian[0, 0, x.size - 1] = x[x.size - 1], 1.0
     for a in range(len(laws)):
         law = law_of(laws[a])
         at = a * STATES
         stiff, damp = law.k * (1.0 + x[at + STIFFNESS]), law.b * (1.0 + x[at + DAMPING])
         turn = turn_of(law, np.exp(x[at + LOG]), x[at + PHASE], signal.w[k, a], stiff, damp, signal.force[k, a])
+        by_stiff, by_damp = turn.by_stiffness * (law.k / stiff), turn.by_damping * (law.b / damp)
+        # how the rate itself changes along the flow: a motion that follows a drift hardly bends
+        bend = turn.by_phase * turn.rate.imag + turn.by_log * turn.rate.real + by_stiff * x[at + TREND]
         values[0, 0] += signal.mean_gain * turn.seen[0].real
-        jacobian[0, 0, at + LOG] = signal.mean_gain * turn.seen_by_log[0].real
-        values[1, 0] += jacobian[0, 0, at + LOG] * turn.rate.real
-        moves = (
-            (PHASE, turn.by_phase),
-            (LOG, turn.by_log),
-            (STIFFNESS, turn.by_stiffness * (law.k / stiff)),
-            (DAMPING, turn.by_damping * (law.b / damp)),
-        )
+        values[0, 0] += signal.mean_delay * turn.seen_by_log[0].real * turn.rate.real
+        by_mean = signal.mean_gain * turn.seen_by_log[0].real
+        values[1, 0] += by_mean * turn.rate.real
+        mean_bend = 0.5 * signal.mean_gain * turn.mean_bend
+        values[2, 0] += mean_bend * turn.rate.real**2 + 0.5 * by_mean * bend.real
+        jacobian[0, 0, at + LOG] = by_mean
+        moves = ((PHASE, turn.by_phase), (LOG, turn.by_log), (STIFFNESS, by_stiff), (DAMPING, by_damp))
         for s, by in moves:
-            jacobian[1, 0, at + s] = jacobian[0, 0, at + LOG] * by.real
+            by_bend = turn.by_phase * by.imag + turn.by_log * by.real
+            jacobian[0, 0, at + s] += signal.mean_delay * turn.seen_by_log[0].real * by.real
+            jacobian[1, 0, at + s] = by_mean * by.real
+            jacobian[2, 0, at + s] = 2.0 * mean_bend * turn.rate.real * by.real + 0.5 * by_mean * by_bend.real
         slip = signal.w[k, a] + turn.rate.imag - signal.tuned[k, a]
         gain, u = np.exp(x[at + GAIN]), np.exp(1j * (signal.psi[k, a] + x[at + PHASE]))
         for i in range(signal.lines.shape[0]):
             if signal.lines[i, 0] == a:
                 order = signal.lines[i, 1]
-                passed = signal.passed[k, i] + signal.passed_by_w[k, i] * turn.rate.imag
+                grows = 0.0 if turn.seen[order] == 0.0 else (turn.seen_by_log[order] / turn.seen[order]).real
+                fades = 1j * grows / order  # a line that decays has a complex frequency
+                rate = turn.rate.imag - fades * turn.rate.real
+                passed = signal.passed[k, i] + signal.passed_by_w[k, i] * rate
                 by_passed = signal.passed_by_w[k, i] / passed if passed != 0.0 else 0.0j
                 turned = gain * passed * u**order
                 line, by_log = turned * turn.seen[order], turned * turn.seen_by_log[order]
                 by_phase = 1j * order * line
                 first = by_log * turn.rate.real + by_phase * slip
-                second = 0.5 * first * first / line if line != 0.0 else 0.0j
+                second = 0.5 * (by_log * bend.real + by_phase * bend.imag)
+                if line != 0.0:
+                    second += 0.5 * first * first / line
                 for j, part in ((1 + 2 * i, 1.0 + 0.0j), (2 + 2 * i, 1.0j)):  # Re with the cosine, -Im with the sine
                     values[0, j], values[1, j], values[2, j] = (
                         (part * line).real,
@@ -216,8 +268,14 @@ def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
                     jacobian[0, j, at + PHASE], jacobian[0, j, at + LOG] = (part * by_phase).real, (part * by_log).real
                     jacobian[0, j, at + GAIN] = values[0, j]
                     for s, by in moves:
-                        jacobian[0, j, at + s] += (part * line * by_passed).real * by.imag
-                        jacobian[1, j, at + s] = (part * (by_log * by.real + by_phase * by.imag)).real
+                        by_bend = turn.by_phase * by.imag + turn.by_log * by.real
+                        jacobian[0, j, at + s] += (part * line * by_passed * (by.imag - fades * by.real)).real
+                        by_first = by_log * by.real + by_phase * by.imag
+                        by_second = 0.5 * (by_log * by_bend.real + by_phase * by_bend.imag)
+                        if line != 0.0:
+                            by_second += by_first * first / line
+                        jacobian[1, j, at + s] = (part * by_first).real
+                        jacobian[2, j, at + s] = (part * by_second).real
     return values, jacobian
 
 
@@ -271,6 +329,7 @@ def _update(signal, k, x, P, about, values, jacobian, noise):  # type: ignore[no
             e -= root * values[0, j] + roots[1, i, j] * values[1, j] + roots[2, i, j] * values[2, j]
             for u in range(n):
                 H[u] += root * jacobian[0, j, u] + roots[1, i, j] * jacobian[1, j, u]
+                H[u] += roots[2, i, j] * jacobian[2, j, u]
         if size <= 0.0:  # a direction in which the block has no samples
             continue
         S = noise
@@ -348,7 +407,7 @@ def run_filter(laws, signal, x, P, live, walk, offset_walk, xs, Ps, xp, Pp, Fs):
     Args:
         laws: an ``AxisLaw`` a row. signal: ``Signal``.
         x, P: state before the first block. live: whether the motion of each axis was found, shape (axes,); changed.
-        walk: shape (axes, 4), see ``_flow``. offset_walk: [V^2/s].
+        walk: shape (axes, 4), see ``flow``. offset_walk: [V^2/s].
         xs, Ps: filtered; xp, Pp: predicted; Fs: Jacobian of the step that leads to each block; shape (blocks, ...).
 
     Returns:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,21 @@ from numpy.typing import NDArray
 from estimation.signals import intensity_clock, is_capacitive, reference_of, senses
 from estimation.tracker import backward, smoother
 from estimation.tracker.angle import SlowAngle, SlowMotion
-from estimation.tracker.orbit import MOVED
+from estimation.tracker.orbit import MOVED, law_of, turn_of
 from estimation.tracker.signal import Prepared, prepare
-from estimation.tracker.smoother import DAMPING, FLOOR, LOG, LOST, PHASE, SIGNIFICANT, STATES, TREND, Signal
+from estimation.tracker.smoother import (
+    DAMPING,
+    FLOOR,
+    LOG,
+    LOST,
+    PHASE,
+    SIGNIFICANT,
+    STATES,
+    STIFFNESS,
+    TREND,
+    Signal,
+)
+from estimation.tracker.switches import EDGE
 from scanner.device import Amdm, Device, Position
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion
@@ -232,6 +244,7 @@ def window(signal: Signal, first: int, stop: int) -> Signal:
         "psi",
         "w",
         "force",
+        "share",
         "passed",
         "passed_by_w",
         "tuned",
@@ -314,15 +327,18 @@ def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, fl
     rates = np.empty((len(prepared.time), axes), np.complex128)
     moved = np.empty((len(prepared.time), axes, MOVED + 1), np.complex128)
     smoother.turns(prepared.rows, signal, found.states, rates, moved)
-    log, phase = found.states[:, at + LOG], found.states[:, at + PHASE]
-    lines = moved[:, i] / np.exp(log)[:, None]
+    log = found.states[:, at + LOG]
+    reference = prepared.references[prepared.sense.axes[i]]
+    # a block sees the reference averaged over itself, which is not its value in the middle when the drive sweeps
+    phase = found.states[:, at + PHASE] + signal.psi[:, i] - reference.phase(prepared.time)
+    knots: list[NDArray[Any]] = [prepared.time, phase, rates[:, i], log, moved[:, i]]
+    for k in np.flatnonzero(signal.share[:, i] != 0.5)[::-1]:
+        knots = [np.insert(a, k + 1, b, axis=0) for a, b in zip(knots, _at_switch(prepared, found, i, k), strict=True)]
+    lines = knots[4] / np.exp(knots[3])[:, None]
     lines[:, 1] = -1j
     if prepared.laws[i].theta_th == 0.0 and prepared.laws[i].pull:
         lines = np.ascontiguousarray(lines[:, 1::2])
-    reference = prepared.references[prepared.sense.axes[i]]
-    # a block sees the reference averaged over itself, which is not its value in the middle when the drive sweeps
-    phase = phase + signal.psi[:, i] - reference.phase(prepared.time)
-    slow = SlowMotion(reference, prepared.time, phase, rates[:, i].imag.copy(), log, rates[:, i].real.copy(), lines)
+    slow = SlowMotion(reference, knots[0], knots[1], knots[2].imag.copy(), knots[3], knots[2].real.copy(), lines)
     return AxisMotion(
         time=prepared.time,
         phase=phase,
@@ -333,6 +349,23 @@ def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, fl
         reference=reference.kind,
         sign=sign,
     )
+
+
+def _at_switch(prepared: Prepared, found: Track, i: int, k: int) -> tuple[NDArray[Any], ...]:
+    """Time, phase, rate, ln A and own harmonics of axis ``i`` just before and after the switch behind block ``k``."""
+    signal, law = prepared.signal, law_of(prepared.rows[i])
+    reference = prepared.references[prepared.sense.axes[i]]
+    share = signal.share[k, i] * signal.step
+    time = prepared.time[k] + share
+    sides = []
+    for j, h, side in ((k, share, -EDGE), (k + 1, share - signal.step, EDGE)):
+        w, force = signal.w[j, i], signal.force[j, i]
+        x, *_ = smoother.flow(law, found.states[j, i * STATES : (i + 1) * STATES], w, force, h, np.zeros(4))
+        stiff, damp = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
+        turn = turn_of(law, np.exp(x[LOG]), x[PHASE], w, stiff, damp, force)
+        phase = x[PHASE] + signal.psi[j, i] + w * h - reference.phase(np.array([time + side]))[0]
+        sides.append((time, phase, turn.rate, x[LOG], turn.moved))
+    return tuple(np.array(values) for values in zip(*sides, strict=True))
 
 
 def _facts(prepared: Prepared, found: Track, walk: Array) -> dict[str, object]:
