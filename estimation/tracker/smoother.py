@@ -236,9 +236,15 @@ def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
         mean_bend = 0.5 * signal.mean_gain * turn.mean_bend
         values[2, 0] += mean_bend * turn.rate.real**2 + 0.5 * by_mean * bend.real
         jacobian[0, 0, at + LOG] = by_mean
-        moves = ((PHASE, turn.by_phase), (LOG, turn.by_log), (STIFFNESS, by_stiff), (DAMPING, by_damp))
-        for s, by in moves:
-            by_bend = turn.by_phase * by.imag + turn.by_log * by.real
+        moves = (
+            (PHASE, turn.by_phase, 0.0j),
+            (LOG, turn.by_log, 0.0j),
+            (STIFFNESS, by_stiff, 0.0j),
+            (TREND, 0.0j, by_stiff),
+            (DAMPING, by_damp, 0.0j),
+        )
+        for s, by, by_trend in moves:
+            by_bend = turn.by_phase * by.imag + turn.by_log * by.real + by_trend
             jacobian[0, 0, at + s] += signal.mean_delay * turn.seen_by_log[0].real * by.real
             jacobian[1, 0, at + s] = by_mean * by.real
             jacobian[2, 0, at + s] = 2.0 * mean_bend * turn.rate.real * by.real + 0.5 * by_mean * by_bend.real
@@ -267,8 +273,8 @@ def expected(laws, signal, k, x):  # type: ignore[no-untyped-def]
                     )
                     jacobian[0, j, at + PHASE], jacobian[0, j, at + LOG] = (part * by_phase).real, (part * by_log).real
                     jacobian[0, j, at + GAIN] = values[0, j]
-                    for s, by in moves:
-                        by_bend = turn.by_phase * by.imag + turn.by_log * by.real
+                    for s, by, by_trend in moves:
+                        by_bend = turn.by_phase * by.imag + turn.by_log * by.real + by_trend
                         jacobian[0, j, at + s] += (part * line * by_passed * (by.imag - fades * by.real)).real
                         by_first = by_log * by.real + by_phase * by.imag
                         by_second = 0.5 * (by_log * by_bend.real + by_phase * by_bend.imag)
