@@ -18,7 +18,8 @@ from estimation.signals import reference_of, senses
 from estimation.tracker.bound import phase_bound
 from estimation.tracker.signal import prepare
 from estimation.tracker.smoother import PHASE, STATES
-from estimation.tracker.track import follow, signed, starting_belief, tuned_walk
+from estimation.tracker.track import averaged, follow, signed, starting_belief
+from estimation.tracker.tuning import likely_walks, tuned_walk
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.score import axis_error
@@ -88,7 +89,8 @@ def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
                     (own,) = (s for s in senses(noisy, device) if s.channel.name == sense.channel.name)
                     prepared = prepare(noisy, device, own, references)
                     begin, _ = signed(prepared, starting_belief(prepared, device))
-                    found = follow(prepared, begin, tuned_walk(prepared, begin))
+                    walk = tuned_walk(prepared, begin)
+                    found = averaged(prepared, begin, likely_walks(prepared, begin, walk))
                     for i, name in enumerate(sense.axes):
                         error = found.states[:, i * STATES + PHASE] - truth[:, i * STATES + PHASE]
                         error = (error + np.pi / 2) % np.pi - np.pi / 2

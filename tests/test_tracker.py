@@ -30,7 +30,8 @@ from estimation.tracker.smoother import (
     expected,
     run_filter,
 )
-from estimation.tracker.track import follow, signed, starting_belief, tuned_walk
+from estimation.tracker.track import follow, signed, starting_belief
+from estimation.tracker.tuning import tuned_walk
 from phantoms.forward import Plan, Start, quantised, simulate
 from phantoms.waveforms import Constant, Sequence, Sine
 from recon.mapping import Grid, accumulate

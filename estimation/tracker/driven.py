@@ -18,15 +18,14 @@ from estimation.tracker.orbit import axis_law, law_of, turn_of
 from estimation.tracker.signal import Driven, Prepared, driven_blocks
 from estimation.tracker.smoother import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND, Signal
 from estimation.tracker.track import (
-    LEAST_WALK,
     STIFFNESS_SPREAD,
     TREND_SD,
-    Belief,
     PhaseSeen,
     axis_motion,
     follow,
     with_phases,
 )
+from estimation.tracker.tuning import LEAST_WALK, Belief
 from scanner.channel import Channel
 from scanner.device import Device, Position
 from scanner.errors import BadInput

@@ -23,10 +23,10 @@ from estimation.tracker.smoother import (
     SIGNIFICANT,
     STATES,
     STIFFNESS,
-    TREND,
     Signal,
 )
 from estimation.tracker.switches import EDGE
+from estimation.tracker.tuning import START_WALK, Belief, Likely, densities, filtered, likely_walks, tuned_walk, window
 from scanner.device import Amdm, Device, Position
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion
@@ -39,12 +39,6 @@ DAMPING_SPREAD = 0.05
 TREND_SD = 0.3  # of the stiffness [1/s]: 0.3 % within 10 ms
 POSITION_GAIN_SD = 1e-4  # relative: what a position sensor says is what the angle is
 OFFSET_SD = 1.0  # of the readout [V]
-START_WALK = (1e-7, 0.1, 1e-5)  # white phase noise [rad2/s], trend [1/s3], damping [1/s]: where the tuning starts
-LEAST_WALK = (1e-9, 1e-4, 1e-8)
-GAIN_WALK, OFFSET_WALK = 1e-8, 1e-8  # [1/s], [V2/s]: a readout's drift is slow against the scan
-TUNED_BLOCKS = 300  # in up to three stretches
-ROUNDS, SETTLED = 12, 0.2  # of the tuning, and the change of a logarithm at which it ends
-UNHEARD = 1e-3  # degrees of freedom that a density has in the track: below nothing tells it
 WINDOW, LAG = 4096, 512  # blocks smoothed at a time, and how far a window looks ahead of what it gives
 LISTENED = 64  # blocks that may be taken together to find a motion in noise
 PROBED = 200  # blocks from which the sign is told
@@ -59,15 +53,6 @@ class PhaseSeen(NamedTuple):
     time: Array
     phase: Array
     sd: Array
-
-
-@dataclass(frozen=True)
-class Belief:
-    """State and covariance before a block, and whether each axis's motion has been found."""
-
-    x: Array
-    P: Array
-    live: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -110,7 +95,8 @@ def track(
         prepared = prepare(recording, device, sense, references)
         start, signs = signed(prepared, starting_belief(prepared, device))
         walk = tuned_walk(prepared, start)  # by the signal alone: it would bend the motion to each of a few phases seen
-        found = follow(with_phases(prepared, seen or {}), start, walk, causal)
+        helped = with_phases(prepared, seen or {})
+        found = averaged(helped, start, likely_walks(prepared, start, walk), causal)
         for i, name in enumerate(sense.axes):
             if not found.live[i]:
                 raise BadInput(
@@ -193,91 +179,16 @@ def _listen(signal: Signal, a: int, x: Array) -> bool:
     return False
 
 
-def _walks(values: Array) -> Array:
-    """Spectral densities of each axis, shape (axes, 4), from the three that are tuned."""
-    return np.concatenate([values, np.full((len(values), 1), GAIN_WALK)], axis=1)
-
-
-def tuned_walk(prepared: Prepared, start: Belief) -> Array:
-    """Process noise of each axis by maximum likelihood, shape (axes, 3): see ``START_WALK``.
-
-    Where the likelihood's score vanishes, a state is kicked as much as the smoothed track says (``backward.kicks``);
-    until then each density grows by the ratio of the two. What has less than a degree of freedom is not waited for.
-    """
-    signal, axes = prepared.signal, len(prepared.laws)
-    parts = _stretches(signal)
-    walk = np.tile(START_WALK, (axes, 1))
-    for _ in range(ROUNDS):
-        squares, spreads = np.zeros((2, start.x.size))
-        for part in parts:
-            kept = _filtered(prepared, part, start, _walks(walk))[-1]
-            backward.run_smoother(*kept)
-            squares, spreads = np.add((squares, spreads), backward.kicks(*kept[:4]))
-        told, held = (_by_walk(sums, axes) for sums in (squares, spreads))
-        freedom = held * walk * signal.step
-        heard = freedom > UNHEARD
-        new = np.where(heard, np.maximum(walk * told / np.where(heard, held, 1.0), LEAST_WALK), walk)
-        settled = (np.abs(np.log(new / walk)) < SETTLED) | (freedom < 1.0)
-        walk = new
-        if settled.all():
-            break
-    return walk
-
-
-def _by_walk(sums: Array, axes: int) -> Array:
-    """Sums over states as sums over what walks, shape (axes, 3): phase and ln A together, trend, damping."""
-    own = sums[: axes * STATES].reshape(axes, STATES)
-    return np.stack([own[:, PHASE] + own[:, LOG], own[:, TREND], own[:, DAMPING]], axis=1)
-
-
-def _stretches(signal: Signal) -> list[Signal]:
-    blocks = len(signal.whitened)
-    if blocks <= TUNED_BLOCKS:
-        return [signal]
-    third = TUNED_BLOCKS // 3
-    return [window(signal, at, at + third) for at in (0, (blocks - third) // 2, blocks - third)]
-
-
-def window(signal: Signal, first: int, stop: int) -> Signal:
-    """Blocks ``first`` up to ``stop`` of a signal."""
-    by_block = (
-        "psi",
-        "w",
-        "force",
-        "share",
-        "passed",
-        "passed_by_w",
-        "tuned",
-        "whitened",
-        "geometry",
-        "noise_var",
-        "known",
-        "known_var",
-    )
-    return signal._replace(**{name: getattr(signal, name)[first:stop] for name in by_block})
-
-
-def _filtered(
-    prepared: Prepared, signal: Signal, start: Belief, walk: Array
-) -> tuple[float, float, int, NDArray[np.bool_], tuple[Array, Array, Array, Array, Array]]:
-    """(log-likelihood, chi2, measurements, live, (xs, Ps, xp, Pp, Fs)) of ``smoother.run_filter``."""
-    m, n = len(signal.whitened), start.x.size
-    kept = (np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n)))
-    live = start.live.copy()
-    told = smoother.run_filter(prepared.rows, signal, start.x.copy(), start.P.copy(), live, walk, OFFSET_WALK, *kept)
-    return *told, live, kept
-
-
 def follow(prepared: Prepared, start: Belief, values: Array, causal: bool = False) -> Track:
     """The track of all blocks, window by window, so that memory does not grow with the covariances of all blocks."""
-    blocks, walk = len(prepared.time), _walks(values)
+    blocks, walk = len(prepared.time), densities(values)
     states, sds = np.empty((blocks, start.x.size)), np.empty((blocks, start.x.size))
     live = start.live.copy()
     total, chi2, count, first, belief = 0.0, 0.0, 0, 0, start
     while first < blocks:
         done = min(first + WINDOW, blocks)
         part = window(prepared.signal, first, min(done + LAG, blocks))
-        ll, squares, used, found, (xs, Ps, xp, Pp, Fs) = _filtered(prepared, part, belief, walk)
+        ll, squares, used, found, (xs, Ps, xp, Pp, Fs) = filtered(prepared, part, belief, walk)
         live = live | found
         inner = done - first
         if done < blocks:
@@ -292,6 +203,28 @@ def follow(prepared: Prepared, start: Belief, values: Array, causal: bool = Fals
     return Track(states, sds, total, chi2 / max(count, 1), live)
 
 
+def averaged(prepared: Prepared, start: Belief, likely: Likely, causal: bool = False) -> Track:
+    """The track averaged over the process noise that may be, its deviations with what that leaves uncertain.
+
+    Where noise leaves the drift's law uncertain, the track for the most probable law is as good as any, but its
+    covariance takes that law for known: intervals of 95 % would hold the truth in 91 % (docs/bound.md).
+    """
+    tracks = [follow(prepared, start, walk, causal) for walk in likely.walks]
+    centre = tracks[len(tracks) // 2]
+    states, sds = centre.states.copy(), centre.sds.copy()
+    for a in range(len(prepared.laws)):
+        own = slice(a * STATES, (a + 1) * STATES)
+        moved = np.stack([each.states[:, own] - centre.states[:, own] for each in tracks])
+        period = 2.0 * np.pi / prepared.signal.main
+        moved[:, :, PHASE] -= period * np.round(moved[:, :, PHASE] / period)
+        shift = np.tensordot(likely.mean[a], moved, 1)
+        variance = np.tensordot(likely.mean[a], np.stack([each.sds[:, own] ** 2 for each in tracks]), 1)
+        variance += np.einsum("ij,iks,jks->ks", likely.square[a], moved, moved) - shift**2
+        states[:, own] += shift
+        sds[:, own] = np.sqrt(np.maximum(variance, 0.0))
+    return replace(centre, states=states, sds=sds)
+
+
 def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     """The start with each axis's sign as its odd harmonics tell it over the first blocks, and what told it.
 
@@ -304,7 +237,7 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     if not (prepared.signal.lines[:, 1] % 2).any():
         return start, ["ambiguous"] * axes
     signal = window(prepared.signal, 0, PROBED)
-    kept = _filtered(prepared, signal, start, _walks(np.tile(START_WALK, (axes, 1))))[-1]
+    kept = filtered(prepared, signal, start, densities(np.tile(START_WALK, (axes, 1))))[-1]
     agreement, weight = np.zeros(axes), np.zeros(axes)
     for k, state in enumerate(kept[0]):
         unroot = signal.unroots[signal.geometry[k]]
