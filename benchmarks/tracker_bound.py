@@ -17,7 +17,7 @@ from estimation.estimate import estimate
 from estimation.signals import reference_of, senses
 from estimation.tracker.bound import phase_bound
 from estimation.tracker.signal import prepare
-from estimation.tracker.smoother import PHASE, STATES
+from estimation.tracker.step import PHASE, STATES
 from estimation.tracker.track import averaged, follow, signed, starting_belief
 from estimation.tracker.tuning import likely_walks, tuned_walk
 from phantoms.forward import Plan, simulate

@@ -19,17 +19,8 @@ from estimation.tracker.angle import SEGMENT, SlowAngle
 from estimation.tracker.backward import kicks, run_smoother
 from estimation.tracker.orbit import axis_law, turn_of
 from estimation.tracker.signal import Prepared, prepare
-from estimation.tracker.smoother import (
-    DAMPING,
-    GAIN,
-    LOG,
-    PHASE,
-    STATES,
-    STIFFNESS,
-    TREND,
-    expected,
-    run_filter,
-)
+from estimation.tracker.smoother import expected, run_filter
+from estimation.tracker.step import DAMPING, GAIN, LOG, PHASE, STATES, STIFFNESS, TREND
 from estimation.tracker.track import follow, signed, starting_belief
 from estimation.tracker.tuning import tuned_walk
 from phantoms.forward import Plan, Start, quantised, simulate

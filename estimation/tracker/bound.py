@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from estimation.tracker.backward import run_smoother
 from estimation.tracker.orbit import SENSED, law_of, turn_of
 from estimation.tracker.signal import Prepared
-from estimation.tracker.smoother import DAMPING, GAIN, LOG, PHASE, STATES, STIFFNESS, predict
+from estimation.tracker.step import DAMPING, GAIN, LOG, PHASE, STATES, STIFFNESS, predict
 from scanner.harmonics import readout_response
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ def phase_bound(prepared: Prepared, states: Array, P: Array, walk: Array, noise_
     """Least standard deviations of phi that a filter and a smoother can have, each of shape (blocks, axes) [rad].
 
     Args:
-        states: the true states at the blocks' middles, shape (blocks, states), see ``smoother``.
+        states: the true states at the blocks' middles, shape (blocks, states), see ``step``.
         P: covariance before the first block.
         walk: the true process's spectral densities, shape (axes, 4); the offset stands still.
         noise_var: of a sample [V^2].

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimation.signals import Sense, drive_voltage, intensity_clock, reference_of
 from estimation.tracker.orbit import axis_law, law_of, turn_of
 from estimation.tracker.signal import Driven, Prepared, driven_blocks
-from estimation.tracker.smoother import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND, Signal
+from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND, Signal
 from estimation.tracker.track import (
     STIFFNESS_SPREAD,
     TREND_SD,

@@ -13,7 +13,7 @@ from estimation.reference import Reference
 from estimation.signals import Sense, drive_voltage, is_capacitive
 from estimation.tracker.blocks import Projections, project, residual_variance, solved
 from estimation.tracker.orbit import COS, DRIVEN, POINTS, SENSED, SIN, AxisLaw, axis_law
-from estimation.tracker.smoother import Signal
+from estimation.tracker.step import Signal
 from estimation.tracker.switches import pieces, project_one, project_pieces, shares, switch_times, with_switches
 from scanner.channel import Channel
 from scanner.device import Amdm, Axis, Device
@@ -153,7 +153,7 @@ class Driven(NamedTuple):
 
     Attributes:
         reference: with bends and jumps where the drive switched. switches: when it did, shape (switches,) [s].
-        psi, w, force, share: as in ``smoother.Signal``, shape (blocks, ...).
+        psi, w, force, share: as in ``step.Signal``, shape (blocks, ...).
     """
 
     reference: Reference

@@ -14,17 +14,8 @@ from estimation.tracker import backward, smoother
 from estimation.tracker.angle import SlowAngle, SlowMotion
 from estimation.tracker.orbit import MOVED, law_of, turn_of
 from estimation.tracker.signal import Prepared, prepare
-from estimation.tracker.smoother import (
-    DAMPING,
-    FLOOR,
-    LOG,
-    LOST,
-    PHASE,
-    SIGNIFICANT,
-    STATES,
-    STIFFNESS,
-    Signal,
-)
+from estimation.tracker.smoother import LOST, SIGNIFICANT
+from estimation.tracker.step import DAMPING, FLOOR, LOG, PHASE, STATES, STIFFNESS, Signal, flow
 from estimation.tracker.switches import EDGE
 from estimation.tracker.tuning import START_WALK, Belief, Likely, densities, filtered, likely_walks, tuned_walk, window
 from scanner.device import Amdm, Device, Position
@@ -60,7 +51,7 @@ class Track:
     """State along the blocks.
 
     Attributes:
-        states: shape (blocks, states), see ``smoother``. sds: their standard deviations.
+        states: shape (blocks, states), see ``step``. sds: their standard deviations.
         log_likelihood: of the projections, up to a constant.
         chi2: mean squared normalised innovation; 1 where model and noise are right.
         live: whether the motion of each axis was found.
@@ -293,7 +284,7 @@ def _at_switch(prepared: Prepared, found: Track, i: int, k: int) -> tuple[NDArra
     sides = []
     for j, h, side in ((k, share, -EDGE), (k + 1, share - signal.step, EDGE)):
         w, force = signal.w[j, i], signal.force[j, i]
-        x, *_ = smoother.flow(law, found.states[j, i * STATES : (i + 1) * STATES], w, force, h, np.zeros(4))
+        x, *_ = flow(law, found.states[j, i * STATES : (i + 1) * STATES], w, force, h, np.zeros(4))
         stiff, damp = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
         turn = turn_of(law, np.exp(x[LOG]), x[PHASE], w, stiff, damp, force)
         phase = x[PHASE] + signal.psi[j, i] + w * h - reference.phase(np.array([time + side]))[0]

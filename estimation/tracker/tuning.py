@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from estimation.tracker import backward, smoother
 from estimation.tracker.signal import Prepared
-from estimation.tracker.smoother import DAMPING, LOG, PHASE, STATES, TREND, Signal
+from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, TREND, Signal
 
 Array = NDArray[np.float64]
 
