@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.signals import intensity_clock, is_capacitive, reference_of, senses
+from estimation.signals import Sense, intensity_clock, is_capacitive, reference_of, senses
 from estimation.tracker import backward, smoother
 from estimation.tracker.angle import SlowAngle, SlowMotion
 from estimation.tracker.orbit import MOVED
@@ -77,7 +77,11 @@ class Track:
 
 
 def track(
-    recording: Recording, device: Device, causal: bool = False, seen: Mapping[str, PhaseSeen] | None = None
+    recording: Recording,
+    device: Device,
+    causal: bool = False,
+    seen: Mapping[str, PhaseSeen] | None = None,
+    before: Motion | None = None,
 ) -> Motion:
     """Phase and amplitude of all axes from their sense signals.
 
@@ -85,6 +89,7 @@ def track(
         causal: each block from what came before it only (a filter); its latency is half a block. By default all
             blocks from all of the recording (a smoother).
         seen: further measurements of an axis's phase, from a picture that shows forward beside backward, by axis.
+        before: track of an earlier stretch of the same scan, from whose process noise the tuning starts.
 
     Raises:
         BadInput: a channel shows no motion, or cannot be used. ChannelMissing: an axis has no sense channel.
@@ -97,7 +102,8 @@ def track(
         references = {name: reference_of(recording, device, name, sense.channel, even) for name in sense.axes}
         prepared = prepare(recording, device, sense, references)
         start, signs = signed(prepared, starting_belief(prepared, device))
-        walk = tuned_walk(prepared, start)  # by the signal alone: it would bend the motion to each of a few phases seen
+        # by the signal alone: it would bend the motion to each of a few phases seen
+        walk = tuned_walk(prepared, start, _walk_of(before, sense))
         found = follow(with_phases(prepared, seen or {}), start, walk, causal)
         for i, name in enumerate(sense.axes):
             if not found.live[i]:
@@ -186,15 +192,15 @@ def _walks(values: Array) -> Array:
     return np.concatenate([values, np.full((len(values), 1), GAIN_WALK)], axis=1)
 
 
-def tuned_walk(prepared: Prepared, start: Belief) -> Array:
-    """Process noise of each axis by maximum likelihood, shape (axes, 3): see ``START_WALK``.
+def tuned_walk(prepared: Prepared, start: Belief, walk: Array | None = None) -> Array:
+    """Process noise of each axis by maximum likelihood, shape (axes, 3), from ``walk`` on: see ``START_WALK``.
 
     Where the likelihood's score vanishes, a state is kicked as much as the smoothed track says (``backward.kicks``);
     until then each density grows by the ratio of the two. What has less than a degree of freedom is not waited for.
     """
     signal, axes = prepared.signal, len(prepared.laws)
     parts = _stretches(signal)
-    walk = np.tile(START_WALK, (axes, 1))
+    walk = np.tile(START_WALK, (axes, 1)) if walk is None else walk
     for _ in range(ROUNDS):
         squares, spreads = np.zeros((2, start.x.size))
         for part in parts:
@@ -333,6 +339,13 @@ def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, fl
         reference=reference.kind,
         sign=sign,
     )
+
+
+def _walk_of(motion: Motion | None, sense: Sense) -> Array | None:
+    """The process noise that a track tells of one channel, shape (axes, 3); None where it tells none."""
+    facts = {} if motion is None else motion.info.get(sense.channel.name, {})
+    told = facts.get("walk") if isinstance(facts, Mapping) else None
+    return None if told is None else np.array([list(told[axis].values()) for axis in sense.axes])
 
 
 def _facts(prepared: Prepared, found: Track, walk: Array) -> dict[str, object]:
