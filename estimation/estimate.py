@@ -79,6 +79,7 @@ def estimate(
     device: Device | None = None,
     method: str | None = None,
     flips: Mapping[str, bool] | None = None,
+    before: Motion | None = None,
 ) -> Motion:
     """The motion of every axis of the device.
 
@@ -86,6 +87,7 @@ def estimate(
         device: in place of the recording's own.
         method: a name from ``ESTIMATORS``; ``default_estimator`` otherwise.
         flips: axes whose sign the user turns, for an even capacitance cannot tell theta from -theta.
+        before: the tracker's motion of an earlier stretch of the same scan, which shortens its tuning.
 
     Raises:
         BadInput: no such estimator, or the recording or the device does not serve it.
@@ -99,6 +101,12 @@ def estimate(
         raise BadInput(f"no estimator is named {method!r}", hint=f"there are {', '.join(ESTIMATORS)}")
 
     def run(recording: Recording, device: Device) -> Motion:
-        return settle_signs(ESTIMATORS[method][1](recording, device), recording, flips or {})
+        if before is not None and method == "tracker":
+            from estimation.tracker import track
+
+            motion = track(recording, device, before=before)
+        else:
+            motion = ESTIMATORS[method][1](recording, device)
+        return settle_signs(motion, recording, flips or {})
 
     return estimate_with_terms(recording, device, run, modelled=method not in MEASURED)

@@ -184,7 +184,7 @@ def show(
     device = device_of(recording, Device.load(options.device) if options.device else None)
     lead = BEFORE * slow_period(before.motion) if before else 0.0
     part = with_light(recording, device).slice(start - lead, stop)
-    motion, _ = moved(part, device, options)
+    motion, _ = moved(part, device, options, before.motion if before else None)
     if before:
         motion = continued(motion, before.motion)
     grid = before.grid if before else field_of(device, motion, options)[0]

@@ -182,9 +182,15 @@ def reconstruct(
     )
 
 
-def moved(recording: Recording, device: Device, options: Options) -> tuple[Motion, list[str]]:
-    """The estimator's motion, refined by the picture where that helps, and what a reader has to know of it."""
-    motion = estimate(recording, device, options.estimator, options.flips)
+def moved(
+    recording: Recording, device: Device, options: Options, before: Motion | None = None
+) -> tuple[Motion, list[str]]:
+    """The estimator's motion, refined by the picture where that helps, and what a reader has to know of it.
+
+    Args:
+        before: as in ``estimate``.
+    """
+    motion = estimate(recording, device, options.estimator, options.flips, before)
     grid, _ = field_of(device, motion, options)
     motion, notes = refined(recording, device, motion, recording["intensity"], grid, options.flips)
     return motion, notes + list(motion.notes)

@@ -41,7 +41,7 @@ def block_phasors(
 
 @lru_cache(maxsize=4)
 def _phasor_weights(block: int, turns: float) -> Array:
-    """What the fit of ``block_phasors`` takes of each sample, ``turns`` from one to the next: cosine's share, sine's."""
+    """Each sample's share in cosine and sine, shape (2, block), of a line that makes ``turns`` a sample."""
     turn = 2 * np.pi * turns * (np.arange(block) - 0.5 * (block - 1))
     basis = np.stack([np.ones(block), np.cos(turn), np.sin(turn)])
     windowed = basis * np.sin(np.pi * (np.arange(block) + 0.5) / block) ** 2

@@ -411,3 +411,20 @@ def test_windows_give_what_one_pass_gives(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(module, "LAG", 35)
     pieces = follow(prepared, start, walk)
     assert (np.abs(pieces.states - whole.states) < 0.1 * whole.sds)[:, [0, 6]].all()
+
+
+def test_an_earlier_track_shortens_the_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, device = noisy(8), devices.load("imaging")
+    module, rounds = sys.modules["estimation.tracker.tuning"], []
+
+    def counted(*kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rounds.append(1)
+        return kicks(*kept)
+
+    monkeypatch.setattr(module.backward, "kicks", counted)
+    alone = track(recording, device)
+    cold = len(rounds)
+    again = track(recording, device, before=alone)
+    assert len(rounds) - cold < cold
+    for name, axis in again.axes.items():
+        assert np.all(np.abs(axis.phase - alone.axes[name].phase) < 0.2 * axis.phase_sd)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.signals import intensity_clock, is_capacitive, reference_of, senses
+from estimation.signals import Sense, intensity_clock, is_capacitive, reference_of, senses
 from estimation.tracker import backward, smoother
 from estimation.tracker.angle import SlowAngle, SlowMotion
 from estimation.tracker.orbit import MOVED, law_of, turn_of
@@ -65,7 +65,11 @@ class Track:
 
 
 def track(
-    recording: Recording, device: Device, causal: bool = False, seen: Mapping[str, PhaseSeen] | None = None
+    recording: Recording,
+    device: Device,
+    causal: bool = False,
+    seen: Mapping[str, PhaseSeen] | None = None,
+    before: Motion | None = None,
 ) -> Motion:
     """Phase and amplitude of all axes from their sense signals.
 
@@ -73,6 +77,7 @@ def track(
         causal: each block from what came before it only (a filter); its latency is half a block. By default all
             blocks from all of the recording (a smoother).
         seen: further measurements of an axis's phase, from a picture that shows forward beside backward, by axis.
+        before: track of an earlier stretch of the same scan, from whose process noise the tuning starts.
 
     Raises:
         BadInput: a channel shows no motion, or cannot be used. ChannelMissing: an axis has no sense channel.
@@ -85,7 +90,8 @@ def track(
         references = {name: reference_of(recording, device, name, sense.channel, even) for name in sense.axes}
         prepared = prepare(recording, device, sense, references)
         start, signs = signed(prepared, starting_belief(prepared, device))
-        walk = tuned_walk(prepared, start)  # by the signal alone: it would bend the motion to each of a few phases seen
+        # by the signal alone: it would bend the motion to each of a few phases seen
+        walk = tuned_walk(prepared, start, _walk_of(before, sense))
         helped = with_phases(prepared, seen or {})
         found = averaged(helped, start, likely_walks(prepared, start, walk), causal)
         for i, name in enumerate(sense.axes):
@@ -273,6 +279,13 @@ def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, fl
         reference=reference.kind,
         sign=sign,
     )
+
+
+def _walk_of(motion: Motion | None, sense: Sense) -> Array | None:
+    """The process noise that a track tells of one channel, shape (axes, 3); None where it tells none."""
+    facts = {} if motion is None else motion.info.get(sense.channel.name, {})
+    told = facts.get("walk") if isinstance(facts, Mapping) else None
+    return None if told is None else np.array([list(told[axis].values()) for axis in sense.axes])
 
 
 def _at_switch(prepared: Prepared, found: Track, i: int, k: int) -> tuple[NDArray[Any], ...]:

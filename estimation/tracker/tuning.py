@@ -58,8 +58,10 @@ def densities(values: Array) -> Array:
     return np.concatenate([values, np.full((len(values), 1), GAIN_WALK)], axis=1)
 
 
-def tuned_walk(prepared: Prepared, start: Belief) -> Array:
+def tuned_walk(prepared: Prepared, start: Belief, walk: Array | None = None) -> Array:
     """Process noise of each axis, shape (axes, 3), see ``START_WALK``: of the trend most probable, else most likely.
+
+    The search starts from ``walk``, where one is given.
 
     Where the likelihood's score vanishes, a state is kicked as much as the smoothed track says (``backward.kicks``);
     until then each density grows by the ratio of the two. What has less than a degree of freedom is not waited for. The
@@ -69,7 +71,7 @@ def tuned_walk(prepared: Prepared, start: Belief) -> Array:
     """
     signal, axes = prepared.signal, len(prepared.laws)
     parts = _stretches(signal)
-    walk = np.tile(START_WALK, (axes, 1))
+    walk = np.tile(START_WALK, (axes, 1)) if walk is None else walk
     for _ in range(ROUNDS):
         told, held = _kicked(prepared, parts, start, walk)
         freedom = held * walk * signal.step
