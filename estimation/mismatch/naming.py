@@ -12,6 +12,7 @@ from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.screen import Screened, screen
+from estimation.mismatch.start import measured_whiteners
 from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
@@ -78,12 +79,24 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], thr
 
     Free corrections, which cost most, are fitted only where no named term leaves noise alone.
     """
-    promising = sorted((screen(comparison, base, each) for each in candidates), key=lambda s: -s.gain)
+    promising = sorted(screen(comparison, base, candidates), key=lambda s: -s.gain)
     promising = [each for each in promising if each.gain > threshold]
-    fits = _finalists(comparison, [each for each in promising if each.candidate.term.effect not in FREE])
-    if not any(fit.chi2 < EXPLAINED * fit.rows.sum() for fit in fits):
-        fits += _finalists(comparison, [each for each in promising if each.candidate.term.effect in FREE])
+    return _named_first(promising, lambda part: _finalists(comparison, part))
+
+
+def _named_first(screened: Sequence[Screened], fitted: Callable[[list[Screened]], list[Fit]]) -> list[Fit]:
+    """Fits of named terms, and of free corrections too unless the best named one leaves noise alone; best first."""
+    fits = fitted([each for each in screened if each.candidate.term.effect not in FREE])
+    if not fits or not _explains(min(fits, key=lambda fit: fit.evidence)):
+        fits += fitted([each for each in screened if each.candidate.term.effect in FREE])
     return sorted(fits, key=lambda fit: fit.evidence)
+
+
+def _explains(fit: Fit) -> bool:
+    """Whether nothing is left but noise, as it is measured once this fit has taken its part away."""
+    comparison = Comparison(fit.model.runs, measured_whiteners(fit.model, fit.x))
+    again = solve(comparison, fit.model, fit.x, turns=3)
+    return again.chi2 < EXPLAINED * int(again.rows.sum())
 
 
 def _finalists(comparison: Comparison, promising: Sequence[Screened]) -> list[Fit]:
@@ -122,12 +135,22 @@ def race(
     first = _failing(early)
     followed = early[max(first - 1, 0)]
     base = solve(comparison, nominal, nominal.embed(early[first].model, early[first].x), stops[first], 8)
-    field = sorted((screen(comparison, base, each, stops[first]) for each in candidates), key=lambda each: -each.gain)
+    field = sorted(screen(comparison, base, candidates, stops[first]), key=lambda each: -each.gain)
     few = base.rows.sum() > MANY_SAMPLES
     starters = [each for i, each in enumerate(field) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
-    running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in starters]
+    tracks = list(_eased(stops[max(first - 1, 0) :]) if first else stops)
+
+    def through(part: list[Screened]) -> list[Fit]:
+        running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in part]
+        return _raced(comparison, running, tracks)
+
+    return _named_first(starters, through)
+
+
+def _raced(comparison: Comparison, running: list[tuple[Model, Array]], stops: Sequence[float]) -> list[Fit]:
+    """Possible fits of those that keep up through the growing windows ``stops``."""
     fits: list[Fit] = []
-    for stop in _eased(stops[max(first - 1, 0) :]) if first else stops:
+    for stop in stops if running else ():
         turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
         fits = []
         for model, x in running:
