@@ -168,7 +168,8 @@ def solve(
     value = residual[rows] @ residual[rows] + precision @ (x * x)
     damping = 1e-4
     jacobian, fresh = comparison.jacobian(model, x, residual, steps, stop), True
-    for turn in range(turns):
+    turn = 0
+    while True:
         part = jacobian[rows]
         normal = part.T @ part + np.diag(precision)
         gradient = part.T @ residual[rows] + precision * x
@@ -187,13 +188,13 @@ def solve(
             damping *= 6.0
         if fresh and gain < tolerance and turn > 0:
             break
-        given_up = turn == turns - 1 or (turn >= 4 and gain < 0.2 * (value - hopeless))
         # The Jacobian takes nearly all the time: while steps hold what it promises, it need not be known anew.
-        fresh = given_up or not KEPT * promised < gain > tolerance
+        fresh = not KEPT * promised < gain > tolerance
         if fresh:
+            turn += 1
             jacobian = comparison.jacobian(model, x, residual, steps, stop)
-        if given_up:
-            break
+            if turn == turns or (turn > 4 and gain < 0.2 * (value - hopeless)):
+                break
     return made_fit(comparison, model, x, residual, jacobian, rows)
 
 

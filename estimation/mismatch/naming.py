@@ -142,6 +142,8 @@ def race(
 
     def through(part: list[Screened]) -> list[Fit]:
         running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in part]
+        if any(each.candidate.term.effect in FREE for each in part):  # few, and none is a measure of another
+            return [fit for one in running for fit in _raced(comparison, [one], tracks)]
         return _raced(comparison, running, tracks)
 
     return _named_first(starters, through)
