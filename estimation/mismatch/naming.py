@@ -30,9 +30,6 @@ SHARE_HELD = 0.3
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
 
-EXPLAINED = 1.02
-"""Reduced chi-square of the fitted samples at which there is nothing left for a free correction to do."""
-
 MUCH = 100.0
 """Fall of -2 log evidence beyond which first order is no judge of candidates."""
 
@@ -77,7 +74,7 @@ def convincing(before: Fit, after: Fit) -> bool:
 def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], threshold: float = 3.0) -> list[Fit]:
     """Fits of the candidates that first order around ``base`` promises anything of, best first.
 
-    Free corrections, which cost most, are fitted only where no named term leaves noise alone.
+    Free corrections, which cost most, are fitted only where they find something beside the best named term.
     """
     promising = sorted(screen(comparison, base, candidates), key=lambda s: -s.gain)
     promising = [each for each in promising if each.gain > threshold]
@@ -85,18 +82,21 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], thr
 
 
 def _named_first(screened: Sequence[Screened], fitted: Callable[[list[Screened]], list[Fit]]) -> list[Fit]:
-    """Fits of named terms, and of free corrections too unless the best named one leaves noise alone; best first."""
+    """Fits of named terms, and of free corrections too unless they find nothing beside the best name; best first."""
+    free = [each for each in screened if each.candidate.term.effect in FREE]
     fits = fitted([each for each in screened if each.candidate.term.effect not in FREE])
-    if not fits or not _explains(min(fits, key=lambda fit: fit.evidence)):
-        fits += fitted([each for each in screened if each.candidate.term.effect in FREE])
+    if free and not (fits and _explains(min(fits, key=lambda fit: fit.evidence), [each.candidate for each in free])):
+        fits += fitted(free)
     return sorted(fits, key=lambda fit: fit.evidence)
 
 
-def _explains(fit: Fit) -> bool:
-    """Whether nothing is left but noise, as it is measured once this fit has taken its part away."""
+def _explains(fit: Fit, free: Sequence[Candidate]) -> bool:
+    """Whether no ``free`` correction gains by first order beside a fit, under the noise that the fit leaves."""
     comparison = Comparison(fit.model.runs, measured_whiteners(fit.model, fit.x))
     again = solve(comparison, fit.model, fit.x, turns=3)
-    return again.chi2 < EXPLAINED * int(again.rows.sum())
+    if again.chi2 > TRACKED * int(again.rows.sum()):
+        return False
+    return all(each.gain < LEAD_OVER_NOTHING for each in screen(comparison, again, free))
 
 
 def _finalists(comparison: Comparison, promising: Sequence[Screened]) -> list[Fit]:
