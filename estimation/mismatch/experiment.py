@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scanner.channel import Channel, check_signal
 from scanner.device import Amdm, Axis, Device, Position, Readout, Transimpedance
 from scanner.errors import BadInput, DeviceInvalid
+from scanner.lowpass import response
 from scanner.recording import Recording
 from scanner.response import Inputs
 from scanner.terms import Scales
@@ -344,9 +345,8 @@ def _amplitude(axis: Axis, readout: Readout | None, rate: float, signal: Array, 
     theta = sizes[:, None] * np.sin(turn)
     u = theta / comb.theta0
     if isinstance(readout, Amdm):
-        told = np.ptp(readout.a_cir * comb.C0 * np.exp(-u * u), axis=1) / (
-            1.0 + (rate / np.pi / readout.lpf_hz[0]) ** 2
-        )
+        passed = np.abs(response(rate / np.pi, readout.lpf_hz))  # an even bell swings at twice the motion's rate
+        told = np.ptp(readout.a_cir * comb.C0 * np.exp(-u * u), axis=1) * passed
     elif isinstance(readout, Transimpedance):
         slope = -2 * u / comb.theta0 * comb.C0 * np.exp(-u * u)
         told = np.ptp(readout.R_s * readout.V_bias * slope * sizes[:, None] * rate * np.cos(turn), axis=1)

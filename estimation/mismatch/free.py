@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
+from numpy.polynomial.chebyshev import chebval
 from numpy.typing import NDArray
 
 from scanner.terms import Parameter, Term, View
@@ -44,9 +45,11 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
         for j in range(n + 1):
             total += p[at] * x ** (n - j) * y**j
             at += 1
-    for j in range(1, WAVES + 1):
-        wave = np.cos(np.pi * j * t / p[2])
+    first = np.cos(np.pi * t / p[2])
+    before, wave = 1.0, first
+    for _ in range(WAVES):
         total += (p[at] * x + p[at + 1] * y) * wave
+        before, wave = wave, 2.0 * first * wave - before
         at += 2
     return -total * nominal[2] * p[0], 0.0, 0.0
 
@@ -63,6 +66,11 @@ def _profile(theta, p, nominal):  # type: ignore[no-untyped-def]
     return bell * value, bell * slope / nominal[4]
 
 
+def waves(turn: Array, sizes: Sequence[float]) -> Array:
+    """sum_j sizes[j] cos(j turn), of the shape of ``turn``; cos(j turn) is Chebyshev's polynomial of its cosine."""
+    return np.asarray(chebval(np.cos(turn), np.asarray(sizes)))
+
+
 def _drive(voltage: Array, p: Sequence[float], view: View) -> Array:
     time = view.time[:-1, None] + view.step * np.array([0.0, 0.5, 1.0])
     turn, size, rate = np.pi * time / p[0], p[1], p[2]
@@ -70,27 +78,22 @@ def _drive(voltage: Array, p: Sequence[float], view: View) -> Array:
     swing = voltage - mean
     slope = np.gradient(view.raw_voltage, view.step)
     slopes = np.stack([slope[:-1], 0.5 * (slope[:-1] + slope[1:]), slope[1:]], axis=1)
-    change = p[3] * swing + p[4] * slopes / rate + p[5] * swing * swing / size
-    for j in (1, 2, 3):
-        change = change + (p[4 + 2 * j] * swing + p[5 + 2 * j] * size) * np.cos(j * turn)
-    return voltage + change
+    gain, offset = waves(turn, [p[3], *p[6::2]]), waves(turn, [0.0, *p[7::2]])
+    return voltage + (gain + p[5] / size * swing) * swing + size * offset + p[4] / rate * slopes
 
 
 def _readout(signal: Array, p: Sequence[float], view: View) -> Array:
     turn, size, rate = np.pi * view.time / p[0], p[1], p[2]
     swing = signal - signal.mean()
     slope = np.gradient(signal, view.step) / rate
-    change = p[3] * swing**2 / size + p[4] * swing**3 / size**2 + p[5] * slope
-    for j in range(1, OFFSETS + 1):
-        change = change + p[5 + j] * size * np.cos(j * turn)
-    gain = np.zeros_like(signal)
-    for j in range(1, GAINS + 1):
-        gain += p[5 + OFFSETS + j] * np.cos(j * turn)
-    return signal + change + gain * swing
+    offset = waves(turn, [0.0, *p[6 : 6 + OFFSETS]])
+    gain = waves(turn, [0.0, *p[6 + OFFSETS :]])
+    u = swing / size
+    return signal + swing * (gain + u * (p[3] + p[4] * u)) + size * offset + p[5] * slope
 
 
 def _timing(signal: Array, p: Sequence[float], view: View) -> Array:
-    late = sum(p[1 + j] * np.cos(np.pi * j * view.time / p[0]) for j in range(DELAYS + 1))
+    late = waves(np.pi * view.time / p[0], p[1:])
     return signal - late * np.gradient(signal, view.step)
 
 

@@ -50,7 +50,7 @@ def instead(
 ) -> list[Fit]:
     """Fits with other terms of ``pool`` in the place of ``gone``, best first; with ``pairs``, two of them as well."""
     taken = {each.key for each in fit.model.candidates}
-    seen = [screen(comparison, fit, each, gone=(gone,)) for each in pool if each.key not in taken]
+    seen = screen(comparison, fit, [each for each in pool if each.key not in taken], gone=(gone,))
     seen = [each for each in seen if np.any(each.columns)]
     if not seen:
         return []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +94,7 @@ class Model:
             (r, output.name): self._basis(r, output) for r, run in enumerate(self.runs) for output in run.outputs
         }
         self._paths: dict[tuple[object, ...], Path] = {}
+        self._lock = Lock()
 
     def _free(self) -> list[Free]:
         free = [
@@ -218,17 +220,20 @@ class Model:
 
     def _remembered(self, axis: Axis, added: tuple[Added, ...], inputs: Inputs,
                     start: tuple[float, float], r: int) -> Path:  # fmt: skip
-        """The last two motions are kept: a changed readout needs no new integration."""
+        """The last few motions are kept: a changed readout needs no new integration."""
         acting = [each for each in added if _moves(each.term)]
         key = (
             r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
             *[(each.term.effect, each.values, each.hidden) for each in acting],
         )  # fmt: skip
-        if key not in self._paths:
+        with self._lock:
+            path = self._paths.pop(key, None)
+        if path is None:
+            path = move(axis, acting, inputs, start)
+        with self._lock:  # at the end: the one used last is the last to go
+            self._paths[key] = path
             if len(self._paths) > 8 * len(self.runs):
                 self._paths.pop(next(iter(self._paths)))
-            self._paths[key] = move(axis, acting, inputs, start)
-        path = self._paths[key]
         return replace(path, axis=with_constants(axis, added), added=added)
 
     def _offset(self, output: Output, signal: Array, r: int, x: Array) -> Array:

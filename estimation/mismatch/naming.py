@@ -12,6 +12,7 @@ from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.screen import Screened, screen
+from estimation.mismatch.start import measured_whiteners
 from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
@@ -28,9 +29,6 @@ SHARE_HELD = 0.3
 
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
-
-EXPLAINED = 1.02
-"""Reduced chi-square of the fitted samples at which there is nothing left for a free correction to do."""
 
 MUCH = 100.0
 """Fall of -2 log evidence beyond which first order is no judge of candidates."""
@@ -76,14 +74,29 @@ def convincing(before: Fit, after: Fit) -> bool:
 def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], threshold: float = 3.0) -> list[Fit]:
     """Fits of the candidates that first order around ``base`` promises anything of, best first.
 
-    Free corrections, which cost most, are fitted only where no named term leaves noise alone.
+    Free corrections, which cost most, are fitted only where they find something beside the best named term.
     """
-    promising = sorted((screen(comparison, base, each) for each in candidates), key=lambda s: -s.gain)
+    promising = sorted(screen(comparison, base, candidates), key=lambda s: -s.gain)
     promising = [each for each in promising if each.gain > threshold]
-    fits = _finalists(comparison, [each for each in promising if each.candidate.term.effect not in FREE])
-    if not any(fit.chi2 < EXPLAINED * fit.rows.sum() for fit in fits):
-        fits += _finalists(comparison, [each for each in promising if each.candidate.term.effect in FREE])
+    return _named_first(promising, lambda part: _finalists(comparison, part))
+
+
+def _named_first(screened: Sequence[Screened], fitted: Callable[[list[Screened]], list[Fit]]) -> list[Fit]:
+    """Fits of named terms, and of free corrections too unless they find nothing beside the best name; best first."""
+    free = [each for each in screened if each.candidate.term.effect in FREE]
+    fits = fitted([each for each in screened if each.candidate.term.effect not in FREE])
+    if free and not (fits and _explains(min(fits, key=lambda fit: fit.evidence), [each.candidate for each in free])):
+        fits += fitted(free)
     return sorted(fits, key=lambda fit: fit.evidence)
+
+
+def _explains(fit: Fit, free: Sequence[Candidate]) -> bool:
+    """Whether no ``free`` correction gains by first order beside a fit, under the noise that the fit leaves."""
+    comparison = Comparison(fit.model.runs, measured_whiteners(fit.model, fit.x))
+    again = solve(comparison, fit.model, fit.x, turns=3)
+    if again.chi2 > TRACKED * int(again.rows.sum()):
+        return False
+    return all(each.gain < LEAD_OVER_NOTHING for each in screen(comparison, again, free))
 
 
 def _finalists(comparison: Comparison, promising: Sequence[Screened]) -> list[Fit]:
@@ -122,12 +135,24 @@ def race(
     first = _failing(early)
     followed = early[max(first - 1, 0)]
     base = solve(comparison, nominal, nominal.embed(early[first].model, early[first].x), stops[first], 8)
-    field = sorted((screen(comparison, base, each, stops[first]) for each in candidates), key=lambda each: -each.gain)
+    field = sorted(screen(comparison, base, candidates, stops[first]), key=lambda each: -each.gain)
     few = base.rows.sum() > MANY_SAMPLES
     starters = [each for i, each in enumerate(field) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
-    running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in starters]
+    tracks = list(_eased(stops[max(first - 1, 0) :]) if first else stops)
+
+    def through(part: list[Screened]) -> list[Fit]:
+        running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in part]
+        if any(each.candidate.term.effect in FREE for each in part):  # few, and none is a measure of another
+            return [fit for one in running for fit in _raced(comparison, [one], tracks)]
+        return _raced(comparison, running, tracks)
+
+    return _named_first(starters, through)
+
+
+def _raced(comparison: Comparison, running: list[tuple[Model, Array]], stops: Sequence[float]) -> list[Fit]:
+    """Possible fits of those that keep up through the growing windows ``stops``."""
     fits: list[Fit] = []
-    for stop in _eased(stops[max(first - 1, 0) :]) if first else stops:
+    for stop in stops if running else ():
         turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
         fits = []
         for model, x in running:

@@ -74,16 +74,25 @@ def starts(candidate: Candidate) -> list[tuple[float, ...]]:
 
 
 def screen(
-    comparison: Comparison, base: Fit, candidate: Candidate, stop: float = 1.0, gone: Sequence[Candidate] = ()
-) -> Screened:
-    """The best start of a candidate by first order around ``base``.
+    comparison: Comparison,
+    base: Fit,
+    candidates: Iterable[Candidate],
+    stop: float = 1.0,
+    gone: Sequence[Candidate] = (),
+) -> list[Screened]:
+    """The best start of every candidate by first order around ``base``.
 
     Args:
         gone: terms of ``base`` in whose place it would stand: ``base`` follows the motion, they need not be right.
     """
-    model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
     rows = base.rows & (comparison.time < stop)
     known = Projection(base, rows, gone)
+    return [_best_start(comparison, base, each, known, rows, stop) for each in candidates]
+
+
+def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: Projection, rows: NDArray[np.bool_],
+                stop: float) -> Screened:  # fmt: skip
+    model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
     best: Screened | None = None
     for grid in starts(candidate):
         x = model.embed(base.model, base.x)

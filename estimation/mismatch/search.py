@@ -80,8 +80,8 @@ class Search:
 def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: Progress = lambda text: None) -> Search:
     """Locate and name what ``device`` leaves out of ``runs``.
 
-    Where a free correction does better than any one term although the misfit is large, several terms may be at work:
-    they are kept if, one after the other, they leave next to nothing of it.
+    Where a free correction does better than any one term but leaves something of a misfit that is large, several terms
+    may be at work: they are kept if, one after the other, they leave next to nothing of it.
 
     Args:
         terms: effects to look for.
@@ -98,8 +98,8 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     states = [_State(comparison, nominal, nominal, {})]
     states += _extended(states[0], [*named, *FREE.values()], early, stops, say)
     found = states[-1]
-    if _is_free(found.best) and found.nominal.held_chi2 > LARGE:
-        several = [states[-2], *_extended(states[-2], named, early, stops, say)][-1]
+    if _is_free(found.best) and found.nominal.held_chi2 > LARGE and found.best.held_chi2 > ADEQUATE:
+        several = _several(states[-2], _extended(states[-2], named, early, stops, say))
         if several.best.held_chi2 - 1.0 < NEXT_TO_NOTHING * (several.nominal.held_chi2 - 1.0):
             found = several
     elif found.best.model.candidates and not _is_free(found.best) and found.best.held_chi2 > INADEQUATE:
@@ -168,6 +168,17 @@ def _extended(
         yield _State(comparison, nominal, best, rivals)
         if _is_free(best):
             return
+
+
+def _several(start: _State, further: Iterator[_State]) -> _State:
+    """The last of ``further`` as long as each takes away at least half of the misfit that the one before it left."""
+    last = start
+    for state in further:
+        worth = state.best.held_chi2 - 1.0 < 0.5 * (last.best.held_chi2 - 1.0)
+        last = state
+        if not worth:
+            break
+    return last
 
 
 def _by_name(comparison: Comparison, before: Fit, free: Fit, named: Sequence[Candidate]) -> tuple[Comparison, Fit, Fit]:

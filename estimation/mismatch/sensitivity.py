@@ -71,15 +71,14 @@ def visibility(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> list[
 
 def columns(comparison: Comparison, fit: Fit, candidate: Candidate) -> list[Array]:
     """Sensitivities to a candidate around ``fit``, shape (N, q), for each of its starts that shows anything."""
-    blocks = []
+    alone = []
     for start in starts(candidate):
         place = iter(start)
         parameters = tuple(
             p if p.kind == "fixed" else replace(p, starts=(next(place),)) for p in candidate.term.parameters
         )
-        alone = replace(candidate, term=replace(candidate.term, parameters=parameters))
-        blocks.append(screen(comparison, fit, alone).columns)
-    return [block for block in blocks if np.any(block)]
+        alone.append(replace(candidate, term=replace(candidate.term, parameters=parameters)))
+    return [each.columns for each in screen(comparison, fit, alone) if np.any(each.columns)]
 
 
 def distances(fit: Fit, blocks: Sequence[Array], rows: NDArray[np.bool_]) -> tuple[Array, Array]:
