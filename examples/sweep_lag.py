@@ -4,8 +4,9 @@
 
 The paper models its readout as y = a_cir C + b_cir with filters whose phase shifts "are constant" (section II-C). Two
 sections near 41 kHz are not: from 31.11 to 31.50 kHz they move the motion's phase by 0.35 degrees. Three short
-recordings at different drive frequencies are held against the paper's device; what is found goes into the device, and
-recordings at other frequencies are estimated with the paper's constant phase and with the improved device.
+recordings at different drive frequencies, with the position detector that the paper had on its bench, are held against
+the paper's device; what is found goes into the device, and recordings at other frequencies, of the sense signal alone,
+are estimated with the paper's constant phase and with the improved device.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ from scanner.device import Amdm, Device
 from scanner.recording import Recording
 
 CALIBRATION = 31420.0, 31470.0, 31520.0  # Hz, of the recordings that the diagnosis sees
-SWEEP = 31400.0, 31445.0, 31495.0, 31540.0, 31580.0  # Hz, of those it does not
-LENGTH, TEST = 0.004, 0.006  # seconds
+SWEEP = 31400.0, 31440.0, 31500.0, 31540.0  # Hz, of those it does not
+LENGTH, TEST = 0.003, 0.006  # seconds
+DETECTOR_NOISE = 1e-4  # rad, of the bench's position detector
 
 
 def papers_own(true: Device) -> Device:
@@ -42,22 +44,31 @@ def papers_own(true: Device) -> Device:
     return replace(true, axes={"x": replace(axis, readout=replace(readout, lpf_hz=()))})
 
 
-def recorded(true: Device, nominal: Device, frequency: float, duration: float, seed: int) -> tuple[Recording, dict]:  # type: ignore[type-arg]
-    """One recording under a steady drive of 30 V + 30 V sin at ``frequency`` [Hz], and its truth."""
-    return simulate(true, Plan({"x": Sine(frequency, 30.0, 30.0)}, duration), seed=seed, nominal=nominal)
+def driven(frequency: float, duration: float, angles: bool = False) -> Plan:
+    """30 V + 30 V sin at ``frequency`` [Hz], for ``duration`` [s]."""
+    return Plan({"x": Sine(frequency, 30.0, 30.0)}, duration, angles=angles)
+
+
+def on_the_bench(true: Device, nominal: Device, frequency: float, seed: int) -> Recording:
+    """Sense signal and the detector's angle."""
+    recording, _ = simulate(true, driven(frequency, LENGTH, angles=True), seed=seed, nominal=nominal)
+    channels = {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
+    angle, *told = channels["angle_x"]
+    noise = DETECTOR_NOISE * np.random.default_rng(seed).standard_normal(angle.size)
+    return Recording.from_arrays(channels | {"angle_x": (angle + noise, *told)}, nominal)
 
 
 def diagnosed(true: Device, nominal: Device) -> Diagnosis:
-    """What the recordings at the calibration's frequencies, taken together, say is missing."""
-    records = [recorded(true, nominal, f, LENGTH, seed)[0] for seed, f in enumerate(CALIBRATION)]
+    """What the bench's recordings, taken together, say is missing."""
+    records = [on_the_bench(true, nominal, frequency, seed) for seed, frequency in enumerate(CALIBRATION)]
     return diagnose(records, nominal, lambda text: print(text, file=sys.stderr))
 
 
 def phase_over_sweep(true: Device, device: Device, sweep: Sequence[float] = SWEEP) -> NDArray[np.float64]:
     """Mean phase error of the tracker with ``device`` at each drive frequency, shape (len(sweep),) [deg]."""
     errors = []
-    for seed, frequency in enumerate(sweep):
-        recording, told = recorded(true, device, frequency, TEST, 100 + seed)
+    for frequency in sweep:
+        recording, told = simulate(true, driven(frequency, TEST), seed=round(frequency), nominal=device)
         truth = told_truth(told)
         assert truth is not None
         error = axis_error(estimate(recording, device, "tracker").axes["x"], *truth.angles["x"])

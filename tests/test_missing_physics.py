@@ -50,3 +50,15 @@ def test_a_shared_readout_s_terms_are_candidates_once(calibration) -> None:  # t
     assert "x.readout-lag" in keys
     assert "y.readout-lag" not in keys
     assert {"y.cubic-stiffness", "y.feedthrough", "y.channel-delay:angle", "y.comb-offset"} <= set(keys)
+
+
+def test_the_demodulator_s_lag_over_a_sweep_is_no_constant() -> None:
+    example = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "sweep_lag.py"))
+    true = devices.load("chen2020-driven")
+    nominal = example["papers_own"](true)
+    axis = nominal.axis("x")
+    improved = replace(nominal, axes={"x": replace(axis, terms={"demodulator-lag": {"f_c": 40950.0}})})
+    sweep = (31440.0, 31540.0)
+    without, with_term = (example["phase_over_sweep"](true, device, sweep) for device in (nominal, improved))
+    assert np.ptp(without) > 0.1
+    assert np.max(np.abs(with_term)) < 0.03

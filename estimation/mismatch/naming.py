@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -38,6 +38,9 @@ STARTERS = 12
 
 MANY_SAMPLES = 1500
 """From here on only ``STARTERS`` start: over a window so short that it has fewer, all may, and cost little."""
+
+EASE = 5
+"""Windows from the last that the nominal model follows to the first that it does not."""
 
 HOPELESS = 2000.0
 """A fit that is this far behind another's evidence after a few turns is not polished."""
@@ -175,9 +178,14 @@ def _failing(early: Sequence[Fit]) -> int:
     return first
 
 
-def _eased(stops: Sequence[float]) -> list[float]:
-    """Windows after the first of ``stops``, with one in between each: a law is added where a little has gone wrong."""
-    return [stop for low, high in pairwise(stops) for stop in (float(np.sqrt(low * high)), high)]
+def _eased(stops: Sequence[float]) -> Iterator[float]:
+    """Windows after the first of ``stops``, with some in between: a law is added where a little has gone wrong.
+
+    Many on the way to the first window that the nominal model does not follow: anywhere there the law may set in.
+    """
+    for i, (low, high) in enumerate(pairwise(stops)):
+        yield from np.geomspace(low, high, (EASE if i == 0 else 2) + 1)[1:-1].tolist()
+        yield high
 
 
 def _unspoilt(each: Screened, followed: Fit) -> Array:
