@@ -7,6 +7,7 @@ many samples are missing a phase tells only up to whole periods, so nothing is m
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ def leaps(recording: Recording) -> list[Trouble]:
 def longest_stretch(recording: Recording, found: Sequence[Trouble]) -> tuple[float, float]:
     """Begin and end [s] of the longest stretch without a leap."""
     edges = sorted((each.start, each.stop) for each in found)
-    begins = [recording.start, *(max(stop for _, stop in edges[: i + 1]) for i in range(len(edges)))]
+    begins = [recording.start, *accumulate((stop for _, stop in edges), max)]
     ends = [*(start for start, _ in edges), recording.end]
     return max(zip(begins, ends, strict=True), key=lambda stretch: stretch[1] - stretch[0])
 

@@ -189,7 +189,7 @@ def solve(
         if fresh and gain < tolerance and turn > 0:
             break
         # The Jacobian takes nearly all the time: while steps hold what it promises, it need not be known anew.
-        fresh = not KEPT * promised < gain > tolerance
+        fresh = gain <= KEPT * promised or gain <= tolerance
         if fresh:
             turn += 1
             jacobian = comparison.jacobian(model, x, residual, steps, stop)

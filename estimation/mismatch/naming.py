@@ -30,6 +30,9 @@ SHARE_HELD = 0.3
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
 
+PROMISING = 3.0
+"""Fall of -2 log evidence by first order from which a candidate is fitted."""
+
 MUCH = 100.0
 """Fall of -2 log evidence beyond which first order is no judge of candidates."""
 
@@ -74,13 +77,13 @@ def convincing(before: Fit, after: Fit) -> bool:
     return gained > -2.0 * np.sqrt(changed) - 2.0
 
 
-def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate], threshold: float = 3.0) -> list[Fit]:
+def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate]) -> list[Fit]:
     """Fits of the candidates that first order around ``base`` promises anything of, best first.
 
     Free corrections, which cost most, are fitted only where they find something beside the best named term.
     """
     promising = sorted(screen(comparison, base, candidates), key=lambda s: -s.gain)
-    promising = [each for each in promising if each.gain > threshold]
+    promising = [each for each in promising if each.gain > PROMISING]
     return _named_first(promising, lambda part: _finalists(comparison, part))
 
 

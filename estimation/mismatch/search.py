@@ -155,12 +155,9 @@ def _extended(
             say("named terms in the free correction's place")
             comparison, before, found = _by_name(comparison, before, found, named)
         if not _is_free(found):
-            newest = len(found.model.candidates) - len(best.model.candidates)
-            if (
-                found.held_chi2 > TRACKED
-            ):  # the first to be taken imitated all: once the others are there, its place is free
-                newest = len(found.model.candidates)
-            final = settled(comparison, found, named, newest)
+            # The first to be taken may have imitated all: where much is left, its place is open too.
+            kept = len(best.model.candidates) if found.held_chi2 <= TRACKED else 0
+            final = settled(comparison, found, named, len(found.model.candidates) - kept)
             leads = {key: _merged(own, leads.get(key, ())) for key, own in final.leads.items()}
             found = final.fit
         rivals |= leads
