@@ -2,7 +2,8 @@
 
 Each look opens the file anew and takes what is there: HDF5 that another program writes (SWMR), or an instrument's file
 that a reader reads as far as it goes. A frame is reconstructed from its own stretch of the recording and a little
-before it, so that its cost does not grow with the recording; frames that are over before their turn comes are dropped.
+before it, so that its cost does not grow with the recording. Frames are shown in turn; where more than WAITING are
+whole by then, all but the newest are dropped.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from scanner.hdf5 import check_ends
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
-POLL = 0.05  # s between looks
+POLL = 0.05  # s from look to look at the least
+WAITING = 2  # frames that may be whole at once: one that took long delays the next and loses none
 FIRST = 0.01  # s: the stretch in which the scan's repeat is looked for; twice as long each time it is too short
 BEFORE = 30.0  # periods of the slower axis before a frame, in which a motion is found that goes on from the last one
 MOST_TURNS = 4000  # of the slower axis, in which the figure may repeat
@@ -67,7 +69,7 @@ class Live:
 
     Attributes:
         frame_s: length of a frame [s]; NaN as long as it is not known.
-        frames: shown. dropped: not shown, because a newer one was whole by their turn or they could not be tracked.
+        frames: shown. dropped: not shown, because newer ones were whole by their turn or they could not be tracked.
         latency_s: of each frame shown, from its last sample's arrival in the file to its picture's [s].
         ended: why following ended.
     """
@@ -94,7 +96,7 @@ def follow(
     quiet_time: float = 5.0,
     quiet: bool = False,
 ) -> Live:
-    """Show a recording's frames while it is written: the newest whole one as image.tif and image.png in ``output``.
+    """Show a recording's frames while it is written, as image.tif and image.png in ``output``.
 
     It ends when the writer closes the file, when the file's attribute ``finished`` is true, when nothing has come for
     ``quiet_time``, or at an interrupt.
@@ -121,8 +123,9 @@ def follow(
             if np.isnan(live.frame_s) and end - begin >= wanted:
                 live.frame_s, wanted = _first_repeat(recording, options), 2 * (end - begin)
             whole = 0 if np.isnan(live.frame_s) else floor((end - begin) / live.frame_s + 1e-9)
-            if whole > turn:
-                stop = begin + whole * live.frame_s
+            while whole > turn:
+                due = turn + 1 if whole - turn <= WAITING else whole
+                stop = begin + due * live.frame_s
                 try:
                     shown = show(recording, stop - live.frame_s, stop, shown, output, options)
                 except BadInput:  # no motion in this stretch; the next may have one, and the whole will tell
@@ -130,8 +133,8 @@ def follow(
                 else:
                     live.frames += 1
                     live.latency_s.append(time.monotonic() - float(np.interp(stop, *np.array(arrivals).T)))
-                live.dropped += whole - 1 - turn
-                turn = whole
+                live.dropped += due - 1 - turn
+                turn = due
                 bar.update(live.frames - bar.n)
                 late = f", {live.latency_s[-1]:.2f} s late" if live.latency_s else ""
                 bar.set_postfix_str(f"{live.dropped} dropped{late}")
@@ -148,6 +151,7 @@ def looks(path: Path, mapping: Path | None, quiet_time: float) -> Iterator[Look]
     """
     grown, size, writing = time.monotonic(), -np.inf, False
     while True:
+        looked = time.monotonic()
         try:
             recording, still_written = _opened(path, mapping)
         except BadInput:  # not there yet, or caught in the middle of a change
@@ -170,7 +174,7 @@ def looks(path: Path, mapping: Path | None, quiet_time: float) -> Iterator[Look]
         if ended:
             return
         writing = still_written
-        time.sleep(POLL)
+        time.sleep(max(0.0, POLL - (time.monotonic() - looked)))  # none after a frame, whose time was enough
 
 
 def show(

@@ -7,6 +7,7 @@ the field's lower edge belongs to pixel 0, and what lies outside the field is dr
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,9 @@ BLOCK = 256  # samples whose pixels are found before they are added up
 BITS = 18  # of a position's fraction, in an int32
 WIDEST = 1 << 12  # pixels across whose positions do fit
 OUTSIDE = 1 << 29  # beyond every index, an int32 still
+SMALL = ("i1", "u1", "i2", "u2")  # types of which sum and count share a cell of eight bytes
+COUNTED = 24  # bits of a cell for the count, the rest for the sum
+MOST = 1 << (COUNTED - 1)  # samples that no cell overflows with
 
 
 @dataclass(frozen=True)
@@ -134,25 +138,74 @@ def _indices(x, y, values, half_x, half_y, width, height, index):  # type: ignor
 
 
 @numba.njit(cache=True, error_model="numpy")
-def add_block(x, y, values, half_x, half_y, index, sums, counts):  # type: ignore[no-untyped-def]
-    """Add a block of samples to sums and counts; ``index`` is room for as many int32."""
-    height, width = counts.shape
-    flat_sums, flat_counts = sums.reshape(-1), counts.reshape(-1)
+def find_block(x, y, values, half_x, half_y, width, height, index):  # type: ignore[no-untyped-def]
+    """Flat indices of a block's pixels into ``index``, int32; OUTSIDE outside the field and where there is no value."""
     if not _found(x, y, values, half_x, half_y, width, height, index):
         _indices(x, y, values, half_x, half_y, width, height, index)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def add_block(index, values, sums, counts, cells):  # type: ignore[no-untyped-def]
+    """Add a block's values to the pixels that were found: to ``cells``, unless there are none, of ``shared_cells``."""
+    if cells.size:
+        _add_shared(index, values, cells)
+    else:
+        _add(index, values, sums.reshape(-1), counts.reshape(-1))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add(index, values, sums, counts):  # type: ignore[no-untyped-def]
     for i in range(values.size):  # apart from the indices, so that those are found side by side
         if index[i] < OUTSIDE:
             pixel = np.uint32(index[i])
-            flat_counts[pixel] += np.uint32(1)
-            flat_sums[pixel] += values[i]
+            counts[pixel] += np.uint32(1)
+            sums[pixel] += values[i]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_shared(index, values, cells):  # type: ignore[no-untyped-def]
+    """One addition, and one place in memory, for sum and count."""
+    for i in range(values.size):
+        if index[i] < OUTSIDE:
+            cells[np.uint32(index[i])] += (np.int64(values[i]) << np.int64(COUNTED)) + np.int64(1)
+
+
+@numba.njit(cache=True)
+def _emptied(cells, sums, counts):  # type: ignore[no-untyped-def]
+    """Move what cells hold to sums and counts."""
+    for i in range(cells.size):
+        sums[i] += cells[i] >> np.int64(COUNTED)
+        counts[i] += np.uint32(cells[i] & np.int64((1 << COUNTED) - 1))
+        cells[i] = 0
+
+
+def added(
+    kernel: Callable[[slice, NDArray[np.int64]], object],
+    intensity: NDArray[Any],
+    sums: NDArray[np.float64],
+    counts: NDArray[np.uint32],
+) -> None:
+    """Have a kernel add samples, in parts after which what it left in cells for ``add_block`` moves to sums and counts.
+
+    Args:
+        kernel: adds a part of the samples to sums and counts, or to cells if there are any.
+        intensity: shape (n,). Small integers, if they are many, share cells: half of an addition is to fetch its place.
+    """
+    shared = intensity.dtype.str[1:] in SMALL and intensity.size >= counts.size
+    cells = np.zeros(counts.size if shared else 0, np.int64)
+    for first in range(0, intensity.size, MOST):
+        kernel(slice(first, first + MOST), cells)
+        _emptied(cells, sums.reshape(-1), counts.reshape(-1))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _accumulate(theta_x, theta_y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
+def _accumulate(theta_x, theta_y, intensity, half_x, half_y, sums, counts, cells):  # type: ignore[no-untyped-def]
+    height, width = counts.shape
     index = np.empty(BLOCK, np.int32)
     for at in range(0, theta_x.size, BLOCK):
         x, y, values = theta_x[at : at + BLOCK], theta_y[at : at + BLOCK], intensity[at : at + BLOCK]
-        add_block(x, y, values, half_x, half_y, index, sums, counts)
+        find_block(x, y, values, half_x, half_y, width, height, index)
+        add_block(index, values, sums, counts, cells)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -210,8 +263,15 @@ def accumulate(
     counts = np.zeros(shape[:2], np.uint32) if counts is None else counts
     if sums.shape != shape or counts.shape != shape[:2]:
         raise BadInput(f"sums of shape {sums.shape} and counts of {counts.shape} where {shape} is needed")
-    kernel = _accumulate if intensity.ndim == 1 else _accumulate_detectors
-    kernel(theta_x, theta_y, intensity, grid.half_angle_x, grid.half_angle_y, sums, counts)
+    field = grid.half_angle_x, grid.half_angle_y, sums, counts
+    if intensity.ndim == 2:
+        _accumulate_detectors(theta_x, theta_y, intensity, *field)
+    else:
+
+        def kernel(i: slice, cells: NDArray[np.int64]) -> None:
+            _accumulate(theta_x[i], theta_y[i], intensity[i], *field, cells)
+
+        added(kernel, intensity, sums, counts)
     return sums, counts
 
 

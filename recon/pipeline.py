@@ -26,6 +26,7 @@ from recon.slow_mapping import accumulate_slow
 from recon.trouble import Ranges, Trouble, samples, told, troubles, unknown, without
 from recon.undo import placed, with_light
 from scanner.channel import CHANNEL_UNITS, Channel, check_signal
+from scanner.demodulate import plain
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import Motion
@@ -35,7 +36,7 @@ Array = NDArray[np.float64]
 
 AXES = ("x", "y")
 REGISTERED = 200  # periods of the slower axis that are registered at the most: as many as a scan of 60 ms has
-CHUNK = 1 << 20  # samples mapped at a time
+CHUNK = 1 << 22  # samples mapped at a time
 
 
 @dataclass(frozen=True)
@@ -218,22 +219,20 @@ def mapped(
         lost: samples (first, stop) that belong to no pixel. begin, end: samples that are mapped.
     """
     x, y = (motion.axes[axis].angle for axis in AXES)
-    sums = counts = None
-    end = intensity.size if end is None else end
-    for first in range(begin, end, CHUNK):
-        stop = min(first + CHUNK, end)
-        seen = intensity.read(first, stop)
-        if intensity.raw.dtype.kind == "f":
-            seen[np.isinf(seen)] = np.nan  # which is left out
-        for low, high in lost:
-            seen[max(low - first, 0) : max(high - first, 0)] = np.nan
-        if isinstance(x, SlowAngle) and isinstance(y, SlowAngle) and seen.ndim == 1:
-            sums, counts = accumulate_slow(x, y, first, seen, grid, sums, counts)
-        else:
-            sums, counts = accumulate(x.read(first, stop), y.read(first, stop), seen, grid, sums, counts)
-    assert sums is not None
-    assert counts is not None
-    return mean_picture(sums, counts, grid)
+    sums = np.zeros((grid.height, grid.width, *intensity.shape[1:]))
+    counts = np.zeros((grid.height, grid.width), np.uint32)
+    for low, high in without([(begin, intensity.size if end is None else end)], lost):
+        for first in range(low, high, CHUNK):
+            stop = min(first + CHUNK, high)
+            seen = plain(intensity.stored(first, stop))
+            if seen.dtype.kind == "f" and not np.isfinite(seen).all():
+                seen = np.where(np.isinf(seen), np.nan, seen)  # which is left out
+            if isinstance(x, SlowAngle) and isinstance(y, SlowAngle) and seen.ndim == 1:
+                accumulate_slow(x, y, first, seen, grid, sums, counts)
+            else:
+                accumulate(x.read(first, stop), y.read(first, stop), seen, grid, sums, counts)
+    shown = counts if sums.ndim == 2 else counts[..., None]
+    return mean_picture(intensity.gain * sums + intensity.offset * shown, counts, grid)
 
 
 def _visited(motion: Motion, ranges: Ranges, grid: Grid) -> NDArray[np.bool_]:

@@ -1,7 +1,8 @@
 """From slow phase and amplitude straight to the picture: no angle is stored and no sine taken for a sample.
 
-Each segment's angles come from turning phasors (``estimation.tracker.angle``), are turned into pixels side by side, and
-only the adding up is done one at a time. Counts equal those of ``mapping.accumulate`` on the same angles to the sample.
+A segment's places are first told in single precision, eight samples at a time, by turning phasors as
+``estimation.tracker.angle`` does. Where one lies so near a pixel's edge that this could not tell its pixel, the
+segment's angles are made in double precision: counts equal those of ``mapping.accumulate`` on them to the sample.
 """
 
 from __future__ import annotations
@@ -12,20 +13,131 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.tracker.angle import FINE, SEGMENT, SlowAngle, segment_angles
-from recon.mapping import Grid, add_block
+from estimation.tracker.angle import FINE, SEGMENT, SlowAngle, doubled, segment_angles
+from recon.mapping import OUTSIDE, Grid, add_block, added, find_block
 from scanner.errors import BadInput
+
+PLACES = 23  # bits of a place across the field: all that single precision has
+ROUNDED = 5.0  # roundings of half of the last bit in a place, in amplitudes: of phasors, factors and sums
+POWERS = 20.0  # the same for a harmonic, whose phasor is a power of the first one's
+DOUBLINGS = 7
+PART = 1 << DOUBLINGS  # samples whose phasors one table holds
+TOGETHER = 32  # segments added up at a time: what adding takes of the first cache, tables have to be fetched back into
+NEAR = 1e-7  # rad a sample by which a turn may be off its table's
+RAMP = np.arange(PART, dtype=np.float32)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _bits(pixels):  # type: ignore[no-untyped-def]
+    """Bits of a pixel's fraction: as many as leave places across ``pixels`` whole numbers below 2^PLACES."""
+    bits = PLACES
+    while bits > 0 and pixels << bits > 1 << PLACES:
+        bits -= 1
+    return bits
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _tabulated(turn, re, im, table):  # type: ignore[no-untyped-def]
+    """Phasors of PART samples that begin at 1, the same times the sample's number, and their third and fifth powers.
+
+    ``table``: shape (8 PART,), real and imaginary parts in turn, in one array so that nothing has to be told apart
+    before eight samples are taken together.
+    """
+    doubled(turn, re, im)
+    for i in range(PART):
+        c, s = np.float32(re[i]), np.float32(im[i])
+        c2, s2 = c * c - s * s, np.float32(2.0) * c * s
+        c3, s3 = c * c2 - s * s2, c * s2 + s * c2
+        table[i], table[PART + i] = c, s
+        table[2 * PART + i], table[3 * PART + i] = RAMP[i] * c, RAMP[i] * s
+        table[4 * PART + i], table[5 * PART + i] = c3, s3
+        table[6 * PART + i], table[7 * PART + i] = c3 * c2 - s3 * s2, c3 * s2 + s3 * c2
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _placed(axis, s, scale, pixels, kept, re, im, table, out):  # type: ignore[no-untyped-def]
+    """Places of segment ``s`` in units of 2^-bits pixels into ``out``, float32; False where they may be off by a unit.
+
+    As ``angle.segment_angles`` for harmonics 1, 3 and 5. ``axis``: arrays of ``Segments``. ``scale``: units by radian.
+    ``kept``: turn that ``table`` is made for, shape (1,); a turn next to it bends the first harmonic's ramp.
+    """
+    firsts, turns, lines, steps = axis
+    across = float(pixels << _bits(pixels))
+    first, third, fifth, step = lines[s, 0], lines[s, 1], lines[s, 2], steps[s, 0].imag
+    third, fifth = third + 0.5 * SEGMENT * steps[s, 1], fifth + 0.5 * SEGMENT * steps[s, 2]
+    size, harmonics = abs(first.imag) + SEGMENT * abs(step), _size(third) + _size(fifth)
+    if not scale * (ROUNDED * size + POWERS * harmonics) + across < 1 << (PLACES + 2):  # or is not a number
+        return False
+    turn = turns[s]
+    slip = (turn * kept[0].conjugate()).imag
+    if not abs(slip) < NEAR:
+        kept[0], slip = turn, 0.0
+        _tabulated(turn, re, im, table)
+    far = turn
+    for _ in range(DOUBLINGS):
+        far *= far
+    middle, u = np.float32(0.5 * across), firsts[s]
+    for at in range(0, SEGMENT, PART):
+        u2 = u * u
+        one = 1j * scale * (first.imag + at * step) * u
+        three, five = scale * third * u2 * u, scale * fifth * u2 * u2 * u
+        ramp = 1j * (scale * step * u + slip * one)
+        a1, b1, a3, b3 = np.float32(one.real), np.float32(one.imag), np.float32(three.real), np.float32(three.imag)
+        a5, b5 = np.float32(five.real), np.float32(five.imag)
+        ramp_a, ramp_b = np.float32(ramp.real), np.float32(ramp.imag)
+        for i in range(PART):
+            small = ramp_a * table[2 * PART + i] - ramp_b * table[3 * PART + i]
+            small += a3 * table[4 * PART + i] - b3 * table[5 * PART + i]
+            small += a5 * table[6 * PART + i] - b5 * table[7 * PART + i]
+            out[at + i] = middle + (a1 * table[i] - b1 * table[PART + i] + small)
+        u *= far
+    return True
+
+
+@numba.njit(cache=True)
+def _size(z):  # type: ignore[no-untyped-def]
+    """At least the modulus."""
+    return abs(z.real) + abs(z.imag)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _found(x, y, values, width, height, index):  # type: ignore[no-untyped-def]
+    """As ``mapping.find_block``, from places; False where one is within a unit of a pixel's edge."""
+    bits_x, bits_y = np.int32(_bits(width)), np.int32(_bits(height))
+    one, two, stride, nearest = np.int32(1), np.int32(2), np.int32(width), np.int32(2)
+    last_x, last_y = np.int32((width << bits_x) - 1), np.int32((height << bits_y) - 1)
+    fraction_x, fraction_y = np.int32((1 << bits_x) - 1), np.int32((1 << bits_y) - 1)
+    for i in range(values.size):
+        column, row = np.int32(x[i]), np.int32(y[i])
+        beside_x, beside_y = np.int32(np.int32(column + one) & fraction_x), np.int32(np.int32(row + one) & fraction_y)
+        nearest = min(nearest, beside_x, beside_y)
+        beyond = np.int32(np.int32(column | np.int32(last_x - column)) | np.int32(row | np.int32(last_y - row)))
+        inside = (beyond >= 0) & (values[i] == values[i])
+        pixel = np.int32(np.int32(np.int32(row >> bits_y) * stride) + np.int32(column >> bits_x))
+        index[i] = pixel if inside else np.int32(OUTSIDE)
+    return nearest >= two
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _accumulate(x, y, intensity, half_x, half_y, sums, counts):  # type: ignore[no-untyped-def]
-    theta_x, theta_y, re, im = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(FINE), np.empty(FINE)
-    index = np.empty(SEGMENT, np.int32)
-    for s in range(x[0].size):
-        segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, theta_x)
-        segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, theta_y)
-        values = intensity[s * SEGMENT : (s + 1) * SEGMENT]
-        add_block(theta_x, theta_y, values, half_x, half_y, index, sums, counts)
+def _accumulate(x, y, intensity, half_x, half_y, sums, counts, cells):  # type: ignore[no-untyped-def]
+    height, width = counts.shape
+    scale_x, scale_y = 0.5 * (width << _bits(width)) / half_x, 0.5 * (height << _bits(height)) / half_y
+    theta_x, theta_y, index = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(TOGETHER * SEGMENT, np.int32)
+    re, im, part_re, part_im = np.empty(FINE), np.empty(FINE), np.empty(PART), np.empty(PART)
+    place_x, place_y = np.empty(SEGMENT, np.float32), np.empty(SEGMENT, np.float32)
+    table_x, table_y = np.empty(8 * PART, np.float32), np.empty(8 * PART, np.float32)
+    turn_x, turn_y = np.full(1, np.nan + 0j), np.full(1, np.nan + 0j)
+    odd = x[2].shape[1] == 3 and y[2].shape[1] == 3
+    for some in range(0, x[0].size, TOGETHER):
+        for s in range(some, min(some + TOGETHER, x[0].size)):
+            values, own = intensity[s * SEGMENT : (s + 1) * SEGMENT], index[(s - some) * SEGMENT :]
+            told = odd and _placed(x, s, scale_x, width, turn_x, part_re, part_im, table_x, place_x)
+            told = told and _placed(y, s, scale_y, height, turn_y, part_re, part_im, table_y, place_y)
+            if not (told and _found(place_x, place_y, values, width, height, own)):
+                segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, theta_x)
+                segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, theta_y)
+                find_block(theta_x, theta_y, values, half_x, half_y, width, height, own)
+        add_block(index, intensity[some * SEGMENT : (some + TOGETHER) * SEGMENT], sums, counts, cells)
 
 
 def accumulate_slow(
@@ -55,8 +167,17 @@ def accumulate_slow(
         )
     sums = np.zeros((grid.height, grid.width)) if sums is None else sums
     counts = np.zeros((grid.height, grid.width), np.uint32) if counts is None else counts
-    if intensity.size:
-        part = first, first + intensity.size
-        a, b = ((s.first, s.turn, s.lines, s.line_steps) for s in (x.segments(*part), y.segments(*part)))
-        _accumulate(a, b, intensity, grid.half_angle_x, grid.half_angle_y, sums, counts)
+    field = grid.half_angle_x, grid.half_angle_y, sums, counts
+
+    def kernel(part: slice, cells: NDArray[np.int64]) -> None:
+        values = intensity[part]
+        run = first + part.start, first + part.start + values.size
+        _accumulate(_segments(x, run), _segments(y, run), values, *field, cells)
+
+    added(kernel, intensity, sums, counts)
     return sums, counts
+
+
+def _segments(axis: SlowAngle, run: tuple[int, int]) -> tuple[NDArray[np.complex128], ...]:
+    own = axis.segments(*run)
+    return own.first, own.turn, own.lines, own.line_steps

@@ -116,16 +116,11 @@ def _cut(phase, lines):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def segment_angles(first, turn, lines, line_steps, re, im, out):  # type: ignore[no-untyped-def]
-    """Angles of one segment into ``out`` (SEGMENT,) [rad]; ``re``, ``im`` (FINE,) are room for phasors.
-
-    ``lines`` are harmonics 0, 1, 2, ...; three are 1, 3, 5. The amplitude runs straight over the segment, the small
-    harmonics keep the value of its middle. A sample's phasor is one of FINE that start at 1, turned by the one of its
-    stretch of FINE samples.
-    """
+def doubled(turn, re, im):  # type: ignore[no-untyped-def]
+    """Powers of ``turn`` from the 0th on into ``re`` and ``im``, as many as a power of two; returns the next one."""
     re[0], im[0] = 1.0, 0.0
     done, far = 1, turn
-    while done < FINE:  # each step turns all phasors there are at once, and so doubles them
+    while done < re.size:  # each step turns all phasors there are at once, and so doubles them
         a, b = far.real, far.imag
         next_re, next_im = re[done : 2 * done], im[done : 2 * done]
         for i in range(done):
@@ -133,6 +128,18 @@ def segment_angles(first, turn, lines, line_steps, re, im, out):  # type: ignore
             next_re[i], next_im[i] = x * a - y * b, x * b + y * a
         far *= far
         done *= 2
+    return far
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def segment_angles(first, turn, lines, line_steps, re, im, out):  # type: ignore[no-untyped-def]
+    """Angles of one segment into ``out`` (SEGMENT,) [rad]; ``re``, ``im`` (FINE,) are room for phasors.
+
+    ``lines`` are harmonics 0, 1, 2, ...; three are 1, 3, 5. The amplitude runs straight over the segment, the small
+    harmonics keep the value of its middle. A sample's phasor is one of FINE that start at 1, turned by the one of its
+    stretch of FINE samples.
+    """
+    far = doubled(turn, re, im)
     a, b = first.real, first.imag
     for at in range(0, SEGMENT, FINE):
         part = out[at : at + FINE]
