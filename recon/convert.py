@@ -28,7 +28,7 @@ from types import MappingProxyType
 from typing import Any
 
 from recon.readers import read
-from recon.readers.contents import Contents, Variable, clock_of
+from recon.readers.contents import Contents, Variable, clock_of, line_up
 from scanner.channel import Channel, checked_channel
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -185,14 +185,15 @@ def _channel(name: str, said: Mapping[str, Any], contents: Contents, source: Pat
             raise bad(f"says no {key} of variable {said['variable']!r}{because}", f"add {key} = ...; {holds}")
     file = f"{source} by {said_in}"
     return checked_channel(
-        name, variable.raw, unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file
+        name, line_up(variable.raw), unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file
     )
 
 
 def _clock(times: Variable, name: str, bad: Any) -> tuple[float, float]:
-    if not times.is_signal or times.raw.ndim != 1:
+    column = line_up(times.raw)
+    if not times.is_signal or column.ndim != 1:
         raise bad(f"time = {name!r} is no column of numbers", "name the variable that holds the times [s]")
-    rate, start, note = clock_of(times.raw)
+    rate, start, note = clock_of(column)
     if rate is None or start is None:
         raise bad(f"time = {name!r} is no clock: {note}", "cut the file there, or state sample_rate")
     return rate, start

@@ -50,7 +50,7 @@ def test_files_as_instruments_wrote_them(measured_data: Path) -> None:
         "CH3": ("V", 2e9, -3e-7, [-0.16, -0.16]), "CH4": ("V", 2e9, -3e-7, [0.0, 0.0]),
     }  # fmt: skip
     assert stated(folder / "DS2072A-1.csv")["CH2"] == ("V", 2e5, -3.5e-3, [0.008, -0.016])
-    assert stated(folder / "rs_rtp_01.Wfm.csv") == {"column 1": (None, None, None, [-0.031620555, 0.0])}
+    assert stated(folder / "rs_rtp_01.Wfm.csv") == {"column 1": ("V", 8e5, -2.5e-3, [-0.031620555, 0.0])}
     assert stated(folder / "DS1054Z-A.wfm")["CH1"][:2] == ("V", 2.5e8)
     assert stated(folder / "agilent_1.bin")["CH1"][:2] == ("V", 2e6)
     unit, rate, start, _ = stated(folder / "lecroy_3.trc")["CH2"]
@@ -265,6 +265,31 @@ def test_rohde_schwarz_has_its_clock_in_a_second_file(tmp_path: Path) -> None:
     assert stated(path) == {"column 1": (None, None, None, [0.1, 0.2])}
     text(tmp_path / "pulse.csv", "RecordLength:3:\nHardwareXStart:-1.12e-8:\nSignalResolution:2e-11:\n")
     assert stated(path) == {"column 1": (None, 5e10, -1.12e-8, [0.1, 0.2])}
+
+
+@pytest.mark.parametrize(("rows", "start"), [(3, -2e-6), (5, -2.5e-6), (4, None)])
+def test_rohde_schwarz_tells_the_start_by_the_number_of_values(tmp_path: Path, rows: int, start: float | None) -> None:
+    said = {
+        "SignalResolution": "5e-07", "BaseUnit": "eRS_UNIT_LEVEL_V", "XStart": "-2e-06", "RecordLength": "3",
+        "HardwareXStart": "-2.5e-06", "SignalHardwareRecordLength": "5",
+    }  # fmt: skip
+    lines = [f'<Prop Avail="0" Name="{key}" Version="2" Value="{value}" UserValue="7"/>' for key, value in said.items()]
+    path = text(tmp_path / "pulse.Wfm.csv", rows * "0.1\n")
+    text(tmp_path / "pulse.bin", "\n".join(["<Database>", *lines, "</Database>"]))
+    assert stated(path) == {"column 1": ("V", 2e6, start, [0.1, 0.1])}
+
+
+def test_a_row_is_a_channel(tmp_path: Path) -> None:
+    rows = np.arange(7.0)[None, :]
+    np.savez(tmp_path / "a.npz", row=rows)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["row"] = rows
+    for name in ("a.npz", "a.h5"):
+        plan = {"channels": {"sense_x": {"variable": "row", "unit": "V", "time": "row"}}}
+        with convert(tmp_path / name, plan) as recording:
+            assert recording["sense_x"].read().tolist() == list(range(7))
+            assert recording["sense_x"].read(2, 5).tolist() == [2.0, 3.0, 4.0]
+            assert recording["sense_x"].sample_rate == 1.0
 
 
 @pytest.mark.parametrize(

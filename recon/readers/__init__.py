@@ -72,5 +72,5 @@ def read(path: Path, name: str | None = None) -> Contents:
     contents = READERS[name](path)
     if not contents.variables:
         contents.close()
-        raise BadInput(f"is {contents.kind} with nothing in it", file=path, hint="record or export it again")
+        raise BadInput(f"is read as {contents.kind}, with nothing in it", file=path, hint="record or export it again")
     return contents

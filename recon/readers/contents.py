@@ -90,6 +90,13 @@ class Lazy:
         return self.fetch(first, max(first, stop))
 
 
+def line_up(raw: Samples) -> Samples:
+    """Samples in one row, shape (1, n), one after the other, shape (n,); others as they are."""
+    if raw.ndim != 2 or raw.shape[0] != 1:
+        return raw
+    return Lazy(raw.shape[1:], raw.dtype, lambda first, stop: raw[0:1][0, first:stop])
+
+
 def spelled(unit: str) -> str | None:
     """A unit as a recording spells it, itself where it stands in no list; None for nothing."""
     return UNITS.get(unit.strip().lower(), unit.strip()) or None

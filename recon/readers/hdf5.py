@@ -34,7 +34,7 @@ def read_hdf5(path: Path) -> Contents:
 
 
 def vector(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """MATLAB's vector, a matrix of one row or column, as one dimension; other shapes as they are."""
+    """A matrix of one row or column, as MATLAB stores a vector, as one dimension; other shapes as they are."""
     return (prod(shape),) if len(shape) == 2 and 1 in shape else shape
 
 
@@ -50,9 +50,9 @@ def _datasets(group: h5py.Group, depth: int = DEEPEST) -> Iterator[tuple[str, h5
 
 
 def _samples(path: Path, dataset: h5py.Dataset, matlab: bool) -> Lazy:
-    """A dataset; MATLAB counts its dimensions the other way round, and has vectors as matrices."""
+    """A dataset; MATLAB counts its dimensions the other way round."""
     stored: tuple[int, ...] = dataset.shape or ()
-    shape = vector(stored[::-1]) if matlab else stored
+    shape = vector(stored[::-1] if matlab else stored)
     text = matlab and attributes(dataset).get("MATLAB_class") == "char"
 
     def fetch(first: int, stop: int) -> NDArray[Any]:

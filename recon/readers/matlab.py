@@ -76,7 +76,3 @@ def _load(path: Path, name: str) -> NDArray[Any]:
     if name not in content:
         raise BadInput("cannot be read", file=path, channel=name, hint="copy or save the file again")
     return content[name]
-
-
-def _vector(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (prod(shape),) if len(shape) == 2 and 1 in shape else shape

@@ -39,7 +39,8 @@ def read_scope(path: Path) -> Contents:
     except MemoryError:
         raise
     except Exception as error:  # the parsers stumble in as many ways as a file can be damaged
-        what = f"is not a whole file of a known oscilloscope: {error or type(error).__name__}"
+        said = str(error).replace(f"{path.parent}/", "") or type(error).__name__
+        what = f"is not a whole file of a known oscilloscope: {said}"
         raise BadInput(what, file=path, hint="copy it again, or save it as CSV") from None
     if not variables:
         raise BadInput("holds no analog channel", file=path, hint="record or export it again")

@@ -5,7 +5,8 @@ Each puts names, units and clock into other places of the lines above the number
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -17,6 +18,9 @@ from recon.readers.table import Array, fields_of, is_numeric, lines_of, number_b
 from scanner.errors import BadInput
 
 MOST_HEADER_LINES = 200
+HEADER_BYTES = 1 << 16
+LEVELS = {"eRS_UNIT_LEVEL_V": "V", "eRS_UNIT_LEVEL_A": "A"}
+_PROPERTY = re.compile(r'<Prop [^>]*?\bName="(\w+)"[^>]*? Value="([^"]*)"')
 SECONDS = ("s", "sec", "second", "seconds")
 
 
@@ -29,6 +33,7 @@ class Layout:
         names, units: of the columns. columns: their places in a line. first: lines before the table.
         times: which column holds times [s]. index: which counts samples.
         rate, start: as the header states them [Hz], [s].
+        starts: the start [s] of a table of so many rows, where the header says it so.
         about: what else the header states.
     """
 
@@ -42,6 +47,7 @@ class Layout:
     rate: float | None = None
     start: float | None = None
     about: dict[str, str] = field(default_factory=dict)
+    starts: Mapping[int, float] = field(default_factory=dict)
 
 
 def read_csv(path: Path) -> Contents:
@@ -71,7 +77,7 @@ def read_csv(path: Path) -> Contents:
 
 
 def _variables(layout: Layout, table: Array) -> dict[str, Variable]:
-    rate, start, note = layout.rate, layout.start, ""
+    rate, start, note = layout.rate, layout.starts.get(len(table), layout.start), ""
     if layout.times is not None:
         told, start, note = clock_of(table[:, layout.times])
         rate = None if told is None else rate or told
@@ -151,16 +157,39 @@ def _tektronix_beside(head: list[str]) -> Layout:
 
 
 def _rohde_schwarz(path: Path, width: int) -> Layout:
-    """``NAME.Wfm.csv`` holds values only; the clock stands in ``NAME.csv`` beside it, as ``key:value:``."""
-    beside = path.with_name(path.name[: -len(".Wfm.csv")] + ".csv") if path.name.lower().endswith(".wfm.csv") else path
-    said = {}
-    if beside != path and beside.is_file():
-        pairs = (line.split(":", 2) for line in islice(lines_of(beside), MOST_HEADER_LINES))
-        said = {pair[0]: pair[1] for pair in pairs if len(pair) > 1}
+    """``NAME.Wfm.csv`` holds values only; unit and clock stand in ``NAME.csv`` beside it, or in ``NAME.bin``.
+
+    The values are either those on the screen or all that were recorded, which their number tells.
+    """
+    said = _beside(path)
     rate = rate_of(number_of(said.get("SignalResolution", "")))
-    start = _finite(number_of(said.get("HardwareXStart", "")))
+    screen, all_of_it = (_finite(number_of(said.get(key, ""))) for key in ("XStart", "HardwareXStart"))
+    starts = {
+        int(rows): start
+        for rows, start in ((said.get("RecordLength"), screen), (said.get("SignalHardwareRecordLength"), all_of_it))
+        if rows and rows.isdecimal() and len(rows) < 20 and start is not None
+    }
+    unit = LEVELS.get(said.get("BaseUnit", ""), "")
     kind = "Rohde & Schwarz CSV" if said else "CSV without a header"
-    return Layout(kind, [""] * width, [""] * width, range(width), 0, rate=rate, start=start)
+    return Layout(
+        kind, [""] * width, [unit] * width, range(width), 0, rate=rate, start=None if starts else all_of_it,
+        starts=starts,
+    )  # fmt: skip
+
+
+def _beside(path: Path) -> dict[str, str]:
+    """What the header beside ``NAME.Wfm.csv`` states: ``key:value:`` in NAME.csv, else XML in NAME.bin."""
+    if not path.name.lower().endswith(".wfm.csv"):
+        return {}
+    name = path.name[: -len(".Wfm.csv")]
+    text, xml = path.with_name(f"{name}.csv"), path.with_name(f"{name}.bin")
+    if text.is_file():
+        pairs = (line.split(":", 2) for line in islice(lines_of(text), MOST_HEADER_LINES))
+        return {pair[0]: pair[1] for pair in pairs if len(pair) > 1}
+    if xml.is_file():
+        with xml.open("rb") as file:
+            return dict(_PROPERTY.findall(file.read(HEADER_BYTES).decode(errors="replace")))
+    return {}
 
 
 def _finite(number: float | None) -> float | None:
