@@ -116,7 +116,8 @@ def draw(pictures: dict[str, Picture], gratings: dict[str, Grating], output: Pat
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, panels = plt.subplots(1, 4, figsize=(21, 5.4), layout="constrained")
+    figure, grid_of_panels = plt.subplots(2, 2, figsize=(6.6, 6.4), layout="constrained")
+    panels = grid_of_panels.ravel()
     for panel, (name, picture) in zip(panels, pictures.items(), strict=False):
         grid = picture.grid
         extent = (-grid.half_angle_x, grid.half_angle_x, -grid.half_angle_y, grid.half_angle_y)
@@ -127,7 +128,7 @@ def draw(pictures: dict[str, Picture], gratings: dict[str, Grating], output: Pat
         panels[3].plot(gratings[name].along, 1e3 * gratings[name].stray, "o-", label=name)
     panels[3].set(title="Stray of the lines", xlabel="along the lines (µm)", ylabel="off straight (nm)")
     panels[3].legend()
-    figure.savefig(output, dpi=100)
+    figure.savefig(output, dpi=160)
     plt.close(figure)
 
 

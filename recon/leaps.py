@@ -7,16 +7,17 @@ many samples are missing a phase tells only up to whole periods, so nothing is m
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.reference import dominant_frequency
+from recon.mapping import Grid, accumulate
 from recon.trouble import Trouble, runs
 from scanner.channel import Channel
 from scanner.demodulate import block_length, block_phasors
 from scanner.errors import BadInput
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 Array = NDArray[np.float64]
@@ -52,10 +53,54 @@ def leaps(recording: Recording) -> list[Trouble]:
 
 def longest_stretch(recording: Recording, found: Sequence[Trouble]) -> tuple[float, float]:
     """Begin and end [s] of the longest stretch without a leap."""
-    edges = sorted((each.start, each.stop) for each in found)
-    begins = [recording.start, *accumulate((stop for _, stop in edges), max)]
-    ends = [*(start for start, _ in edges), recording.end]
+    edges = apart(found)
+    begins, ends = [recording.start, *(stop for _, stop in edges)], [*(start for start, _ in edges), recording.end]
     return max(zip(begins, ends, strict=True), key=lambda stretch: stretch[1] - stretch[0])
+
+
+def apart(found: Sequence[Trouble]) -> list[tuple[float, float]]:
+    """Their stretches [s], increasing, those that overlap as one: drive and sense show one leap each in their way."""
+    edges: list[tuple[float, float]] = []
+    for start, stop in sorted((each.start, each.stop) for each in found):
+        if edges and start <= edges[-1][1]:
+            edges[-1] = edges[-1][0], max(stop, edges[-1][1])
+        else:
+            edges.append((start, stop))
+    return edges
+
+
+def passed(motion: Motion, found: Sequence[Trouble], begin: float, end: float, grid: Grid) -> NDArray[np.bool_]:
+    """Pixels that the beam would have passed during the leaps beside a stretch, had it gone on as at the stretch's ends.
+
+    Args:
+        motion: of the beam from ``begin`` to ``end`` [s].
+
+    Returns:
+        Shape (height, width).
+    """
+    counts = np.zeros((grid.height, grid.width), np.uint32)
+    rate = motion.axes["x"].angle.sample_rate
+    for start, stop in apart(found):
+        if begin in (start, stop) or end in (start, stop):
+            time = np.arange(start, stop, 1 / rate)
+            x, y = (_continued(motion.axes[name], time) for name in ("x", "y"))
+            accumulate(x, y, np.zeros(time.size), grid, counts=counts)
+    return counts > 0
+
+
+def _continued(axis: AxisMotion, time: Array) -> Array:
+    """Angles [rad] before a motion's first sample or behind its last one, by the sine of the CYCLES next to it."""
+    track, late = axis.angle, time[0] > axis.angle.start
+    turn = 2 * np.pi * axis.frequency[-1 if late else 0]
+    count = min(track.size, round(CYCLES * 2 * np.pi / turn * track.sample_rate))
+    first = track.size - count if late else 0
+
+    def sine(at: Array) -> Array:
+        return np.stack([np.ones_like(at), np.cos(turn * at), np.sin(turn * at)], -1)
+
+    near = track.start + np.arange(first, first + count) / track.sample_rate
+    law = np.linalg.lstsq(sine(near - near[0]), track.read(first, first + count), rcond=None)[0]
+    return np.asarray(sine(time - near[0]) @ law, np.float64)
 
 
 def _leaps(channel: Channel, frequency: float, least: float) -> Iterator[Trouble]:

@@ -17,7 +17,7 @@ from estimation.estimate import default_estimator, estimate
 from estimation.signals import device_of
 from estimation.tracker.angle import SlowAngle
 from recon import blur
-from recon.leaps import leaps, longest_stretch
+from recon.leaps import leaps, longest_stretch, passed
 from recon.mapping import Grid, Picture, accumulate, mean_picture
 from recon.picture_phase import refined
 from recon.registration import PhaseError, registered, slow_period
@@ -143,7 +143,7 @@ def reconstruct(
         lost = samples(unknown(motion, trouble), intensity)
         picture = mapped(beam, intensity, grid, lost)
         touched = samples(((each.start, each.stop) for each in trouble), intensity)
-        affected = _visited(beam, without(touched, lost), grid)
+        affected = _visited(beam, without(touched, lost), grid) | passed(beam, jumped, begin, end, grid)
         if not picture.coverage.any():
             raise DeviceInvalid(
                 "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"

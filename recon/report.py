@@ -184,7 +184,7 @@ def phase_figures(results: Mapping[str, Reconstruction]) -> list[Figure]:
         motions = {name: result.motion.axes[axis] for name, result in results.items()}
         errors = {name: result.errors[axis] for name, result in results.items() if axis in result.errors}
         seen = [(each.time, *getattr(each, axis)) for each in first.seen] if len(results) == 1 else []
-        uri = views.phase_figure(motions, first.bound(axis), errors, seen, f"axis {axis}")
+        uri = views.phase_figure(motions, first.bound(axis), errors, seen, axis)
         figures.append(Figure(uri, f"phase of axis {axis}, ±2 sd; its error and the bound ±p/m"))
     return figures
 

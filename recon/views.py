@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 UNVISITED = "#20405f"  # pixels the beam never reached; no grey of a picture
 MARK = "#e08a1e"  # pixels that a stretch of trouble touched
 FILL_FOR_THE_EYE = 2  # pixels
+NARROW = 4.6  # in: on a phone's screen its letters can be read still
+LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}
 COLOURS = ("#2f6fb0", "#c8553d", "#3d8f5f", "#8a5fb0", "#b08a2f")
 
 
@@ -111,16 +113,16 @@ def phase_figure(
     bound: float,
     errors: Mapping[str, AxisError],
     seen: Sequence[tuple[float, float, float]] = (),
-    title: str = "",
+    name_of_axis: str = "the axis",
 ) -> str:
     """Phase of one axis against time with its ±2 sd band, and below, where truth or picture tell one, its error.
 
     Args:
-        motions: by the name to show. bound: p/m [rad]. errors: by the same names.
+        motions: of the axis, by the name to show. bound: p/m [rad]. errors: by the same names.
         seen: (time, value, sd) of the phase error that the picture shows [s, rad, rad].
     """
     lower = bool(errors) or bool(seen)
-    drawing, axes = figure(2 if lower else 1, 1, (7.0, 5.0 if lower else 2.8))
+    drawing, axes = figure(2 if lower else 1, 1, (NARROW, 4.4 if lower else 2.4))
     top = axes[0, 0]
     for (name, axis), colour in zip(motions.items(), COLOURS, strict=False):
         t, phase = 1e3 * axis.time, np.degrees(axis.phase)
@@ -128,8 +130,8 @@ def phase_figure(
         sd = np.degrees(axis.phase_sd)
         top.fill_between(t, phase - 2 * sd, phase + 2 * sd, color=colour, alpha=0.2, lw=0)
         top.plot(t, phase, color=colour, lw=1.2, label=name)
-    top.set(ylabel="phase [°]", title=title)
-    top.legend(frameon=False, fontsize=8)
+    top.set(ylabel=f"phase of {name_of_axis} [°]")
+    top.legend(**LEGEND, ncols=2)
     if lower:
         bottom = axes[1, 0]
         largest = np.degrees(bound)
@@ -143,14 +145,14 @@ def phase_figure(
                 1e3 * t, np.degrees(value), 2 * np.degrees(sd), fmt="o", ms=3, color="#444", label="seen in the picture"
             )
         bottom.set(ylabel="phase error [°]")
-        bottom.legend(frameon=False, fontsize=8, ncols=3)
+        bottom.legend(**LEGEND, ncols=2)
     axes[-1, 0].set_xlabel("time [ms]")
     return figure_uri(drawing)
 
 
 def blur_figure(parts: Mapping[str, Mapping[str, float]], p: float) -> str:
     """Blur by cause [px], a group of bars for each entry of ``parts``, with the tolerated p."""
-    drawing, axes = figure(size=(7.0, 2.6))
+    drawing, axes = figure(size=(NARROW, 2.4))
     own = axes[0, 0]
     causes = list(next(iter(parts.values())))
     width = 0.8 / len(parts)

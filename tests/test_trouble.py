@@ -16,6 +16,7 @@ from worlds import imaging, separate_electrodes
 
 from recon.cli import main
 from recon.leaps import leaps
+from recon.mapping import map_samples
 from recon.pipeline import Options, Reconstruction, reconstruct
 from recon.score import told_truth
 from recon.trouble import Trouble, samples, troubles, without
@@ -163,10 +164,18 @@ def test_the_longest_stretch_between_leaps_is_reconstructed(whole: Reconstructio
     assert any("leaps as where samples were lost" in note for note in result.notes)
     x, y = (result.motion.axes[axis].angle.read() for axis in "xy")
     at = round(result.motion.axes["x"].angle.start * RATE) + lost  # where these samples were in the whole scan
+    turned = {}
     for angle, axis in ((x, "x"), (y, "y")):
         same = whole.motion.axes[axis].angle.read()[at : at + angle.size]
         error = angle - np.sign(angle @ same) * same  # an even capacitance does not know the sign
         assert np.sqrt(np.mean(error**2)) < 2e-3 * np.abs(angle).max()
+        turned[axis] = bool(angle @ same < 0)
+    own = [whole.motion.axes[axis].turned() if turned[axis] else whole.motion.axes[axis] for axis in "xy"]
+    since = [axis.angle.read(first + lost, at) for axis in own]  # from the loss to what is used
+    there = map_samples(*since, np.zeros(since[0].size), result.picture.grid).coverage > 0
+    assert 0.2 < there.mean() < 0.9
+    assert result.affected[there].mean() > 0.95  # a pixel more or less at the path's side
+    assert result.affected.mean() < 0.7
 
 
 def test_the_folder_and_the_summary_say_so(tmp_path: Path) -> None:
