@@ -69,20 +69,18 @@ def apart(found: Sequence[Trouble]) -> list[tuple[float, float]]:
     return edges
 
 
-def passed(motion: Motion, found: Sequence[Trouble], begin: float, end: float, grid: Grid) -> NDArray[np.bool_]:
-    """Pixels that the beam would have passed during the leaps beside a stretch, had it gone on as at the stretch's ends.
-
-    Args:
-        motion: of the beam from ``begin`` to ``end`` [s].
+def passed(motion: Motion, found: Sequence[Trouble], grid: Grid) -> NDArray[np.bool_]:
+    """Pixels that the beam would have passed during the leaps beside its motion, had it gone on as at those ends.
 
     Returns:
         Shape (height, width).
     """
     counts = np.zeros((grid.height, grid.width), np.uint32)
-    rate = motion.axes["x"].angle.sample_rate
+    track = motion.axes["x"].angle
+    begin, end = track.start, track.start + track.size / track.sample_rate
     for start, stop in apart(found):
-        if begin in (start, stop) or end in (start, stop):
-            time = np.arange(start, stop, 1 / rate)
+        if min(abs(stop - begin), abs(start - end)) < 0.5 * (stop - start):
+            time = np.arange(start, stop, 1 / track.sample_rate)
             x, y = (_continued(motion.axes[name], time) for name in ("x", "y"))
             accumulate(x, y, np.zeros(time.size), grid, counts=counts)
     return counts > 0

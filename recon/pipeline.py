@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from estimation.signals import device_of
 from estimation.tracker.angle import SlowAngle
 from recon import blur
 from recon.leaps import leaps, longest_stretch, passed
+from recon.lost_light import apart, lost_light, on_time, put_back, torn
 from recon.mapping import Grid, Picture, accumulate, mean_picture
 from recon.picture_phase import refined
 from recon.registration import PhaseError, registered, slow_period
@@ -120,14 +121,66 @@ def reconstruct(
         BadInput: the recording or the device does not serve.
     """
     began = time.perf_counter()
+    check_signal(recording.require("intensity", "a picture needs it"), gaps_ok=True)
+    device = device_of(recording, Device.load(options.device) if options.device else None)
+    jumped = leaps(recording)
+    begin, end = longest_stretch(recording, jumped)
+    if jumped:
+        recording = recording.slice(begin, end)
+
+    def once(recording: Recording) -> Reconstruction:
+        return _reconstruct(recording, device, options, truth, quiet, jumped)
+
+    result = _put_right(once, recording, once(recording))
+    if jumped:
+        cut = (
+            f"a phase leaps as where samples were lost: {begin:.6g} s to {end:.6g} s are used, the longest stretch "
+            "between leaps; cut the recording there to see the rest"
+        )
+        result = replace(result, notes=[*result.notes, cut])
+    return replace(result, seconds=time.perf_counter() - began)
+
+
+def _put_right(
+    once: Callable[[Recording], Reconstruction], recording: Recording, result: Reconstruction
+) -> Reconstruction:
+    """``result``; where the picture shows that samples of the intensity were lost, once more with room for them."""
+    if len(_windows(result.motion, result.intensity)) > 1:  # slices with stretches between them that no one looked at
+        return result
+    channel, slices = recording["intensity"], len(result.seen)
+    mapping = result.motion, result.intensity, result.picture.grid
+    if on_time(result.seen, result.motion).all():
+        return result
+    torn_at = torn(apart(*mapping, slices), result.motion)
+    if torn_at is None:
+        return result
+    loss = lost_light(*mapping, slices, torn_at)
+    again = None if loss is None else once(put_back(recording, loss))
+    if loss is None or again is None or not on_time(again.seen, again.motion).all():
+        when = channel.start + torn_at * channel.size / slices / channel.sample_rate
+        doubt = (
+            f"from about {when:.4g} s on forward and backward sweeps agree no more: the phase drifted away, samples of "
+            "the intensity were lost, or the sample changed"
+        )
+        return replace(result, notes=[*result.notes, doubt])
+    start, stop = (channel.start + at / channel.sample_rate for at in (loss.first, loss.stop))
+    what = f"{loss.missing} samples lost" if loss.missing > 0 else f"{-loss.missing} samples too many"
+    note = f"intensity: {what} at {start:.6g} s, as the picture shows; what comes later was put back in time"
+    leap = Trouble("intensity", "leap", start, stop)
+    return replace(again, trouble=[*again.trouble, leap], notes=[*again.notes, note])
+
+
+def _reconstruct(
+    recording: Recording,
+    device: Device,
+    options: Options,
+    truth: Truth | None,
+    quiet: bool,
+    jumped: Sequence[Trouble],
+) -> Reconstruction:
+    """:func:`reconstruct` of a stretch between leaps of the phase."""
+    began = time.perf_counter()
     with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=quiet or None) as progress:
-        intensity = recording.require("intensity", "a picture needs it")
-        check_signal(intensity, gaps_ok=True)
-        device = device_of(recording, Device.load(options.device) if options.device else None)
-        jumped = leaps(recording)
-        begin, end = longest_stretch(recording, jumped)
-        if jumped:
-            recording = recording.slice(begin, end)
         recording = with_light(recording, device)
         intensity = recording["intensity"]
         for axis in AXES:
@@ -143,7 +196,7 @@ def reconstruct(
         lost = samples(unknown(motion, trouble), intensity)
         picture = mapped(beam, intensity, grid, lost)
         touched = samples(((each.start, each.stop) for each in trouble), intensity)
-        affected = _visited(beam, without(touched, lost), grid) | passed(beam, jumped, begin, end, grid)
+        affected = _visited(beam, without(touched, lost), grid) | passed(beam, jumped, grid)
         if not picture.coverage.any():
             raise DeviceInvalid(
                 "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"
@@ -160,11 +213,6 @@ def reconstruct(
         if motion.axes[axis].sign == "ambiguous":
             notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
     notes += told(trouble)
-    if jumped:
-        notes.append(
-            f"a phase leaps as where samples were lost: {begin:.6g} s to {end:.6g} s are used, the longest stretch "
-            "between leaps; cut the recording there to see the rest"
-        )
     return Reconstruction(
         motion=motion,
         picture=picture,

@@ -16,8 +16,10 @@ from worlds import imaging, separate_electrodes
 
 from recon.cli import main
 from recon.leaps import leaps
+from recon.lost_light import delays, torn
 from recon.mapping import map_samples
 from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.registration import Estimate, PhaseError
 from recon.score import told_truth
 from recon.trouble import Trouble, samples, troubles, without
 from scanner.recording import Recording
@@ -176,6 +178,50 @@ def test_the_longest_stretch_between_leaps_is_reconstructed(whole: Reconstructio
     assert 0.2 < there.mean() < 0.9
     assert result.affected[there].mean() > 0.95  # a pixel more or less at the path's side
     assert result.affected.mean() < 0.7
+
+
+@pytest.mark.parametrize("missing", [2, 300, -50])
+def test_samples_lost_from_the_intensity_alone_are_found_and_put_back(whole: Reconstruction, missing: int) -> None:
+    at = 45_000
+    light = values("intensity")
+    torn_light = np.r_[light[:at], light[at + missing :]]  # below 0: samples that come twice
+    result = of(damaged(intensity=torn_light))
+    (leap,) = (each for each in result.trouble if each.kind == "leap")
+    assert leap.channel == "intensity"
+    assert leap.start * RATE - 300 < at < leap.stop * RATE + 300
+    count = f"{missing} samples lost" if missing > 0 else f"{-missing} samples too many"
+    assert any(f"intensity: {count} at" in note for note in result.notes)
+    assert 0 < result.affected.mean() < 0.3
+    both = (result.picture.coverage > 0) & (whole.picture.coverage > 0) & ~result.affected
+    assert np.mean(result.picture.image[both] == whole.picture.image[both]) > 0.99
+    assert both.mean() > 0.6 * (whole.picture.coverage > 0).mean()
+
+
+def test_a_sample_that_changed_is_no_loss(whole: Reconstruction) -> None:
+    light = values("intensity")
+    light[40_000:] = np.random.default_rng(0).permutation(light[40_000:])
+    result = of(damaged(intensity=light))
+    assert result.trouble == []
+    assert any("sweeps agree no more" in note for note in result.notes)
+    assert not any("sweeps agree no more" in note for note in whole.notes)
+
+
+def test_only_what_tears_at_once_and_stays_torn_is_a_loss(whole: Reconstruction) -> None:
+    turn = {axis: 2 * np.pi * np.median(whole.motion.axes[axis].frequency) / RATE for axis in "xy"}
+
+    def seen(samples: Sequence[float], sd: float = 0.02) -> list[PhaseError]:
+        return [
+            PhaseError(float(i), *(Estimate(each * turn[axis], sd * turn[axis]) for axis in "xy"))
+            for i, each in enumerate(samples)
+        ]
+
+    np.testing.assert_allclose(delays(seen([0.0, 3.0]), whole.motion), [0.0, 3.0])
+    assert torn(seen([0.1, -0.1, 3.0, 3.0]), whole.motion) == 2
+    assert torn(seen([0.0, 3.0, np.nan], np.inf), whole.motion) is None  # nothing told from the first slice on
+    assert torn(seen([0.0, 0.0, 0.0, 0.0]), whole.motion) is None
+    assert torn(seen([0.0, 3.0, 0.0, 0.0]), whole.motion) is None
+    assert torn(seen([2.0, 2.0, 2.0]), whole.motion) is None  # a delay from the beginning on
+    assert torn(seen([0.0, 0.0, 3.0]), whole.motion) is None  # no whole slice behind it
 
 
 def test_the_folder_and_the_summary_say_so(tmp_path: Path) -> None:
