@@ -49,7 +49,7 @@ def delays(seen: Sequence[PhaseError], motion: Motion) -> Array:
     rate = motion.axes["x"].angle.sample_rate
     told = np.array([[getattr(each, axis) for axis in AXES] for each in seen])  # (slices, axes, value and sd)
     turn = 2 * np.pi * np.array([np.median(motion.axes[axis].frequency) for axis in AXES]) / rate
-    weight = (turn / told[..., 1]) ** 2
+    weight = (turn / np.maximum(told[..., 1], 1e-9)) ** 2  # a picture without noise may leave nothing in doubt
     value = np.where(weight > 0, told[..., 0], 0.0) / turn
     total = weight.sum(1)
     return np.divide((weight * value).sum(1), total, out=np.full(len(seen), np.nan), where=total > 0)
@@ -88,6 +88,7 @@ def lost_light(beam: Motion, intensity: Channel, grid: Grid, slices: int, first:
     begin, end = edges[first + 1], (edges[first + 1] + edges[first + 2]) // 2  # half a slice: room for delays behind
     light = intensity.read(0, end)
     light = light if light.ndim == 1 else light.mean(axis=1)
+    light[~np.isfinite(light)] = np.nan
     reach = math.ceil(PERIODS * slow_period(beam) * intensity.sample_rate)
     x, y = (beam.axes[axis].angle.read(0, end + reach) for axis in AXES)
     sure = slice(0, edges[first])
