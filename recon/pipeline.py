@@ -164,7 +164,8 @@ def _put_right(
         )
         return replace(result, notes=[*result.notes, doubt])
     start, stop = (channel.start + at / channel.sample_rate for at in (loss.first, loss.stop))
-    what = f"{loss.missing} samples lost" if loss.missing > 0 else f"{-loss.missing} samples too many"
+    number = f"{abs(loss.missing)} sample{'s' if abs(loss.missing) > 1 else ''}"
+    what = f"{number} lost" if loss.missing > 0 else f"{number} too many"
     note = f"intensity: {what} at {start:.6g} s, as the picture shows; what comes later was put back in time"
     leap = Trouble("intensity", "leap", start, stop)
     return replace(again, trouble=[*again.trouble, leap], notes=[*again.notes, note])

@@ -26,7 +26,8 @@ class Trouble:
 
     Attributes:
         kind: ``"gap"`` (samples that are not finite), ``"clipped"``, ``"missing"`` (the channel begins later or ends
-            earlier than the intensity), or ``"leap"`` (see :mod:`recon.leaps`).
+            earlier than the intensity), or ``"leap"`` (see :mod:`recon.leaps`; of the intensity,
+            :mod:`recon.lost_light`).
     """
 
     channel: str
