@@ -27,7 +27,7 @@ LOST = (0.5, 0.3)  # sd of phase [rad] and ln A beyond which the block itself te
 SIGNIFICANT = 6.0  # standard deviations that a line must have to be taken for a motion
 MISFIT = 4.0  # mean squared innovation beyond which the motion itself must have jumped
 BROKEN = 100.0  # beyond which it is looked for anew
-NONLINEAR = 2e-3  # step of phase [rad], ln A or anything else after which a block is linearised anew
+NONLINEAR = 2e-3  # step of phase [rad], ln A or anything else, see _change, after which a block is linearised anew
 OPEN = (0.02, 3.0)  # sd of the stiffness and its trend [1/s] that a jump may at most give them
 
 
@@ -196,10 +196,20 @@ def _measured(laws, signal, k, before, P_before, noise):  # type: ignore[no-unty
         x, P = before.copy(), P_before.copy()
         values, jacobian = expected(laws, signal, k, about)
         here = _update(signal, k, x, P, about, values, jacobian, noise)
-        if np.abs(x - about).max() < NONLINEAR:
+        if _change(x, about, signal.step) < NONLINEAR:
             break
         about = bounded(laws, signal, x)
     return x, P, here
+
+
+@njit(cache=True)
+def _change(x, about, step):  # type: ignore[no-untyped-def]
+    """Largest change of a state; a trend's by what it makes of the stiffness over a block of ``step`` seconds."""
+    most = 0.0
+    for i in range(x.size):
+        change = abs(x[i] - about[i])
+        most = max(most, change * step if i % STATES == TREND else change)
+    return most
 
 
 @njit(cache=True, error_model="numpy")
