@@ -237,9 +237,9 @@ def reference(path: Path) -> Array:
 
 
 def passed(channel: str, signal: Array, paths: Sequence[Path], readout: Readout | None) -> Array:
-    """``signal`` after the terms that act on ``channel``, in the order of their stages."""
+    """``signal`` after the terms that act on ``channel``, in the order of their stages, those of its output last."""
     acting = [(each, path) for path in paths for each in path.added]
-    for each, path in sorted(acting, key=lambda pair: STAGES.index(pair[0].term.stage)):
+    for each, path in sorted(acting, key=lambda pair: (pair[0].term.at_output, STAGES.index(pair[0].term.stage))):
         kind, _, variant = each.channel.partition(":")
         if kind == channel:
             signal = each.term.passed(signal, each.values, _view(path, readout, variant))

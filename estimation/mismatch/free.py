@@ -25,11 +25,17 @@ POWERS = tuple((i, n - i) for n in range(2, DEGREE + 1) for i in range(n, -1, -1
 """Powers of angle and rate in the free force, in the order of its coefficients."""
 
 WAVES = 3
-"""Cosines over the recording's length by which stiffness and damping may move."""
+"""Cosines over the recording's length by which stiffness and damping may move beside a force over the state."""
+
+STIFFNESSES, DAMPINGS = 20, 8
+"""Cosines over the recording's length of stiffness and damping where nothing else of the mechanics is free."""
 
 OFFSETS, GAINS, DELAYS = 6, 28, 20
 """Cosines over the recording's length of a readout's offset and gain, and of a delay: a few where the spectrum is full
 of other things, up to a dozen cycles where nothing else stands."""
+
+STEEPEST = 2.0
+"""Slope of the drive, over its deviation and rate, from which a law of it says no more: an edge is steep beyond measure."""
 
 KNOTS = np.linspace(-1.0, 1.0, 15)
 """Angles, over the amplitude, between which the free mapping of a reference angle is straight."""
@@ -54,6 +60,19 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
     return -total * nominal[2] * p[0], 0.0, 0.0
 
 
+@njit(TORQUE, cache=True)
+def _restless(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
+    first = np.cos(np.pi * t / p[2])
+    before, wave = 1.0, first
+    stiffness = damping = 0.0
+    for j in range(STIFFNESSES):
+        stiffness += p[3 + j] * wave
+        if j < DAMPINGS:
+            damping += p[3 + STIFFNESSES + j] * wave
+        before, wave = wave, 2.0 * first * wave - before
+    return -(stiffness * theta + damping * omega / p[1]) * nominal[2], 0.0, 0.0
+
+
 @njit(BELL, cache=True)
 def _profile(theta, p, nominal):  # type: ignore[no-untyped-def]
     u = (theta - nominal[5]) / nominal[4]
@@ -74,22 +93,24 @@ def waves(turn: Array, sizes: Sequence[float]) -> Array:
 def _drive(voltage: Array, p: Sequence[float], view: View) -> Array:
     time = view.time[:-1, None] + view.step * np.array([0.0, 0.5, 1.0])
     turn, size, rate = np.pi * time / p[0], p[1], p[2]
-    mean = view.raw_voltage.mean()
-    swing = voltage - mean
-    slope = np.gradient(view.raw_voltage, view.step)
+    swing = voltage - view.raw_voltage.mean()
+    slope = np.gradient(view.raw_voltage, view.step) / rate
     slopes = np.stack([slope[:-1], 0.5 * (slope[:-1] + slope[1:]), slope[1:]], axis=1)
-    gain, offset = waves(turn, [p[3], *p[6::2]]), waves(turn, [0.0, *p[7::2]])
-    return voltage + (gain + p[5] / size * swing) * swing + size * offset + p[4] / rate * slopes
+    u, v = swing / size, np.clip(slopes / size, -STEEPEST, STEEPEST)
+    gain, offset = waves(turn, [p[3], *p[9:12]]), waves(turn, [0.0, *p[12:]])
+    bent = u * u * (p[5] + p[6] * u) + v * (p[7] * u + p[8] * v * v)
+    return voltage + gain * swing + size * (offset + bent) + p[4] * slopes
 
 
 def _readout(signal: Array, p: Sequence[float], view: View) -> Array:
-    turn, size, rate = np.pi * view.time / p[0], p[1], p[2]
-    swing = signal - signal.mean()
+    turn, size, rate, amplitude = np.pi * view.time / p[0], p[1], p[2], p[3]
+    u = (signal - signal.mean()) / size
     slope = np.gradient(signal, view.step) / rate
-    offset = waves(turn, [0.0, *p[6 : 6 + OFFSETS]])
-    gain = waves(turn, [0.0, *p[6 + OFFSETS :]])
-    u = swing / size
-    return signal + swing * (gain + u * (p[3] + p[4] * u)) + size * offset + p[5] * slope
+    offset, gain = waves(turn, [0.0, *p[12 : 12 + OFFSETS]]), waves(turn, [0.0, *p[12 + OFFSETS :]])
+    x, v = view.theta / amplitude, view.rate / (amplitude * rate)
+    way = v / np.sqrt(x * x + v * v + 1e-6)
+    by_rate = v * (p[7] + p[8] * x) + way * (p[9] + way * way * (p[10] + way * way * p[11]))
+    return signal * (1.0 + by_rate) + size * (u * (gain + u * (p[4] + p[5] * u)) + offset) + p[6] * slope
 
 
 def _timing(signal: Array, p: Sequence[float], view: View) -> Array:
@@ -127,6 +148,17 @@ FREE: dict[str, Term] = {
             SOURCE, torque=_force,
         ),
         Term(
+            "free-stiffness", "mechanics", "J θ'' + (b + δb(t)) θ' + (k + δk(t)) θ = τ",
+            (
+                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
+                Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
+                Parameter("T", "s", lambda s: s.duration, kind="fixed"),
+                *(Parameter(f"k{j}", "k", lambda s: 0.01) for j in range(1, STIFFNESSES + 1)),
+                *(Parameter(f"b{j}", "k", lambda s: 0.3 * s.b * s.rate / s.k) for j in range(1, DAMPINGS + 1)),
+            ),
+            SOURCE, torque=_restless,
+        ),
+        Term(
             "free-capacitance", "capacitance", "C(θ) + C0 exp(−u²) Σ a_n uⁿ",
             tuple(Parameter(f"a{n}", "1", lambda s: 0.07) for n in (1, 3, 4, 5, 6)),
             SOURCE, bell=_profile, applies=lambda axis, scales: axis.capacitance is not None,
@@ -137,17 +169,21 @@ FREE: dict[str, Term] = {
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 Parameter("size", "V", lambda s: s.voltage_rms, kind="fixed"),
                 Parameter("rate", "rad/s", lambda s: s.drive_rate, kind="fixed"),
-                *(Parameter(f"v{i}", "1", lambda s: 0.04) for i in range(9)),
+                *(Parameter(f"v{i}", "1", lambda s: 0.04) for i in range(6)),
+                *(Parameter(f"{name}{j}", "1", lambda s: 0.04) for name in "go" for j in range(1, WAVES + 1)),
             ),
             SOURCE, voltage=_drive, applies=lambda axis, scales: scales.voltage_rms > 0,
         ),
         Term(
-            "free-readout", "readout", "y + δy(y, y', t)",
+            "free-readout", "readout", "y + δy(y, y', θ', t)",
             (
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 Parameter("size", "V", lambda s: s.sense_rms, kind="fixed"),
                 Parameter("rate", "rad/s", lambda s: s.rate, kind="fixed"),
-                *(Parameter(f"y{i}", "1", lambda s: 0.04) for i in range(3 + OFFSETS)),
+                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
+                *(Parameter(f"y{i}", "1", lambda s: 0.04) for i in range(3)),
+                *(Parameter(f"w{i}", "1", lambda s: 0.02) for i in range(5)),
+                *(Parameter(f"o{i}", "1", lambda s: 0.04) for i in range(1, OFFSETS + 1)),
                 *(Parameter(f"g{i}", "1", lambda s: 0.04) for i in range(1, GAINS + 1)),
             ),
             SOURCE, output=_readout,

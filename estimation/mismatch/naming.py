@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.screen import Screened, screen
+from estimation.mismatch.screen import PROMISING, Screened, screen
 from estimation.mismatch.start import measured_whiteners
 from scanner.terms.term import AMPLITUDES
 
@@ -30,11 +30,11 @@ SHARE_HELD = 0.3
 TRACKED = 2.0
 """Reduced chi-square up to which a fit follows the motion, so that first order holds around it."""
 
-PROMISING = 3.0
-"""Fall of -2 log evidence by first order from which a candidate is fitted."""
-
 MUCH = 100.0
 """Fall of -2 log evidence beyond which first order is no judge of candidates."""
+
+EXPLAINED = 1.08
+"""Reduced chi-square over a window up to which a candidate has explained what went wrong in it."""
 
 FINALISTS = 6
 STARTERS = 12
@@ -44,6 +44,12 @@ MANY_SAMPLES = 1500
 
 EASE = 5
 """Windows from the last that the nominal model follows to the first that it does not."""
+
+LOST = 3.0
+"""Growth of the reduced chi-square, from one window to the next, by which a free correction has lost the motion."""
+
+SPLITS, FINEST = 12, 1.03
+"""Windows that it may put in between, and the least growth of a window."""
 
 HOPELESS = 2000.0
 """A fit that is this far behind another's evidence after a few turns is not polished."""
@@ -84,15 +90,20 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate]) -> 
     """
     promising = sorted(screen(comparison, base, candidates), key=lambda s: -s.gain)
     promising = [each for each in promising if each.gain > PROMISING]
-    return _named_first(promising, lambda part: _finalists(comparison, part))
+    return _named_first(promising, lambda part, bar: _finalists(comparison, part))
 
 
-def _named_first(screened: Sequence[Screened], fitted: Callable[[list[Screened]], list[Fit]]) -> list[Fit]:
-    """Fits of named terms, and of free corrections too unless they find nothing beside the best name; best first."""
+def _named_first(screened: Sequence[Screened], fitted: Callable[[list[Screened], float], list[Fit]]) -> list[Fit]:
+    """Fits of named terms, and of free corrections too unless they find nothing beside the best name; best first.
+
+    Args:
+        fitted: told which, and the evidence that is there to be beaten.
+    """
     free = [each for each in screened if each.candidate.term.effect in FREE]
-    fits = fitted([each for each in screened if each.candidate.term.effect not in FREE])
-    if free and not (fits and _explains(min(fits, key=lambda fit: fit.evidence), [each.candidate for each in free])):
-        fits += fitted(free)
+    fits = fitted([each for each in screened if each.candidate.term.effect not in FREE], np.inf)
+    best = min(fits, key=lambda fit: fit.evidence, default=None)
+    if free and not (best is not None and _explains(best, [each.candidate for each in free])):
+        fits += fitted(free, np.inf if best is None else best.evidence)
     return sorted(fits, key=lambda fit: fit.evidence)
 
 
@@ -144,12 +155,13 @@ def race(
     field = sorted(screen(comparison, base, candidates, stops[first]), key=lambda each: -each.gain)
     few = base.rows.sum() > MANY_SAMPLES
     starters = [each for i, each in enumerate(field) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
-    tracks = list(_eased(stops[max(first - 1, 0) :]) if first else stops)
+    tracks = [*([] if first else stops[:1]), *_eased(stops[max(first - 1, 0) :])]
 
-    def through(part: list[Screened]) -> list[Fit]:
+    def through(part: list[Screened], bar: float) -> list[Fit]:
         running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in part]
         if any(each.candidate.term.effect in FREE for each in part):  # few, and none is a measure of another
-            return [fit for one in running for fit in _raced(comparison, [one], tracks)]
+            fits = [_followed(comparison, model, x, tracks, bar) for model, x in running]
+            return [fit for fit in fits if fit is not None and possible(fit)]
         return _raced(comparison, running, tracks)
 
     return _named_first(starters, through)
@@ -168,8 +180,34 @@ def _raced(comparison: Comparison, running: list[tuple[Model, Array]], stops: Se
         best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
         margin = max(60.0, 0.5 * (worst - best))
         kept = [fit for fit in fits if fit.evidence < best + margin]
+        if fits[0].chi2 > EXPLAINED * fits[0].rows.sum():  # of what explains little yet, being ahead is no merit
+            kept = fits[: max(FINALISTS, len(kept))]
         running = [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
     return [fit for fit in fits if possible(fit)]
+
+
+def _followed(comparison: Comparison, model: Model, x: Array, stops: Sequence[float], bar: float) -> Fit | None:
+    """A fit grown through the windows ``stops``, with others in between where the motion would be lost.
+
+    None if a part already is worse than ``bar``, the evidence of another over the whole.
+
+    What a correction over time has not seen yet it may put anywhere: too long a stretch of that and no step leads back.
+    """
+    ahead, reached, level, splits = list(stops)[::-1], 0.0, 1.0, 0
+    while True:
+        stop = ahead[-1]
+        turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
+        fit = solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=bar)
+        new = fit.chi2 / int(fit.rows.sum())
+        if new > LOST * max(level, 1.0) and reached and splits < SPLITS and stop > FINEST * reached:
+            ahead.append(float(np.sqrt(reached * stop)))
+            splits += 1
+            continue
+        if fit.chi2 > bar:
+            return None
+        reached, level, x = ahead.pop(), new, fit.x
+        if not ahead:
+            return fit
 
 
 def _failing(early: Sequence[Fit]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -17,6 +17,12 @@ from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
 
+PROMISING = 3.0
+"""Fall of -2 log evidence by first order from which a candidate is fitted."""
+
+AMISS = 2.0
+"""Growth of chi-square from which a first-order step has left where first order holds."""
+
 LARGEST = 3.0
 """Prior standard deviations that a first-order estimate may reach."""
 
@@ -28,7 +34,7 @@ class Screened:
     Attributes:
         candidate: what would be added.
         model: with it.
-        x: start of a fit, with the first-order estimate of its size.
+        x: start of a fit: the first-order estimate of its size, and of what all else makes of that.
         gain: by how much -2 log evidence would fall.
         columns: sensitivities to its amplitudes, per prior standard deviation, shape (N, q).
     """
@@ -101,16 +107,35 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
         moving = [i for i in at if model.free[i].parameter.kind in AMPLITUDES]  # type: ignore[union-attr]
         if moving:
             columns = _sensitivities(comparison, base, model, x, moving, rows, stop)
-            gain, estimate = known.gain(columns[rows])
-            x[moving] = np.clip(estimate, -LARGEST, LARGEST)
+            normal, gradient, response = known.system(columns[rows])
+            gain, estimate = gain_of(normal, gradient)
+            estimate = np.clip(estimate, -LARGEST, LARGEST)
+            step = model.embed(base.model, known.spread(response @ estimate))
+            step[moving] = estimate
         else:  # a term without an amplitude (a clip level): what a finite size of it changes
             columns = (comparison.residual(model, x, stop) - base.residual)[:, None]
-            gain, share = known.gain(columns[rows])
+            gain, share = gain_of(*known.system(columns[rows])[:2])
             gain = gain if share[0] > 0.3 else 0.0
+            step = np.zeros(x.size)
         if best is None or gain > best.gain:
-            best = Screened(candidate, model, x, gain, columns)
+            best, way = Screened(candidate, model, x, gain, columns), step
     assert best is not None
+    if best.gain > PROMISING and not known.gone:
+        return replace(best, x=_stepped(comparison, base, best, way, rows, stop))
     return best
+
+
+def _stepped(comparison: Comparison, base: Fit, start: Screened, way: Array, rows: NDArray[np.bool_],
+             stop: float) -> Array:  # fmt: skip
+    """As much of the first-order step ``way`` as leaves the misfit within reach of a fit; a sixteenth of it otherwise."""
+    level = AMISS * float(base.residual[rows] @ base.residual[rows])
+    share = 1.0
+    while share > 0.1:
+        residual = comparison.residual(start.model, start.x + share * way, stop)[rows]
+        if residual @ residual < level:
+            break
+        share *= 0.5
+    return np.asarray(start.x + share * way)
 
 
 def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, moving: Sequence[int],
@@ -139,25 +164,32 @@ class Projection:
     """
 
     def __init__(self, base: Fit, rows: NDArray[np.bool_], gone: Sequence[Candidate] = ()):
+        self.gone = tuple(gone)
         keys = {each.key for each in gone}
-        out = np.array([f.kind in ("term", "hidden") and f.owner in keys for f in base.model.free])
+        self._kept = np.array([not (f.kind in ("term", "hidden") and f.owner in keys) for f in base.model.free])
         jacobian = base.jacobian[rows]
-        self._old = jacobian[:, ~out]
-        self._residual = base.residual[rows] - jacobian[:, out] @ base.x[out]
-        precision = base.model.precision[~out]
+        self._old = jacobian[:, self._kept]
+        self._residual = base.residual[rows] - jacobian[:, ~self._kept] @ base.x[~self._kept]
+        precision = base.model.precision[self._kept]
         self._normal = self._old.T @ self._old + np.diag(precision)
-        self._gradient = self._old.T @ self._residual + precision * base.x[~out]
+        self._gradient = self._old.T @ self._residual + precision * base.x[self._kept]
 
-    def system(self, new: Array) -> tuple[Array, Array]:
-        """Normal matrix (q, q) and gradient (q,) of amplitudes of standard normal prior, from their columns (n, q)."""
+    def system(self, new: Array) -> tuple[Array, Array, Array]:
+        """What amplitudes of standard normal prior can do, from their columns (n, q), all else refitted.
+
+        Returns:
+            normal matrix (q, q), gradient (q,), and how the kept free numbers answer to the amplitudes, (p, q).
+        """
         cross = self._old.T @ new
         solved = np.linalg.solve(self._normal, np.column_stack([cross, self._gradient]))
         normal = new.T @ new - cross.T @ solved[:, :-1] + np.eye(new.shape[1])
-        return normal, new.T @ self._residual - cross.T @ solved[:, -1]
+        return normal, new.T @ self._residual - cross.T @ solved[:, -1], -solved[:, :-1]
 
-    def gain(self, new: Array) -> tuple[float, Array]:
-        """Fall of -2 log evidence and estimate of the new amplitudes, all else refitted."""
-        return gain_of(*self.system(new))
+    def spread(self, change: Array) -> Array:
+        """A change of the kept free numbers, (p,), as one of all."""
+        whole = np.zeros(self._kept.size)
+        whole[self._kept] = change
+        return whole
 
 
 def gain_of(normal: Array, gradient: Array) -> tuple[float, Array]:

@@ -36,4 +36,5 @@ TERM = Term(
     source="converter data sheets: input range",
     lookalikes={"sensor-cubic": "no flat top in the histogram there: look at the largest samples"},
     output=output,
+    at_output=True,
 )

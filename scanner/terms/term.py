@@ -143,6 +143,7 @@ class Term:
         applies: whether an axis can show the effect at all, from its axis and scales.
         channels: kinds of channel that ``output`` acts on, one variant each: ``"sense"``, ``"angle"``,
             ``"intensity"`` or ``"place"``.
+        at_output: whether ``output`` acts last of all, on what the converter sees.
         of_axis: on an electrode that all combs share, whether each axis may have the effect for itself.
         coupled: whether ``torque`` looks at the other axis's angle.
     """
@@ -164,6 +165,7 @@ class Term:
     hidden: tuple[Callable[[Scales], float], ...] = ()
     applies: Callable[[Axis, Scales], bool] = lambda axis, scales: True
     channels: tuple[str, ...] = ("sense",)
+    at_output: bool = False
     of_axis: bool = False
     coupled: bool = False
 
