@@ -35,7 +35,7 @@ OFFSETS, GAINS, DELAYS = 6, 28, 20
 of other things, up to a dozen cycles where nothing else stands."""
 
 STEEPEST = 2.0
-"""Slope of the drive, over its deviation and rate, from which a law of it says no more: an edge is steep beyond measure."""
+"""Slope of the drive, over its deviation and rate, from which a law of it says no more: edges are steep without end."""
 
 KNOTS = np.linspace(-1.0, 1.0, 15)
 """Angles, over the amplitude, between which the free mapping of a reference angle is straight."""

@@ -127,7 +127,7 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
 
 def _stepped(comparison: Comparison, base: Fit, start: Screened, way: Array, rows: NDArray[np.bool_],
              stop: float) -> Array:  # fmt: skip
-    """As much of the first-order step ``way`` as leaves the misfit within reach of a fit; a sixteenth of it otherwise."""
+    """As much of the first-order step ``way`` as leaves the misfit within reach of a fit, at least a sixteenth."""
     level = AMISS * float(base.residual[rows] @ base.residual[rows])
     share = 1.0
     while share > 0.1:
