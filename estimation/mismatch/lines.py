@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import percentile_filter
 
 from estimation.mismatch.fit import Fit
 from estimation.mismatch.noise import near_lines, noise_psd, periodogram
@@ -11,12 +12,23 @@ SURE = 30.0
 """A bin this many times the noise around it is a line: exp(-30) of a million bins of noise is none."""
 
 
+MULTIPLES = 19
+"""Harmonics of the motion that are its own."""
+
+CROWDED = 50
+"""Lines of a drive from which a tone may fall among them by chance: its own stands out of what the others leave."""
+
+AROUND = 64
+"""Bins to either side that a line has to stand out of there."""
+
+
 def strongest_foreign_line(fit: Fit) -> float | None:
     """Frequency of the strongest line in any sense channel that lies on no harmonic of motion or drive [Hz], else None.
 
-    Hum counts too: whether it is noise or interference is decided by its size, in the fit.
+    Where the drive's own lines are many, one among them counts if there is no other. Hum counts too: whether it is noise or interference is decided by its size, in the fit.
     """
     best: tuple[float, float] | None = None
+    among: tuple[float, float] | None = None
     model = fit.model
     x = np.array(
         [
@@ -34,14 +46,21 @@ def strongest_foreign_line(fit: Fit) -> float | None:
             duration = rest.size * output.step
             frequency = np.arange(power.size) / duration
             motion = run.scales[output.axes[0]].rate / (2 * np.pi)
-            lines = [*(motion * np.arange(1, 20)), *run.lines[output.axes[0]]]
+            lines = [*(motion * np.arange(1, MULTIPLES + 1)), *run.lines[output.axes[0]]]
             width = 0.06 * motion if run.lines[output.axes[0]].size < 200 else 4.0 / duration
             ratio = power / noise_psd(rest, power.size, output.step, lines, width)
             ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0
             top = int(np.argmax(ratio))
             if ratio[top] > SURE and (best is None or ratio[top] > best[0]):
                 best = float(ratio[top]), _peak(power, top) / duration
-    return None if best is None else best[1]
+            if run.lines[output.axes[0]].size > CROWDED:
+                ratio = power / percentile_filter(power, 90, 2 * AROUND + 1)
+                ratio[near_lines(frequency, lines[:MULTIPLES], 4.0 / duration) | (frequency < 2.5 / duration)] = 0.0
+                top = int(np.argmax(ratio))
+                if ratio[top] > SURE and (among is None or ratio[top] > among[0]):
+                    among = float(ratio[top]), _peak(power, top) / duration
+    found = best or among
+    return None if found is None else found[1]
 
 
 def _peak(power: np.ndarray, top: int) -> float:

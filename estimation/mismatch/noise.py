@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,9 @@ LEAST_BINS = 14
 
 SLOPE_SD = 0.3
 """Standard deviation of the power law that continues the spectrum below its first window."""
+
+PINK_RANGE = 30.0
+"""From the first window up to this many times its frequency, noise that rises as 1/f is told from a white floor."""
 
 
 @dataclass(frozen=True)
@@ -122,12 +126,21 @@ def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -
     return np.cumsum(marks[:-1]) > 0
 
 
+def _pink_rise(centres: Array, heights: Array, wanted: Array) -> Array:
+    """Logarithm of what a white floor with 1/f noise grows by from the first of ``centres`` down to ``wanted``."""
+    near = centres <= PINK_RANGE * centres[0]
+    shapes = np.stack([np.ones(int(near.sum())), 1.0 / centres[near]], axis=1)
+    floor, pink = nnls(shapes / np.exp(heights[near])[:, None], np.ones(len(shapes)))[0]
+    return np.log((floor + pink / wanted) / (floor + pink / centres[0]))
+
+
 def _running_median(position: Array, power: Array, wanted: Array) -> Array:
     """Mean power from medians over windows that widen with frequency, at the wanted positions.
 
     Windows hold at least ``LEAST_BINS`` bins and a quarter of their frequency.
-    Below the first window the spectrum goes on rising as it did between the first two: red noise taken for flat there
-    would pass for a baseline that drifts.
+    Below the first window the spectrum goes on rising as it did between the first two, or as 1/f noise over a white
+    floor would that has the levels of the first ones, whichever is more: red noise taken for flat there would pass for
+    a baseline that drifts.
     """
     edges = [0]
     while edges[-1] < power.size:
@@ -147,6 +160,8 @@ def _running_median(position: Array, power: Array, wanted: Array) -> Array:
     if heights.size > 1:
         slope = np.clip((heights[0] - heights[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
         below = wanted < centres[0]
-        distance = np.log(centres[0] / np.maximum(wanted[below], 0.5))
-        smooth[below] += slope * distance + 0.5 * (SLOPE_SD * distance) ** 2  # mean of a log-normal level
+        lowest = np.maximum(wanted[below], 0.5)
+        distance = np.log(centres[0] / lowest)
+        rise = np.maximum(slope * distance, _pink_rise(np.array(centres), heights, lowest))
+        smooth[below] += rise + 0.5 * (SLOPE_SD * distance) ** 2  # mean of a log-normal level
     return np.exp(smooth)

@@ -129,7 +129,9 @@ def _extended(
     for _ in range(MOST_EFFECTS - len(best.model.candidates)):
         best = with_line(comparison, best)
         taken = {each.key for each in best.model.candidates}
-        candidates = [each for each in all_candidates(best.model.device, best.model, terms) if each.key not in taken]
+        adequate = bool(rivals) and best.held_chi2 < ADEQUATE
+        pool = [each for each in terms if not (adequate and each.effect in FREE)]
+        candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
         say(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
         if taken or best.chi2 < TRACKED * best.rows.sum():
             fits = near(comparison, best, candidates)
@@ -144,8 +146,6 @@ def _extended(
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
         close = [fit for fit in close if convincing(before, fit)]
-        if rivals and before.held_chi2 < ADEQUATE:
-            close = [fit for fit in close if not _is_free(fit)]
         if not close:
             yield _State(comparison, nominal, before, rivals)
             return
