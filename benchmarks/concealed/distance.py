@@ -53,8 +53,13 @@ def _distance(sealed: Sealed, secret: Hidden) -> dict[str, Any]:
         return (_whitened(sealed, start, to, motion if unmoved else move(start, to)) - here) / by
 
     def column(effect: Effect, size: float, shape: Shape) -> Array:
-        """What an effect adds, from a share of it small enough to be linear in."""
-        return change(effect.on(base, scene, effect.gentle * size, shape), effect.gentle**effect.power)
+        """What an effect adds, from a share of it small enough to be linear in.
+
+        With it from long before the recording on: switched on at its start, a second mode would ring.
+        """
+        to = effect.on(base, scene, effect.gentle * size, shape)
+        start = settle(scene.world, to) if effect.stage == "mechanics" else world
+        return change(to, effect.gentle**effect.power, start)
 
     nuisances, priors = zip(*_nuisances(sealed, world, base, change), strict=True)
     free = [change(_hiding(scene, [replace(h, size=1.005 * h.size) for h in others]), 0.005)] if others else []

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.naming import HOPELESS, possible
-from estimation.mismatch.screen import LARGEST, Projection, Screened, gain_of, screen
-from scanner.terms.term import AMPLITUDES
+from estimation.mismatch.screen import LARGEST, Projection, Screened, amplitudes, gain_of, placed, screen
 
 Array = NDArray[np.float64]
 
@@ -99,9 +98,8 @@ def _start(
         own = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == each.candidate.key]
         x[own] = [each.x[each.model.index("term", each.candidate.key, model.free[i].name)] for i in own]
         width = each.columns.shape[1]
-        amplitudes = [i for i in own if model.free[i].parameter.kind in AMPLITUDES]  # type: ignore[union-attr]
-        if amplitudes:
-            x[amplitudes] = estimate[first : first + width]
+        if amplitudes(model, each.candidate):
+            placed(x, model, each.candidate, estimate[first : first + width])
         first += width
     return model, x
 

@@ -25,7 +25,8 @@ AROUND = 64
 def strongest_foreign_line(fit: Fit) -> float | None:
     """Frequency of the strongest line in any sense channel that lies on no harmonic of motion or drive [Hz], else None.
 
-    Where the drive's own lines are many, one among them counts if there is no other. Hum counts too: whether it is noise or interference is decided by its size, in the fit.
+    Where the drive has many lines of its own, one among them counts if there is no other. Hum counts too: whether it is
+    noise or interference is decided by its size, in the fit.
     """
     best: tuple[float, float] | None = None
     among: tuple[float, float] | None = None

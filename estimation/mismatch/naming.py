@@ -46,10 +46,13 @@ EASE = 5
 """Windows from the last that the nominal model follows to the first that it does not."""
 
 LOST = 3.0
-"""Growth of the reduced chi-square, from one window to the next, by which a free correction has lost the motion."""
+"""Growth of the reduced chi-square, from one window to the next, by which the motion has been lost."""
 
-SPLITS, FINEST = 12, 1.03
-"""Windows that it may put in between, and the least growth of a window."""
+TOGETHER, ALONE = 3, 12
+"""Windows that may be put in between for all, and for one free correction that runs alone."""
+
+FINEST = 1.03
+"""Least growth of a window."""
 
 HOPELESS = 2000.0
 """A fit that is this far behind another's evidence after a few turns is not polished."""
@@ -69,18 +72,22 @@ def possible(fit: Fit) -> bool:
 def convincing(before: Fit, after: Fit) -> bool:
     """Whether a term is there: well ahead of nothing, and better on samples that no fit has seen.
 
-    A pull on the nominal values that a term relieves is evidence that no held-out sample shows, so those may stay as
-    they were, within the scatter of what the term changes there.
+    Where those hardly show it (a nominal value pulled off that it relieves, a clip level reached in the first turns
+    only), they may stay as they were, within the scatter of what the term changes there.
     """
-    if before.evidence - after.evidence < LEAD_OVER_NOTHING:
+    lead = before.evidence - after.evidence
+    if lead < LEAD_OVER_NOTHING:
         return False
     gained = float(np.sum(before.residual[before.held] ** 2) - np.sum(after.residual[after.held] ** 2))
     changed = float(np.sum((before.residual[before.held] - after.residual[after.held]) ** 2))
     fitted = before.chi2 - after.chi2
-    if fitted > before.penalty - after.penalty:
-        share = SHARE_HELD * fitted * int(after.held.sum()) / int(after.rows.sum())
-        return gained > min(share, LEAD_OVER_NOTHING)
-    return gained > -2.0 * np.sqrt(changed) - 2.0
+    unharmed = gained > -2.0 * np.sqrt(changed) - 2.0
+    if fitted <= before.penalty - after.penalty:
+        return unharmed
+    share = min(SHARE_HELD * fitted * int(after.held.sum()) / int(after.rows.sum()), LEAD_OVER_NOTHING)
+    if changed < share:
+        return unharmed and lead > 2.0 * LEAD_OVER_NOTHING
+    return gained > share
 
 
 def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate]) -> list[Fit]:
@@ -155,59 +162,61 @@ def race(
     field = sorted(screen(comparison, base, candidates, stops[first]), key=lambda each: -each.gain)
     few = base.rows.sum() > MANY_SAMPLES
     starters = [each for i, each in enumerate(field) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
+    reached = stops[first - 1] if first else 0.0
     tracks = [*([] if first else stops[:1]), *_eased(stops[max(first - 1, 0) :])]
 
     def through(part: list[Screened], bar: float) -> list[Fit]:
         running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in part]
         if any(each.candidate.term.effect in FREE for each in part):  # few, and none is a measure of another
-            fits = [_followed(comparison, model, x, tracks, bar) for model, x in running]
-            return [fit for fit in fits if fit is not None and possible(fit)]
-        return _raced(comparison, running, tracks)
+            return [fit for one in running for fit in _raced(comparison, [one], tracks, reached, ALONE, bar)]
+        return _raced(comparison, running, tracks, reached, TOGETHER)
 
     return _named_first(starters, through)
 
 
-def _raced(comparison: Comparison, running: list[tuple[Model, Array]], stops: Sequence[float]) -> list[Fit]:
-    """Possible fits of those that keep up through the growing windows ``stops``."""
+def _raced(
+    comparison: Comparison,
+    running: list[tuple[Model, Array]],
+    stops: Sequence[float],
+    reached: float,
+    splits: int,
+    bar: float = np.inf,
+) -> list[Fit]:
+    """Possible fits of those that keep up through the growing windows ``stops``.
+
+    Where all lose the motion, windows are put in between: after too long a stretch of what a law has not seen yet, no
+    step leads back.
+
+    Args:
+        reached: window up to which they start as good fits, 0 for none.
+        splits: windows that may be put in between.
+        bar: evidence over the whole that a part must not be worse than.
+    """
+    ahead, level = list(stops)[::-1], 1.0
     fits: list[Fit] = []
-    for stop in stops if running else ():
+    while running and ahead:
+        stop = ahead[-1]
         turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
         fits = []
         for model, x in running:
-            best = min((fit.evidence for fit in fits if possible(fit)), default=np.inf)
+            best = min((fit.evidence for fit in fits if possible(fit)), default=bar - HOPELESS)
             fits.append(solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS))
         fits.sort(key=lambda fit: fit.evidence if possible(fit) else np.inf)
+        now = fits[0].chi2 / int(fits[0].rows.sum())
+        if now > LOST * max(level, 1.0) and splits and stop > FINEST * reached > 0.0:
+            ahead.append(float(np.sqrt(reached * stop)))
+            splits -= 1
+            continue
+        if fits[0].chi2 > bar:
+            return []
         best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
         margin = max(60.0, 0.5 * (worst - best))
         kept = [fit for fit in fits if fit.evidence < best + margin]
-        if fits[0].chi2 > EXPLAINED * fits[0].rows.sum():  # of what explains little yet, being ahead is no merit
+        if now > EXPLAINED:  # of what explains little yet, being ahead is no merit
             kept = fits[: max(FINALISTS, len(kept))]
         running = [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
+        reached, level = ahead.pop(), now
     return [fit for fit in fits if possible(fit)]
-
-
-def _followed(comparison: Comparison, model: Model, x: Array, stops: Sequence[float], bar: float) -> Fit | None:
-    """A fit grown through the windows ``stops``, with others in between where the motion would be lost.
-
-    None if a part already is worse than ``bar``, the evidence of another over the whole.
-
-    What a correction over time has not seen yet it may put anywhere: too long a stretch of that and no step leads back.
-    """
-    ahead, reached, level, splits = list(stops)[::-1], 0.0, 1.0, 0
-    while True:
-        stop = ahead[-1]
-        turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
-        fit = solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=bar)
-        new = fit.chi2 / int(fit.rows.sum())
-        if new > LOST * max(level, 1.0) and reached and splits < SPLITS and stop > FINEST * reached:
-            ahead.append(float(np.sqrt(reached * stop)))
-            splits += 1
-            continue
-        if fit.chi2 > bar:
-            return None
-        reached, level, x = ahead.pop(), new, fit.x
-        if not ahead:
-            return fit
 
 
 def _failing(early: Sequence[Fit]) -> int:

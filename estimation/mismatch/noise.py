@@ -6,12 +6,12 @@ that leaves out the harmonics of motion and drive, where misfit stands, so that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
@@ -126,12 +126,16 @@ def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -
     return np.cumsum(marks[:-1]) > 0
 
 
-def _pink_rise(centres: Array, heights: Array, wanted: Array) -> Array:
-    """Logarithm of what a white floor with 1/f noise grows by from the first of ``centres`` down to ``wanted``."""
+def _pink(centres: Array, heights: Array) -> Callable[[ArrayLike], Array]:
+    """Logarithm of a white floor with 1/f noise over it, fitted to the first of the windows."""
     near = centres <= PINK_RANGE * centres[0]
     shapes = np.stack([np.ones(int(near.sum())), 1.0 / centres[near]], axis=1)
-    floor, pink = nnls(shapes / np.exp(heights[near])[:, None], np.ones(len(shapes)))[0]
-    return np.log((floor + pink / wanted) / (floor + pink / centres[0]))
+    levels = np.exp(heights[near])
+    fitted = levels
+    for _ in range(5):  # weighted by what is fitted: by the levels themselves, those low by chance would weigh most
+        floor, rising = nnls(shapes / fitted[:, None], levels / fitted)[0]
+        fitted = shapes @ (floor, rising)
+    return lambda position: np.log(floor + rising / np.asarray(position, float))
 
 
 def _running_median(position: Array, power: Array, wanted: Array) -> Array:
@@ -139,8 +143,8 @@ def _running_median(position: Array, power: Array, wanted: Array) -> Array:
 
     Windows hold at least ``LEAST_BINS`` bins and a quarter of their frequency.
     Below the first window the spectrum goes on rising as it did between the first two, or as 1/f noise over a white
-    floor would that has the levels of the first ones, whichever is more: red noise taken for flat there would pass for
-    a baseline that drifts.
+    floor would that has the levels of the first ones, whichever is more; that law also holds up the first window, whose
+    few bins may all be low by chance. Red noise taken for flat there would pass for a baseline that drifts.
     """
     edges = [0]
     while edges[-1] < power.size:
@@ -156,12 +160,14 @@ def _running_median(position: Array, power: Array, wanted: Array) -> Array:
         levels.append(np.median(power[low:high]) / MEDIAN_OF_POWER * doubt)
     floor = max(max(levels) * 1e-14, 1e-300)
     heights = np.log(np.maximum(levels, floor))
+    pink = _pink(np.array(centres), heights)
+    heights[0] = max(heights[0], pink(centres[0]))
     smooth = np.interp(wanted, centres, heights)
     if heights.size > 1:
         slope = np.clip((heights[0] - heights[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
         below = wanted < centres[0]
         lowest = np.maximum(wanted[below], 0.5)
         distance = np.log(centres[0] / lowest)
-        rise = np.maximum(slope * distance, _pink_rise(np.array(centres), heights, lowest))
+        rise = np.maximum(slope * distance, pink(lowest) - pink(centres[0]))
         smooth[below] += rise + 0.5 * (SLOPE_SD * distance) ** 2  # mean of a log-normal level
     return np.exp(smooth)

@@ -36,7 +36,8 @@ class Screened:
         model: with it.
         x: start of a fit: the first-order estimate of its size, and of what all else makes of that.
         gain: by how much -2 log evidence would fall.
-        columns: sensitivities to its amplitudes, per prior standard deviation, shape (N, q).
+        columns: sensitivities to its amplitudes, and to the first of them times each hidden state, per prior standard
+            deviation, shape (N, q).
     """
 
     candidate: Candidate
@@ -104,14 +105,14 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
         x = model.embed(base.model, base.x)
         at = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == candidate.key]
         x[at] = grid
-        moving = [i for i in at if model.free[i].parameter.kind in AMPLITUDES]  # type: ignore[union-attr]
+        moving, hidden = amplitudes(model, candidate), states(model, candidate)
         if moving:
-            columns = _sensitivities(comparison, base, model, x, moving, rows, stop)
+            columns = _sensitivities(comparison, base, model, x, moving, hidden, rows, stop)
             normal, gradient, response = known.system(columns[rows])
             gain, estimate = gain_of(normal, gradient)
             estimate = np.clip(estimate, -LARGEST, LARGEST)
             step = model.embed(base.model, known.spread(response @ estimate))
-            step[moving] = estimate
+            placed(step, model, candidate, estimate)
         else:  # a term without an amplitude (a clip level): what a finite size of it changes
             columns = (comparison.residual(model, x, stop) - base.residual)[:, None]
             gain, share = gain_of(*known.system(columns[rows])[:2])
@@ -123,6 +124,28 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
     if best.gain > PROMISING and not known.gone:
         return replace(best, x=_stepped(comparison, base, best, way, rows, stop))
     return best
+
+
+def placed(x: Array, model: Model, candidate: Candidate, estimate: Array) -> None:
+    """Put first-order estimates of a candidate's amplitudes, and of the first times each hidden state, into ``x``."""
+    moving, hidden = amplitudes(model, candidate), states(model, candidate)
+    x[moving] = estimate[: len(moving)]
+    if hidden and x[moving[0]]:
+        x[hidden] = np.clip(estimate[len(moving) :] / x[moving[0]], -LARGEST, LARGEST)
+
+
+def amplitudes(model: Model, candidate: Candidate) -> list[int]:
+    """Where the amplitudes of a candidate stand in x."""
+    return [
+        i
+        for i, f in enumerate(model.free)
+        if f.kind == "term" and f.owner == candidate.key and f.parameter.kind in AMPLITUDES  # type: ignore[union-attr]
+    ]
+
+
+def states(model: Model, candidate: Candidate) -> list[int]:
+    """Where the hidden states of a candidate, at the start of every recording, stand in x."""
+    return [i for i, f in enumerate(model.free) if f.kind == "hidden" and f.owner == candidate.key]
 
 
 def _stepped(comparison: Comparison, base: Fit, start: Screened, way: Array, rows: NDArray[np.bool_],
@@ -139,9 +162,11 @@ def _stepped(comparison: Comparison, base: Fit, start: Screened, way: Array, row
 
 
 def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, moving: Sequence[int],
-                   rows: NDArray[np.bool_], stop: float) -> Array:  # fmt: skip
-    """Derivatives of the whitened residual by the amplitudes ``moving``, shape (N, q)."""
-    columns = np.empty((base.residual.size, len(moving)))
+                   hidden: Sequence[int], rows: NDArray[np.bool_], stop: float) -> Array:  # fmt: skip
+    """Derivatives of the whitened residual by the amplitudes ``moving`` and by the first of them times each of the
+    ``hidden`` states, shape (N, q + h)."""
+    columns = np.empty((base.residual.size, len(moving) + len(hidden)))
+    shares = []
     for j, i in enumerate(moving):
         delta = 1e-3
         for _ in range(2):
@@ -152,6 +177,13 @@ def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, mo
             if 0.05 < size * delta < 20.0:
                 break
             delta = float(np.clip(1.0 / size if size else 1e-2, 1e-6, 0.1))
+        shares.append(moved[i])
+        if not np.linalg.norm(columns[rows, j]) < BURST:
+            columns[:, j] = 0.0
+    for j, i in enumerate(hidden, start=len(moving)):
+        moved = x.copy()
+        moved[[moving[0], i]] = shares[0], 1.0
+        columns[:, j] = (comparison.residual(model, moved, stop) - base.residual) / shares[0] - columns[:, 0]
         if not np.linalg.norm(columns[rows, j]) < BURST:
             columns[:, j] = 0.0
     return columns

@@ -13,7 +13,7 @@ from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.instead import Leads, behind, instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
-from estimation.mismatch.model import Candidate, Model
+from estimation.mismatch.model import MAINS, Candidate, Model
 from estimation.mismatch.naming import LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
 from estimation.mismatch.screen import all_candidates
 from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
@@ -93,7 +93,7 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     comparison = Comparison(runs, first_whiteners(model))
     early = grown(comparison, model, started(comparison, model, stops[0]).x, stops)
     comparison = Comparison(runs, measured_whiteners(model, early[-1].x))
-    nominal = with_hum(comparison, solve(comparison, model, early[-1].x))
+    nominal = solve(comparison, model, early[-1].x)
     named = list(terms.values())
     states = [_State(comparison, nominal, nominal, {})]
     states += _extended(states[0], [*named, *FREE.values()], early, stops, say)
@@ -127,7 +127,7 @@ def _extended(
     """The states that a search passes as it takes up ``terms``, one after the other."""
     comparison, nominal, best, rivals = state.comparison, state.nominal, state.best, dict(state.rivals)
     for _ in range(MOST_EFFECTS - len(best.model.candidates)):
-        best = with_line(comparison, best)
+        best = with_line(comparison, with_hum(comparison, best))
         taken = {each.key for each in best.model.candidates}
         adequate = bool(rivals) and best.held_chi2 < ADEQUATE
         pool = [each for each in terms if not (adequate and each.effect in FREE)]
@@ -256,7 +256,7 @@ def _round(
 def with_hum(comparison: Comparison, fit: Fit) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none."""
     fits = []
-    for mains in ((), *((each,) for each in fit.model.mains)):
+    for mains in ((), *((each,) for each in MAINS)):
         model = Model(fit.model.runs, fit.model.device, fit.model.candidates, mains)
         fits.append(solve(comparison, model, model.embed(fit.model, fit.x), turns=3))
     return min(fits, key=lambda each: each.evidence)

@@ -16,7 +16,7 @@ from estimation.mismatch.experiment import Output
 from estimation.mismatch.fit import Comparison, Fit, made_fit
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.noise import Whitener, flat_psd, whitener
-from estimation.mismatch.screen import all_candidates, screen, starts
+from estimation.mismatch.screen import all_candidates, screen, starts, states
 from scanner.errors import BadInput
 from scanner.terms import Term
 
@@ -70,7 +70,10 @@ def visibility(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> list[
 
 
 def columns(comparison: Comparison, fit: Fit, candidate: Candidate) -> list[Array]:
-    """Sensitivities to a candidate around ``fit``, shape (N, q), for each of its starts that shows anything."""
+    """Sensitivities to a candidate around ``fit``, shape (N, q), for each of its starts that shows anything.
+
+    What the unknown start of a hidden state could do is no sign of the effect and is taken out.
+    """
     alone = []
     for start in starts(candidate):
         place = iter(start)
@@ -78,7 +81,13 @@ def columns(comparison: Comparison, fit: Fit, candidate: Candidate) -> list[Arra
             p if p.kind == "fixed" else replace(p, starts=(next(place),)) for p in candidate.term.parameters
         )
         alone.append(replace(candidate, term=replace(candidate.term, parameters=parameters)))
-    return [each.columns for each in screen(comparison, fit, alone) if np.any(each.columns)]
+    shown = []
+    for each in screen(comparison, fit, alone):
+        own, hidden = np.split(each.columns, [each.columns.shape[1] - len(states(each.model, each.candidate))], axis=1)
+        if np.any(own):
+            rows = comparison.rows
+            shown.append(own - hidden @ np.linalg.lstsq(hidden[rows], own[rows], rcond=None)[0])
+    return shown
 
 
 def distances(fit: Fit, blocks: Sequence[Array], rows: NDArray[np.bool_]) -> tuple[Array, Array]:

@@ -12,13 +12,13 @@ from scanner.trajectory import TORQUE
 @njit(TORQUE, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
     w2 = 2.0 * np.pi * p[1]
-    return -nominal[2] * theta * z0, z1, w2 * w2 * (-p[0] * theta * theta - z0) - w2 / p[2] * z1
+    return -p[0] * nominal[2] * theta * z0, z1, w2 * w2 * (-theta * theta - z0) - w2 / p[2] * z1
 
 
 TERM = Term(
     effect="mode-coupling",
     stage="mechanics",
-    equation="J θ'' + b θ' + k θ (1 + q) = τ,  q'' + (ω2/Q2) q' + ω2² q = −ω2² g θ²",
+    equation="J θ'' + b θ' + k θ (1 + g q) = τ,  q'' + (ω2/Q2) q' + ω2² q = −ω2² θ²",
     parameters=(
         Parameter("g", "1/rad^2", lambda s: 0.02 / s.amplitude**2, sign=1),
         Parameter(
@@ -31,7 +31,7 @@ TERM = Term(
         ),
         Parameter("Q2", "1", lambda s: 100.0, kind="log"),
     ),
-    hidden=(lambda s: 0.02, lambda s: 0.04 * s.rate),
+    hidden=(lambda s: s.amplitude**2, lambda s: 2.0 * s.rate * s.amplitude**2),
     source="Antonio, Zanette & López, Nat. Commun. 3, 806 (2012)",
     lookalikes={"cubic-damping": "no sidebands and no threshold there: record above and below the threshold"},
     # An internal resonance takes a motion at the axis's own.

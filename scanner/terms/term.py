@@ -139,7 +139,8 @@ class Term:
         parameters: in the order in which the laws take them.
         source: where it was published.
         lookalikes: effect -> what tells the two apart.
-        hidden: scales of the hidden states (angle for angle), at most two.
+        hidden: scales of the hidden states (angle for angle), at most two. What they do to the mirror is in proportion
+            to the first parameter, an amplitude.
         applies: whether an axis can show the effect at all, from its axis and scales.
         channels: kinds of channel that ``output`` acts on, one variant each: ``"sense"``, ``"angle"``,
             ``"intensity"`` or ``"place"``.
