@@ -211,3 +211,15 @@ def test_a_device_s_terms_are_checked() -> None:
         added_terms(replace(LINEAR, terms={"cubic-stiffness": {}}))
     with pytest.raises(BadInput, match="variant"):
         added_terms(replace(LINEAR, terms={"channel-delay": {"delay": 1e-6, "variant": 7.0}}))
+
+
+def test_clipping_acts_on_what_the_converter_sees() -> None:
+    """Behind every delay, whichever of the two was named first: nothing interpolates a clipped corner."""
+    inputs = Inputs(np.zeros((1000, 3)), STEP)
+    delay, limit = Added(catalogue()["channel-delay"], (0.37 * STEP,)), Added(catalogue()["saturation"], (0.6,))
+    path = move(LINEAR, [], inputs, (0.1, 0.0))
+    late = sense(LINEAR.readout, [replace(path, added=(delay,))])
+    both = [sense(LINEAR.readout, [replace(path, added=order)]) for order in ((delay, limit), (limit, delay))]
+    assert np.array_equal(*both)
+    assert both[0].max() <= 0.6 < 0.9 < late.max()
+    assert np.allclose(both[0], np.clip(late, -0.6, 0.6), atol=2e-3)

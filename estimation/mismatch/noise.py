@@ -6,13 +6,12 @@ that leaves out the harmonics of motion and drive, where misfit stands, so that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import nnls
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
@@ -27,9 +26,6 @@ LEAST_BINS = 14
 
 SLOPE_SD = 0.3
 """Standard deviation of the power law that continues the spectrum below its first window."""
-
-PINK_RANGE = 30.0
-"""From the first window up to this many times its frequency, noise that rises as 1/f is told from a white floor."""
 
 
 @dataclass(frozen=True)
@@ -126,25 +122,12 @@ def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -
     return np.cumsum(marks[:-1]) > 0
 
 
-def _pink(centres: Array, heights: Array) -> Callable[[ArrayLike], Array]:
-    """Logarithm of a white floor with 1/f noise over it, fitted to the first of the windows."""
-    near = centres <= PINK_RANGE * centres[0]
-    shapes = np.stack([np.ones(int(near.sum())), 1.0 / centres[near]], axis=1)
-    levels = np.exp(heights[near])
-    fitted = levels
-    for _ in range(5):  # weighted by what is fitted: by the levels themselves, those low by chance would weigh most
-        floor, rising = nnls(shapes / fitted[:, None], levels / fitted)[0]
-        fitted = shapes @ (floor, rising)
-    return lambda position: np.log(floor + rising / np.asarray(position, float))
-
-
 def _running_median(position: Array, power: Array, wanted: Array) -> Array:
     """Mean power from medians over windows that widen with frequency, at the wanted positions.
 
     Windows hold at least ``LEAST_BINS`` bins and a quarter of their frequency.
-    Below the first window the spectrum goes on rising as it did between the first two, or as 1/f noise over a white
-    floor would that has the levels of the first ones, whichever is more; that law also holds up the first window, whose
-    few bins may all be low by chance. Red noise taken for flat there would pass for a baseline that drifts.
+    Below the first window the spectrum goes on rising as it did between the first two: red noise taken for flat there
+    would pass for a baseline that drifts.
     """
     edges = [0]
     while edges[-1] < power.size:
@@ -160,14 +143,10 @@ def _running_median(position: Array, power: Array, wanted: Array) -> Array:
         levels.append(np.median(power[low:high]) / MEDIAN_OF_POWER * doubt)
     floor = max(max(levels) * 1e-14, 1e-300)
     heights = np.log(np.maximum(levels, floor))
-    pink = _pink(np.array(centres), heights)
-    heights[0] = max(heights[0], pink(centres[0]))
     smooth = np.interp(wanted, centres, heights)
     if heights.size > 1:
         slope = np.clip((heights[0] - heights[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
         below = wanted < centres[0]
-        lowest = np.maximum(wanted[below], 0.5)
-        distance = np.log(centres[0] / lowest)
-        rise = np.maximum(slope * distance, pink(lowest) - pink(centres[0]))
-        smooth[below] += rise + 0.5 * (SLOPE_SD * distance) ** 2  # mean of a log-normal level
+        distance = np.log(centres[0] / np.maximum(wanted[below], 0.5))
+        smooth[below] += slope * distance + 0.5 * (SLOPE_SD * distance) ** 2  # mean of a log-normal level
     return np.exp(smooth)
