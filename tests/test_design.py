@@ -121,7 +121,7 @@ def test_the_first_pair_does_what_the_design_says(tmp_path: Path, capsys: pytest
     summary = json.loads(capsys.readouterr().out)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"summary.json", "report.html"}
     assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
-    assert (tmp_path / "out" / "report.html").read_text().count("data:image") == 4
+    assert (tmp_path / "out" / "report.html").read_text().count('src="data:image') == 4
     first = summary["candidates"][0]
     assert first["frame_rate"] >= 60
     assert any("skips pixels" in note for note in summary["notes"])

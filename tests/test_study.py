@@ -67,7 +67,7 @@ def test_a_study_writes_table_summary_and_report(done: Path) -> None:
         < summary["estimators"]["constant"]["phase_rmse_deg_p95"]
     )
     page = (done / "report.html").read_text()
-    assert page.count("data:image/svg") == 3
+    assert page.count('src="data:image/svg') == 3
     assert "http" not in page.replace("http://www.w3.org", "")
 
 

@@ -54,22 +54,21 @@ def instead(
     if not seen:
         return []
     ends = np.cumsum([0, *(each.columns.shape[1] for each in seen)])
-    known = Projection(fit, fit.rows, (gone,))
-    normal, gradient, response = known.system(np.column_stack([s.columns[fit.rows] for s in seen]))
+    columns = np.column_stack([s.columns[fit.rows] for s in seen])
+    normal, gradient, _ = Projection(fit, fit.rows, (gone,)).system(columns)
 
-    def promise(group: tuple[int, ...]) -> tuple[float, Array, Array]:
+    def promise(group: tuple[int, ...]) -> tuple[float, Array]:
         at = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in group])
         gain, estimate = gain_of(normal[np.ix_(at, at)], gradient[at])
-        estimate = np.clip(estimate, -LARGEST, LARGEST)
-        return gain, estimate, fit.x + known.spread(response[:, at] @ estimate)
+        return gain, np.clip(estimate, -LARGEST, LARGEST)
 
     fits = []
     for size in (1, 2) if pairs else (1,):
         promised = [(*promise(group), group) for group in combinations(range(len(seen)), size)]
         promised.sort(key=lambda each: -each[0])
-        for place, (_, estimate, refitted, group) in enumerate(promised):
+        for place, (_, estimate, group) in enumerate(promised):
             if place < TRIED or (size == 1 and _alike(seen[group[0]].candidate, gone)):
-                model, x = _start(fit, gone, [seen[i] for i in group], estimate, refitted)
+                model, x = _start(fit, gone, [seen[i] for i in group], estimate)
                 # Around a free correction the way is far; around a named fit, what is not soon as good never will be.
                 turns = 20 if pairs else 8
                 fits.append(solve(comparison, model, x, turns=turns, hopeless=fit.evidence + HOPELESS))
@@ -81,18 +80,14 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     return other.term.effect in one.term.lookalikes or one.term.effect in other.term.lookalikes
 
 
-def _start(
-    fit: Fit, gone: Candidate, added: Sequence[Screened], estimate: Array, refitted: Array
-) -> tuple[Model, Array]:
+def _start(fit: Fit, gone: Candidate, added: Sequence[Screened], estimate: Array) -> tuple[Model, Array]:
     """The model with ``added`` in the place of ``gone``, and where to start its fit.
 
-    Args:
-        estimate: amplitudes of ``added``, to first order.
-        refitted: all free numbers of ``fit``, as they answer to those.
+    All else starts as it was: what stood in ``gone`` is large, and no first order tells how far the others would go.
     """
     kept = [each for each in fit.model.candidates if each is not gone]
     model = Model(fit.model.runs, fit.model.device, [*kept, *(s.candidate for s in added)], fit.model.mains)
-    x = model.embed(fit.model, refitted)
+    x = model.embed(fit.model, fit.x)
     first = 0
     for each in added:
         own = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == each.candidate.key]

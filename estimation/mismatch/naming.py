@@ -161,7 +161,9 @@ def race(
     base = solve(comparison, nominal, nominal.embed(early[first].model, early[first].x), stops[first], 8)
     field = sorted(screen(comparison, base, candidates, stops[first]), key=lambda each: -each.gain)
     few = base.rows.sum() > MANY_SAMPLES
-    starters = [each for i, each in enumerate(field) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
+    free = [each for each in field[:STARTERS] if each.candidate.term.effect in FREE]
+    named = [each for each in field if each.candidate.term.effect not in FREE]
+    starters = [each for i, each in enumerate(named) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
     reached = stops[first - 1] if first else 0.0
     tracks = [*([] if first else stops[:1]), *_eased(stops[max(first - 1, 0) :])]
 
@@ -171,7 +173,7 @@ def race(
             return [fit for one in running for fit in _raced(comparison, [one], tracks, reached, ALONE, bar)]
         return _raced(comparison, running, tracks, reached, TOGETHER)
 
-    return _named_first(starters, through)
+    return _named_first(starters + free, through)
 
 
 def _raced(
