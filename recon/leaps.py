@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from estimation.reference import dominant_frequency
 from recon.mapping import Grid, accumulate
-from recon.trouble import Trouble, runs
+from recon.trouble import Trouble, joined, runs
 from scanner.channel import Channel
 from scanner.demodulate import block_length, block_phasors
 from scanner.errors import BadInput
@@ -53,20 +53,14 @@ def leaps(recording: Recording) -> list[Trouble]:
 
 def longest_stretch(recording: Recording, found: Sequence[Trouble]) -> tuple[float, float]:
     """Begin and end [s] of the longest stretch without a leap."""
-    edges = apart(found)
+    edges = stretches(found)
     begins, ends = [recording.start, *(stop for _, stop in edges)], [*(start for start, _ in edges), recording.end]
     return max(zip(begins, ends, strict=True), key=lambda stretch: stretch[1] - stretch[0])
 
 
-def apart(found: Sequence[Trouble]) -> list[tuple[float, float]]:
+def stretches(found: Sequence[Trouble]) -> list[tuple[float, float]]:
     """Their stretches [s], increasing, those that overlap as one: drive and sense show one leap each in their way."""
-    edges: list[tuple[float, float]] = []
-    for start, stop in sorted((each.start, each.stop) for each in found):
-        if edges and start <= edges[-1][1]:
-            edges[-1] = edges[-1][0], max(stop, edges[-1][1])
-        else:
-            edges.append((start, stop))
-    return edges
+    return joined(sorted((each.start, each.stop) for each in found), 0.0)
 
 
 def passed(motion: Motion, found: Sequence[Trouble], grid: Grid) -> NDArray[np.bool_]:
@@ -78,7 +72,7 @@ def passed(motion: Motion, found: Sequence[Trouble], grid: Grid) -> NDArray[np.b
     counts = np.zeros((grid.height, grid.width), np.uint32)
     track = motion.axes["x"].angle
     begin, end = track.start, track.start + track.size / track.sample_rate
-    for start, stop in apart(found):
+    for start, stop in stretches(found):
         if min(abs(stop - begin), abs(start - end)) < 0.5 * (stop - start):
             time = np.arange(start, stop, 1 / track.sample_rate)
             x, y = (_continued(motion.axes[name], time) for name in ("x", "y"))

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.mapping import Grid, map_samples, pixel_index
 from recon.registration import PhaseError, registered, slow_period
-from scanner.channel import Channel
+from scanner.channel import Channel, Lazy
 from scanner.motion import Motion
 from scanner.recording import Recording
 
@@ -133,41 +133,21 @@ def _place(predicted: Array, light: Array, first: int, stop: int, count: int) ->
     return Loss(int(at[0] + near[0]), int(at[0] + near[-1]) + 1, count)
 
 
-@dataclass(frozen=True)
-class _PutBack:
-    """Samples of a channel with room where some were lost (NaN), made when they are sliced."""
-
-    channel: Channel
-    loss: Loss
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return np.dtype(np.float64)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return (self.channel.size + self.loss.missing, *self.channel.shape[1:])
-
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
-
-    def __getitem__(self, rows: slice) -> Array:
-        low, high, _ = rows.indices(self.shape[0])
-        first, stop, missing = self.loss
-        out = np.full((max(high - low, 0), *self.shape[1:]), np.nan)
-        end, begin = min(first, stop + missing), stop + missing  # of what stays where it is; of what moves
-        if low < end:
-            out[: end - low] = self.channel.read(low, min(high, end))
-        if high > begin:
-            moved = max(low, begin)
-            out[moved - low :] = self.channel.read(moved - missing, high - missing)
-        return out
-
-
 def put_back(recording: Recording, loss: Loss) -> Recording:
     """The recording with an intensity that is on time again; where it is not known on which side, it has a gap."""
     channel = recording["intensity"]
-    raw = _PutBack(channel, loss)
-    whole = replace(channel, raw=raw, first=0, stop=raw.shape[0], gain=1.0, offset=0.0)
-    return replace(recording, channels=MappingProxyType({**recording.channels, "intensity": whole}))
+    end, begin = min(loss.first, loss.stop + loss.missing), loss.stop + loss.missing  # of what stays; of what moves
+
+    def whole(first: int, stop: int) -> Array:
+        out = np.full((stop - first, *channel.shape[1:]), np.nan)
+        if first < end:
+            out[: end - first] = channel.read(first, min(stop, end))
+        if stop > begin:
+            moved = max(first, begin)
+            out[moved - first :] = channel.read(moved - loss.missing, stop - loss.missing)
+        return out
+
+    shape = channel.size + loss.missing, *channel.shape[1:]
+    raw = Lazy(shape, np.dtype(np.float64), whole)
+    late = replace(channel, raw=raw, first=0, stop=shape[0], gain=1.0, offset=0.0)
+    return replace(recording, channels=MappingProxyType({**recording.channels, "intensity": late}))

@@ -78,9 +78,9 @@ class Reconstruction:
         trouble: what is wrong with the recording. dropped: samples of which no one can say where they belong.
         affected: pixels that hold samples from a stretch of trouble, shape (height, width).
         notes: what a reader has to know, a line each.
-        seconds: taken, without writing.
         intensity: as it was mapped: its light undone, and between leaps of the clock.
         name: of the recording.
+        seconds: taken, without writing.
     """
 
     motion: Motion
@@ -94,9 +94,9 @@ class Reconstruction:
     dropped: int
     affected: NDArray[np.bool_]
     notes: list[str]
-    seconds: float
     intensity: Channel
     name: str
+    seconds: float = 0.0
 
     @property
     def recorded(self) -> float:
@@ -180,7 +180,6 @@ def _reconstruct(
     jumped: Sequence[Trouble],
 ) -> Reconstruction:
     """:func:`reconstruct` of a stretch between leaps of the phase."""
-    began = time.perf_counter()
     with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=quiet or None) as progress:
         recording = with_light(recording, device)
         intensity = recording["intensity"]
@@ -226,7 +225,6 @@ def _reconstruct(
         dropped=sum(stop - first for first, stop in lost),
         affected=affected,
         notes=notes,
-        seconds=time.perf_counter() - began,
         intensity=intensity,
         name=recording.name,
     )

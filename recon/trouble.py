@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ class Trouble:
 
 
 Ranges = list[tuple[int, int]]
+Number = TypeVar("Number", int, float)
 
 
 def troubles(recording: Recording) -> list[Trouble]:
@@ -74,7 +75,7 @@ def samples(intervals: Iterable[tuple[float, float]], channel: Channel) -> Range
     """Samples (first, stop) of a channel in intervals [s], increasing and apart."""
     edges = np.array(sorted(intervals), float).reshape(-1, 2)
     ends = np.clip(np.round((edges - channel.start) * channel.sample_rate), 0, channel.size).astype(int)
-    return [(a, b) for a, b in _joined(ends.tolist(), 0) if a < b]
+    return [(a, b) for a, b in joined(ends.tolist(), 0) if a < b]
 
 
 def without(ranges: Ranges, others: Ranges) -> Ranges:
@@ -101,9 +102,9 @@ def _missing(channel: Channel, intensity: Channel) -> list[Trouble]:
 
 
 def _stretches(channel: Channel, kind: str, ranges: Ranges) -> list[Trouble]:
-    joined = _joined(ranges, round(ONE * channel.sample_rate))
+    whole = joined(ranges, round(ONE * channel.sample_rate))
     rate = channel.sample_rate
-    return [Trouble(channel.name, kind, channel.start + a / rate, channel.start + b / rate) for a, b in joined]
+    return [Trouble(channel.name, kind, channel.start + a / rate, channel.start + b / rate) for a, b in whole]
 
 
 def _chunks(channel: Channel) -> Iterator[tuple[int, NDArray[Any]]]:
@@ -144,12 +145,12 @@ def runs(mask: NDArray[np.bool_]) -> Ranges:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _joined(ranges: Iterable[Sequence[int]], near: int) -> Ranges:
+def joined(ranges: Iterable[Sequence[Number]], near: Number) -> list[tuple[Number, Number]]:
     """Increasing ranges, those at most ``near`` apart as one."""
-    joined: Ranges = []
+    whole: list[tuple[Number, Number]] = []
     for a, b in ranges:
-        if joined and a - joined[-1][1] <= near:
-            joined[-1] = joined[-1][0], max(b, joined[-1][1])
+        if whole and a - whole[-1][1] <= near:
+            whole[-1] = whole[-1][0], max(b, whole[-1][1])
         else:
-            joined.append((a, b))
-    return joined
+            whole.append((a, b))
+    return whole

@@ -2,47 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.channel import Channel
+from scanner.channel import Lazy
 from scanner.device import Device
 from scanner.motion import AngleTrack, Motion
 from scanner.optics import acting, delay, gain, place
 from scanner.recording import Recording
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Light:
-    """Samples of an intensity as bright as the light was, made when they are sliced."""
-
-    device: Device
-    channel: Channel
-    origin: float
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return np.dtype(np.float64)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.channel.shape
-
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
-
-    def __getitem__(self, rows: slice) -> Array:
-        first, stop, _ = rows.indices(self.channel.size)
-        values = self.channel.read(first, stop)
-        bright = gain(self.device, self.channel.time(first, stop) - self.origin)
-        return values / (bright if values.ndim == 1 else bright[:, None])
 
 
 def with_light(recording: Recording, device: Device) -> Recording:
@@ -53,10 +25,16 @@ def with_light(recording: Recording, device: Device) -> Recording:
     if "intensity" not in recording or not acting(device, "intensity"):
         return recording
     channel = recording["intensity"]
+
+    def bright(first: int, stop: int) -> Array:
+        values = channel.read(first, stop)
+        light = gain(device, channel.time(first, stop) - recording.start)
+        return np.asarray(values / (light if values.ndim == 1 else light[:, None]))
+
     start = channel.start - delay(device, 1 / channel.sample_rate)
     light = replace(
         channel,
-        raw=_Light(device, channel, recording.start),
+        raw=Lazy(channel.shape, np.dtype(np.float64), bright),
         first=0, stop=channel.size, gain=1.0, offset=0.0, start=start,
     )  # fmt: skip
     return replace(recording, channels=MappingProxyType({**recording.channels, "intensity": light}))

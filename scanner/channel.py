@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from math import isfinite, pi
@@ -48,6 +49,23 @@ class Samples(Protocol):
     @property
     def ndim(self) -> int: ...
     def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
+
+
+@dataclass(frozen=True)
+class Lazy:
+    """Samples that ``fetch(first, stop)`` reads, along the first axis."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fetch: Callable[[int, int], NDArray[Any]]
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        first, stop, _ = rows.indices(self.shape[0])
+        return self.fetch(first, max(first, stop))
 
 
 @dataclass(frozen=True, eq=False)

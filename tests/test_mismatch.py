@@ -119,6 +119,12 @@ def test_a_stiffness_shaken_from_outside_is_unknown_in_the_mechanics() -> None:
     assert [(each.effect, each.stage) for each in told.findings] == [("unknown", "mechanics")]
     scatter = np.sqrt(2.0 / told.search.final.held.sum())
     assert told.search.final.held_chi2 < 1.0 + 3.0 * scatter < 2.0 < told.search.nominal.held_chi2
+    curve = told.findings[0].curve
+    assert curve is not None
+    assert (curve["x"], curve["y"]) == ("time (s)", "stiffness error / k")
+    assert "= 0.01 x cos(12 π t/T) with" in curve["formula"]
+    time, value, sd = np.array(curve["points"]).T
+    assert np.all(np.abs(value - 0.01 * np.cos(2 * np.pi * 6 * time * RATE / N)) < 4.0 * sd + 1e-4)
 
 
 def test_the_nominal_fit_finds_the_values_within_their_errors() -> None:

@@ -14,11 +14,12 @@ from estimation.mismatch.experiment import experiment
 from estimation.mismatch.fit import Comparison, Fit
 from estimation.mismatch.free import FREE
 from estimation.mismatch.intervals import profile_interval
+from estimation.mismatch.law import correction_curve
 from estimation.mismatch.model import Candidate
 from estimation.mismatch.naming import LEAD_OVER_NEXT
 from estimation.mismatch.search import Round, Search, search
 from estimation.mismatch.sensitivity import APART
-from estimation.mismatch.where import correction_curve, where
+from estimation.mismatch.where import where
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording

@@ -43,6 +43,17 @@ KNOTS = np.linspace(-1.0, 1.0, 15)
 SOURCE = "free correction: polynomials and cosines, no physics of their own"
 
 
+@njit(cache=True)
+def _cosines(turn, sizes):  # type: ignore[no-untyped-def]
+    """sum_j sizes[j - 1] cos(j turn)."""
+    first = np.cos(turn)
+    total, before, wave = 0.0, 1.0, first
+    for i in range(len(sizes)):
+        total += sizes[i] * wave
+        before, wave = wave, 2.0 * first * wave - before
+    return total
+
+
 @njit(TORQUE, cache=True)
 def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
     x, y = theta / p[0], omega / (p[0] * p[1])
@@ -51,26 +62,16 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
         for j in range(n + 1):
             total += p[at] * x ** (n - j) * y**j
             at += 1
-    first = np.cos(np.pi * t / p[2])
-    before, wave = 1.0, first
-    for _ in range(WAVES):
-        total += (p[at] * x + p[at + 1] * y) * wave
-        before, wave = wave, 2.0 * first * wave - before
-        at += 2
+    turn = np.pi * t / p[2]
+    total += _cosines(turn, p[at::2]) * x + _cosines(turn, p[at + 1 :: 2]) * y
     return -total * nominal[2] * p[0], 0.0, 0.0
 
 
 @njit(TORQUE, cache=True)
-def _restless(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    first = np.cos(np.pi * t / p[2])
-    before, wave = 1.0, first
-    stiffness = damping = 0.0
-    for j in range(STIFFNESSES):
-        stiffness += p[3 + j] * wave
-        if j < DAMPINGS:
-            damping += p[3 + STIFFNESSES + j] * wave
-        before, wave = wave, 2.0 * first * wave - before
-    return -(stiffness * theta + damping * omega / p[1]) * nominal[2], 0.0, 0.0
+def _wandering(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
+    turn, damping = np.pi * t / p[1], 2 + STIFFNESSES
+    force = _cosines(turn, p[2:damping]) * theta + _cosines(turn, p[damping:]) * omega / p[0]
+    return -force * nominal[2], 0.0, 0.0
 
 
 @njit(BELL, cache=True)
@@ -150,13 +151,12 @@ FREE: dict[str, Term] = {
         Term(
             "free-stiffness", "mechanics", "J θ'' + (b + δb(t)) θ' + (k + δk(t)) θ = τ",
             (
-                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
                 Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 *(Parameter(f"k{j}", "k", lambda s: 0.01) for j in range(1, STIFFNESSES + 1)),
                 *(Parameter(f"b{j}", "k", lambda s: 0.3 * s.b * s.rate / s.k) for j in range(1, DAMPINGS + 1)),
             ),
-            SOURCE, torque=_restless,
+            SOURCE, torque=_wandering,
         ),
         Term(
             "free-capacitance", "capacitance", "C(θ) + C0 exp(−u²) Σ a_n uⁿ",

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import percentile_filter
 
 from estimation.mismatch.fit import Fit
 from estimation.mismatch.noise import near_lines, noise_psd, periodogram
 
+Array = NDArray[np.float64]
+
 SURE = 30.0
 """A bin this many times the noise around it is a line: exp(-30) of a million bins of noise is none."""
-
 
 MULTIPLES = 19
 """Harmonics of the motion that are its own."""
@@ -28,8 +30,7 @@ def strongest_foreign_line(fit: Fit) -> float | None:
     Where the drive has many lines of its own, one among them counts if there is no other. Hum counts too: whether it is
     noise or interference is decided by its size, in the fit.
     """
-    best: tuple[float, float] | None = None
-    among: tuple[float, float] | None = None
+    best = among = (0.0, 0.0)
     model = fit.model
     x = np.array(
         [
@@ -51,20 +52,24 @@ def strongest_foreign_line(fit: Fit) -> float | None:
             width = 0.06 * motion if run.lines[output.axes[0]].size < 200 else 4.0 / duration
             ratio = power / noise_psd(rest, power.size, output.step, lines, width)
             ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0
-            top = int(np.argmax(ratio))
-            if ratio[top] > SURE and (best is None or ratio[top] > best[0]):
-                best = float(ratio[top]), _peak(power, top) / duration
+            best = max(best, _strongest(ratio, power, duration))
             if run.lines[output.axes[0]].size > CROWDED:
                 ratio = power / percentile_filter(power, 90, 2 * AROUND + 1)
                 ratio[near_lines(frequency, lines[:MULTIPLES], 4.0 / duration) | (frequency < 2.5 / duration)] = 0.0
-                top = int(np.argmax(ratio))
-                if ratio[top] > SURE and (among is None or ratio[top] > among[0]):
-                    among = float(ratio[top]), _peak(power, top) / duration
-    found = best or among
-    return None if found is None else found[1]
+                among = max(among, _strongest(ratio, power, duration))
+    for height, line in (best, among):
+        if height > SURE:
+            return line
+    return None
 
 
-def _peak(power: np.ndarray, top: int) -> float:
+def _strongest(ratio: Array, power: Array, duration: float) -> tuple[float, float]:
+    """The largest ratio of a line to what is around it, and the line's frequency [Hz]."""
+    top = int(np.argmax(ratio))
+    return float(ratio[top]), _peak(power, top) / duration
+
+
+def _peak(power: Array, top: int) -> float:
     """Position of a peak between bins, by a parabola through the logarithms of three."""
     if not 0 < top < power.size - 1:
         return float(top)

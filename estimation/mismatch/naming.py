@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.screen import PROMISING, Screened, screen
+from estimation.mismatch.screen import PROMISING, Screened, screen, stepped
 from estimation.mismatch.start import measured_whiteners
 from scanner.terms.term import AMPLITUDES
 
@@ -96,18 +96,25 @@ def near(comparison: Comparison, base: Fit, candidates: Sequence[Candidate]) -> 
     Free corrections, which cost most, are fitted only where they find something beside the best named term.
     """
     promising = sorted(screen(comparison, base, candidates), key=lambda s: -s.gain)
-    promising = [each for each in promising if each.gain > PROMISING]
-    return _named_first(promising, lambda part, bar: _finalists(comparison, part))
+    named, free = _apart([each for each in promising if each.gain > PROMISING])
+    return _named_first(named, free, lambda part, bar: _finalists(comparison, base, part))
 
 
-def _named_first(screened: Sequence[Screened], fitted: Callable[[list[Screened], float], list[Fit]]) -> list[Fit]:
+def _apart(screened: Sequence[Screened]) -> tuple[list[Screened], list[Screened]]:
+    """Named terms, and free corrections."""
+    free = [each for each in screened if each.candidate.term.effect in FREE]
+    return [each for each in screened if each.candidate.term.effect not in FREE], free
+
+
+def _named_first(
+    named: list[Screened], free: list[Screened], fitted: Callable[[list[Screened], float], list[Fit]]
+) -> list[Fit]:
     """Fits of named terms, and of free corrections too unless they find nothing beside the best name; best first.
 
     Args:
         fitted: told which, and the evidence that is there to be beaten.
     """
-    free = [each for each in screened if each.candidate.term.effect in FREE]
-    fits = fitted([each for each in screened if each.candidate.term.effect not in FREE], np.inf)
+    fits = fitted(named, np.inf)
     best = min(fits, key=lambda fit: fit.evidence, default=None)
     if free and not (best is not None and _explains(best, [each.candidate for each in free])):
         fits += fitted(free, np.inf if best is None else best.evidence)
@@ -123,13 +130,13 @@ def _explains(fit: Fit, free: Sequence[Candidate]) -> bool:
     return all(each.gain < LEAD_OVER_NOTHING for each in screen(comparison, again, free))
 
 
-def _finalists(comparison: Comparison, promising: Sequence[Screened]) -> list[Fit]:
+def _finalists(comparison: Comparison, base: Fit, promising: Sequence[Screened]) -> list[Fit]:
     """Possible fits of what is promised most.
 
     Where much is missing, first order promises one ten times too little and the other ten times too much: all take a
     step or two, and those that lag far behind drop out.
     """
-    running = [(each.model, each.x) for each in promising]
+    running = [(each.model, stepped(comparison, base, each)) for each in promising]
     if promising and promising[0].gain > MUCH:
         for turns in (2, 3):
             fits = sorted((solve(comparison, *each, turns=turns) for each in running), key=lambda fit: fit.evidence)
@@ -160,20 +167,23 @@ def race(
     followed = early[max(first - 1, 0)]
     base = solve(comparison, nominal, nominal.embed(early[first].model, early[first].x), stops[first], 8)
     field = sorted(screen(comparison, base, candidates, stops[first]), key=lambda each: -each.gain)
-    few = base.rows.sum() > MANY_SAMPLES
-    free = [each for each in field[:STARTERS] if each.candidate.term.effect in FREE]
-    named = [each for each in field if each.candidate.term.effect not in FREE]
-    starters = [each for i, each in enumerate(named) if not few or i < STARTERS or each.gain > 0.5 * field[0].gain]
+    choosy = base.rows.sum() > MANY_SAMPLES
+    named, _ = _apart(field)
+    named = [each for i, each in enumerate(named) if not choosy or i < STARTERS or each.gain > 0.5 * field[0].gain]
+    _, free = _apart(field[:STARTERS])
     reached = stops[first - 1] if first else 0.0
     tracks = [*([] if first else stops[:1]), *_eased(stops[max(first - 1, 0) :])]
 
     def through(part: list[Screened], bar: float) -> list[Fit]:
-        running = [(each.model, _unspoilt(each, followed) if first else each.x) for each in part]
+        running = [
+            (each.model, _unspoilt(each, followed) if first else stepped(comparison, base, each, stops[first]))
+            for each in part
+        ]
         if any(each.candidate.term.effect in FREE for each in part):  # few, and none is a measure of another
             return [fit for one in running for fit in _raced(comparison, [one], tracks, reached, ALONE, bar)]
         return _raced(comparison, running, tracks, reached, TOGETHER)
 
-    return _named_first(starters + free, through)
+    return _named_first(named, free, through)
 
 
 def _raced(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -34,7 +34,8 @@ class Screened:
     Attributes:
         candidate: what would be added.
         model: with it.
-        x: start of a fit: the first-order estimate of its size, and of what all else makes of that.
+        x: where it was linearised: no size yet, at the best point of the term's own grid.
+        step: the first-order estimate from there: its size, and what all else makes of that.
         gain: by how much -2 log evidence would fall.
         columns: sensitivities to its amplitudes, and to the first of them times each hidden state, per prior standard
             deviation, shape (N, q).
@@ -43,6 +44,7 @@ class Screened:
     candidate: Candidate
     model: Model
     x: Array
+    step: Array
     gain: float
     columns: Array
 
@@ -119,10 +121,8 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
             gain = gain if share[0] > 0.3 else 0.0
             step = np.zeros(x.size)
         if best is None or gain > best.gain:
-            best, way = Screened(candidate, model, x, gain, columns), step
+            best = Screened(candidate, model, x, step, gain, columns)
     assert best is not None
-    if best.gain > PROMISING and not known.gone:
-        return replace(best, x=_stepped(comparison, base, best, way, rows, stop))
     return best
 
 
@@ -148,17 +148,17 @@ def states(model: Model, candidate: Candidate) -> list[int]:
     return [i for i, f in enumerate(model.free) if f.kind == "hidden" and f.owner == candidate.key]
 
 
-def _stepped(comparison: Comparison, base: Fit, start: Screened, way: Array, rows: NDArray[np.bool_],
-             stop: float) -> Array:  # fmt: skip
-    """As much of the first-order step ``way`` as leaves the misfit within reach of a fit, at least a sixteenth."""
+def stepped(comparison: Comparison, base: Fit, each: Screened, stop: float = 1.0) -> Array:
+    """Where a fit starts: as much of the first-order step as leaves the misfit in its reach, at least a sixteenth."""
+    rows = base.rows & (comparison.time < stop)
     level = AMISS * float(base.residual[rows] @ base.residual[rows])
     share = 1.0
     while share > 0.1:
-        residual = comparison.residual(start.model, start.x + share * way, stop)[rows]
+        residual = comparison.residual(each.model, each.x + share * each.step, stop)[rows]
         if residual @ residual < level:
             break
         share *= 0.5
-    return np.asarray(start.x + share * way)
+    return np.asarray(each.x + share * each.step)
 
 
 def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, moving: Sequence[int],
@@ -166,7 +166,7 @@ def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, mo
     """Derivatives of the whitened residual by the amplitudes ``moving`` and by the first of them times each of the
     ``hidden`` states, shape (N, q + h)."""
     columns = np.empty((base.residual.size, len(moving) + len(hidden)))
-    shares = []
+    share = 1.0
     for j, i in enumerate(moving):
         delta = 1e-3
         for _ in range(2):
@@ -177,13 +177,14 @@ def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, mo
             if 0.05 < size * delta < 20.0:
                 break
             delta = float(np.clip(1.0 / size if size else 1e-2, 1e-6, 0.1))
-        shares.append(moved[i])
+        if j == 0:
+            share = moved[i]
         if not np.linalg.norm(columns[rows, j]) < BURST:
             columns[:, j] = 0.0
     for j, i in enumerate(hidden, start=len(moving)):
         moved = x.copy()
-        moved[[moving[0], i]] = shares[0], 1.0
-        columns[:, j] = (comparison.residual(model, moved, stop) - base.residual) / shares[0] - columns[:, 0]
+        moved[[moving[0], i]] = share, 1.0
+        columns[:, j] = (comparison.residual(model, moved, stop) - base.residual) / share - columns[:, 0]
         if not np.linalg.norm(columns[rows, j]) < BURST:
             columns[:, j] = 0.0
     return columns
@@ -196,7 +197,6 @@ class Projection:
     """
 
     def __init__(self, base: Fit, rows: NDArray[np.bool_], gone: Sequence[Candidate] = ()):
-        self.gone = tuple(gone)
         keys = {each.key for each in gone}
         self._kept = np.array([not (f.kind in ("term", "hidden") and f.owner in keys) for f in base.model.free])
         jacobian = base.jacobian[rows]

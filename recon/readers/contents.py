@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.channel import CHUNK, Samples
+from scanner.channel import CHUNK, Lazy, Samples
 from scanner.errors import BadInput
 
 UNITS = {
@@ -71,23 +71,6 @@ class Contents:
     variables: Mapping[str, Variable]
     about: Mapping[str, str] = field(default_factory=dict)
     close: Callable[[], None] = no_step
-
-
-@dataclass(frozen=True)
-class Lazy:
-    """Samples that ``fetch(first, stop)`` reads, along the first axis."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    fetch: Callable[[int, int], NDArray[Any]]
-
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        first, stop, _ = rows.indices(self.shape[0])
-        return self.fetch(first, max(first, stop))
 
 
 def line_up(raw: Samples) -> Samples:

@@ -11,7 +11,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.readers.contents import Contents, Lazy, Variable
+from recon.readers.contents import Contents, Variable
+from scanner.channel import Lazy
 from scanner.hdf5 import DEEPEST, attributes, child, open_hdf5, undamaged
 
 

@@ -13,8 +13,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.readers.contents import Contents, Lazy, Variable
+from recon.readers.contents import Contents, Variable
 from recon.readers.hdf5 import read_hdf5, vector
+from scanner.channel import Lazy
 from scanner.errors import BadInput
 from scanner.files import check_claim
 

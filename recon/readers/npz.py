@@ -14,7 +14,8 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.readers.contents import Contents, Lazy, Variable, spooled
+from recon.readers.contents import Contents, Variable, spooled
+from scanner.channel import Lazy
 from scanner.errors import BadInput
 from scanner.files import check_claim
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.readers.contents import Contents, Lazy, Variable, rate_of, spelled, unique
+from recon.readers.contents import Contents, Variable, rate_of, spelled, unique
+from scanner.channel import Lazy
 from scanner.errors import BadInput
 from scanner.files import check_claim
 

@@ -1,0 +1,177 @@
+"""The law that a free correction measured: a curve with its band, and the few strongest parts as a formula."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.mismatch.fit import Fit
+from estimation.mismatch.free import DEGREE, KNOTS
+from scanner.terms import Scales
+
+Array = NDArray[np.float64]
+
+EARNS = 12.0
+"""Fall of chi-square that a part of a formula has to be worth."""
+
+
+class Section(NamedTuple):
+    """A cut through a free correction along which its law can be drawn.
+
+    Attributes:
+        columns: of the parameters that are seen along it, what one unit of each adds, each of the shape of ``grid``.
+        label, unit: of the law. grid: of what it is drawn over; x_label: what that is.
+    """
+
+    columns: dict[str, Array]
+    label: str
+    unit: str
+    grid: Array
+    x_label: str
+
+
+def correction_curve(fit: Fit) -> dict[str, Any]:
+    """The law that the last, free correction of a fit measured: a curve with its band of one standard deviation.
+
+    It is drawn along the section on which most of it stands.
+    """
+    candidate = fit.model.candidates[-1]
+    scales = fit.model.scales(candidate.axis)
+    at = [i for i, f in enumerate(fit.model.free) if f.kind == "term" and f.owner == candidate.key]
+    names = [fit.model.free[i].name for i in at]
+    sizes = np.array([p.value(1.0, scales) for p in candidate.term.free])
+
+    def basis(section: Section) -> Array:
+        nothing = np.zeros(section.grid.size)
+        return sizes * np.stack([section.columns.get(name, nothing) for name in names], axis=1)
+
+    def share(section: Section) -> float:
+        """Mean square of the law along a section, over its largest unit: sections have units of their own."""
+        largest = max(np.abs(column).max() for column in section.columns.values())
+        return float(np.mean((basis(section) @ fit.x[at] / largest) ** 2))
+
+    section = max(_sections(candidate.term.effect, scales), key=share)
+    columns = basis(section)
+    value = columns @ fit.x[at]
+    band = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", columns, fit.covariance[np.ix_(at, at)], columns), 0.0))
+    points = [[float(a), float(b), float(c)] for a, b, c in zip(section.grid, value, band, strict=True)]
+    labels = {"x": section.x_label, "y": section.label, "unit": section.unit}
+    labels["columns"] = [section.x_label, section.label, "sd"]  # type: ignore[assignment]
+    return labels | {"points": points, "formula": formula(fit, at)}
+
+
+def _sections(effect: str, s: Scales) -> list[Section]:
+    """The ways in which the law of a free correction can be drawn."""
+    u = np.linspace(-1.0, 1.0, 121)
+    turn = 0.5 * np.pi * (u + 1.0)
+    time = s.duration * turn / np.pi
+
+    def waves(letter: str, most: int = 40) -> dict[str, Array]:
+        return {f"{letter}{j}": np.cos(j * turn) for j in range(most)}
+
+    match effect:
+        case "free-mechanics":
+            torque = s.k * s.amplitude
+            powers = range(2, DEGREE + 1)
+            angle = {f"f{n}0": torque * u**n for n in powers}
+            rate = {f"f0{n}": torque * u**n for n in powers}
+            return [
+                Section(angle, "torque at zero rate", "N m", s.amplitude * u, "angle (rad)"),
+                Section(rate, "torque at zero angle", "N m", s.amplitude * s.rate * u, "rate (rad/s)"),
+                Section({n: torque * c for n, c in waves("k").items()}, "change of k A", "N m", time, "time (s)"),
+            ]
+        case "free-stiffness":
+            return [Section(waves("k"), "stiffness error / k", "1", time, "time (s)")]
+        case "free-capacitance":
+            span = 1.5 * u
+            profile = {f"a{n}": np.exp(-(span**2)) * span**n for n in (1, 3, 4, 5, 6)}
+            return [Section(profile, "extra capacitance / C0", "1", span, "angle / theta0")]
+        case "free-drive":
+            static, slopes = {"v0": u, "v2": u**2, "v3": u**3}, {"v1": u, "v5": u**3}
+            return [
+                Section(static, "drive error / rms", "1", u, "drive / rms"),
+                Section(slopes, "drive error / rms", "1", u, "slope / (rms · rate)"),
+                Section(waves("g"), "gain error", "1", time, "time (s)"),
+                Section(waves("o"), "offset / rms", "1", time, "time (s)"),
+            ]
+        case "free-readout":
+            x, v = np.cos(np.pi * u), -np.sin(np.pi * u)
+            by_rate = {"w0": v, "w1": v * x, "w2": v, "w3": v**3, "w4": v**5}
+            return [
+                Section({"y0": u**2, "y1": u**3}, "signal error / rms", "1", u, "signal / rms"),
+                Section(by_rate, "gain error at full swing", "1", np.pi * u, "phase of the swing (rad)"),
+                Section(waves("g"), "gain error", "1", time, "time (s)"),
+                Section(waves("o"), "offset / rms", "1", time, "time (s)"),
+            ]
+        case "free-timing":
+            return [Section(waves("d"), "delay", "s", time, "time (s)")]
+        case _:
+            hats = {f"c{i}": s.amplitude * np.interp(u, KNOTS, hat) for i, hat in enumerate(np.eye(KNOTS.size))}
+            return [Section(hats, "angle error", "rad", s.amplitude * u, "angle (rad)")]
+
+
+LENGTH = "T: the recording's length"
+STATE = "x = θ/A, y = θ'/(A ω)"
+VARIABLES = {
+    "free-mechanics": ("f/(k A)", f"{STATE}, {LENGTH}"),
+    "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
+    "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
+    "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),
+    "free-readout": ("δy/s", f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), s: the signal's rms, {LENGTH}"),
+    "free-timing": ("delay/s", LENGTH),
+    "free-optics": ("δθ/A", "x = θ/A"),
+}
+"""What the formula of a free correction gives, and the variables that it is written in."""
+
+POLYNOMIALS = {
+    "free-capacitance": {"a1": "u", "a3": "u³", "a4": "u⁴", "a5": "u⁵", "a6": "u⁶"},
+    "free-drive": {"v0": "u", "v1": "v", "v2": "u²", "v3": "u³", "v4": "u v", "v5": "v³"},
+    "free-readout": {
+        "y0": "u²", "y1": "u³", "y2": "w", "w0": "u y", "w1": "u x y", "w2": "u r", "w3": "u r³", "w4": "u r⁵",
+    },
+}  # fmt: skip
+"""Parts of free corrections that are no cosines, as a formula shows them."""
+
+SWAYING = {"k": "x ", "b": "y ", "g": "u ", "o": "", "d": ""}
+"""What the cosines of each letter multiply."""
+
+
+POWER = ("", "", "²", "³", "⁴", "⁵")
+
+
+def _symbol(effect: str, name: str) -> str:
+    """A parameter's part of the law, for a reader."""
+    letter, number = name[0], name[1:]
+    if name in POLYNOMIALS.get(effect, {}):
+        return POLYNOMIALS[effect][name]
+    if effect == "free-mechanics" and letter == "f":
+        parts = [base + POWER[int(n)] for base, n in zip("xy", number, strict=True) if n != "0"]
+        return " ".join(parts)
+    if letter == "c":
+        return f"hat(x − {KNOTS[int(number)]:.2g})".replace("− -", "+ ")
+    wave = "" if number == "0" else f"cos({number} π t/T)".replace("(1 ", "(")
+    return SWAYING[letter] + wave
+
+
+def formula(fit: Fit, at: list[int], most: int = 4) -> str:
+    """The few strongest parts of a free correction (sparse regression: backward elimination until each is worth it)."""
+    candidate = fit.model.candidates[-1]
+    information = np.linalg.inv(fit.covariance[np.ix_(at, at)])
+    push = information @ fit.x[at]
+    values, kept = fit.x[at], list(range(len(at)))
+    while kept:
+        inner = information[np.ix_(kept, kept)]
+        values = np.linalg.solve(inner, push[kept])
+        worth = values**2 / np.diag(np.linalg.inv(inner))
+        weakest = int(np.argmin(worth))
+        if worth[weakest] > EARNS and len(kept) <= most:
+            break
+        kept.pop(weakest)
+        values = np.delete(values, weakest)
+    scales, effect = fit.model.scales(candidate.axis), candidate.term.effect
+    free = [candidate.term.free[i] for i in kept]
+    parts = [f"{p.value(v, scales):.3g} {_symbol(effect, p.name)}".strip() for p, v in zip(free, values, strict=True)]
+    law, variables = VARIABLES[effect]
+    return f"{law} = {' + '.join(parts) or '0'}".replace("+ -", "− ") + f" with {variables}"
