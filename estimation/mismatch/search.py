@@ -81,7 +81,7 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     """Locate and name what ``device`` leaves out of ``runs``.
 
     Where a free correction does better than any one term but leaves something of a misfit that is large, several terms
-    may be at work: they are kept if, one after the other, they leave next to nothing of it.
+    may be at work: they are kept if, one after the other, they leave next to nothing of it and less than it does.
 
     Args:
         terms: effects to look for.
@@ -100,7 +100,8 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     found = states[-1]
     if _is_free(found.best) and found.nominal.held_chi2 > LARGE and found.best.held_chi2 > ADEQUATE:
         several = _several(states[-2], _extended(states[-2], named, early, stops, say))
-        if several.best.held_chi2 - 1.0 < NEXT_TO_NOTHING * (several.nominal.held_chi2 - 1.0):
+        enough = several.best.held_chi2 - 1.0 < NEXT_TO_NOTHING * (several.nominal.held_chi2 - 1.0)
+        if enough and solve(found.comparison, several.best.model, several.best.x).evidence < found.best.evidence:
             found = several
     elif found.best.model.candidates and not _is_free(found.best) and found.best.held_chi2 > INADEQUATE:
         found = _unnamed(found)
