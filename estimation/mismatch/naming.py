@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,9 @@ EASE = 5
 
 LOST = 3.0
 """Growth of the reduced chi-square, from one window to the next, by which the motion has been lost."""
+
+FAR = 30.0
+"""Growth of it from which the model is no longer about to lose the motion: a window in between tells more."""
 
 TOGETHER, ALONE = 3, 12
 """Windows that may be put in between for all, and for one free correction that runs alone."""
@@ -163,20 +167,18 @@ def race(
     Args:
         early: fits of the nominal model over the windows ``stops``.
     """
-    first = _failing(early)
-    followed = early[max(first - 1, 0)]
-    base = solve(comparison, nominal, nominal.embed(early[first].model, early[first].x), stops[first], 8)
-    field = sorted(screen(comparison, base, candidates, stops[first]), key=lambda each: -each.gain)
+    followed, reached, base, brink = _brink(comparison, nominal, early, stops)
+    field = sorted(screen(comparison, base, candidates, brink), key=lambda each: -each.gain)
     choosy = base.rows.sum() > MANY_SAMPLES
     named, _ = _apart(field)
     named = [each for i, each in enumerate(named) if not choosy or i < STARTERS or each.gain > 0.5 * field[0].gain]
     _, free = _apart(field[:STARTERS])
-    reached = stops[first - 1] if first else 0.0
-    tracks = [*([] if first else stops[:1]), *_eased(stops[max(first - 1, 0) :])]
+    later = [stop for stop in stops if stop > brink]
+    tracks = list(_eased([reached, brink, *later])) if reached else [brink, *_eased([brink, *later])]
 
     def through(part: list[Screened], bar: float) -> list[Fit]:
         running = [
-            (each.model, _unspoilt(each, followed) if first else stepped(comparison, base, each, stops[first]))
+            (each.model, _unspoilt(each, followed) if reached else stepped(comparison, base, each, brink))
             for each in part
         ]
         if any(each.candidate.term.effect in FREE for each in part):  # few, and none is a measure of another
@@ -184,6 +186,35 @@ def race(
         return _raced(comparison, running, tracks, reached, TOGETHER)
 
     return _named_first(named, free, through)
+
+
+class Brink(NamedTuple):
+    """Where a model begins to lose the motion.
+
+    Attributes:
+        followed: its fit over the longest window ``reached`` that it follows (0 for none, and the first window's fit).
+        failing: its fit over the window ``stop``, over which it fails, but not by far.
+    """
+
+    followed: Fit
+    reached: float
+    failing: Fit
+    stop: float
+
+
+def _brink(comparison: Comparison, model: Model, early: Sequence[Fit], stops: Sequence[float]) -> Brink:
+    """Of windows that grow by large steps the two between which ``model`` fails, and windows between these."""
+    first = _failing(early)
+    followed, reached, stop = early[max(first - 1, 0)], stops[first - 1] if first else 0.0, stops[first]
+    failing = solve(comparison, model, model.embed(early[first].model, early[first].x), stop, 8)
+    while _level(failing) > FAR * max(_level(followed), 1.0) and stop > FINEST**2 * reached > 0.0:
+        middle = float(np.sqrt(reached * stop))
+        fit = solve(comparison, model, model.embed(followed.model, followed.x), middle, 8)
+        if _level(fit) < 2.0 * _level(followed):
+            followed, reached = fit, middle
+        else:
+            failing, stop = fit, middle
+    return Brink(followed, reached, failing, stop)
 
 
 def _raced(
@@ -214,7 +245,7 @@ def _raced(
             best = min((fit.evidence for fit in fits if possible(fit)), default=bar - HOPELESS)
             fits.append(solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS))
         fits.sort(key=lambda fit: fit.evidence if possible(fit) else np.inf)
-        now = fits[0].chi2 / int(fits[0].rows.sum())
+        now = _level(fits[0])
         if now > LOST * max(level, 1.0) and splits and stop > FINEST * reached > 0.0:
             ahead.append(float(np.sqrt(reached * stop)))
             splits -= 1
@@ -231,9 +262,14 @@ def _raced(
     return [fit for fit in fits if possible(fit)]
 
 
+def _level(fit: Fit) -> float:
+    """Reduced chi-square over the window of a fit."""
+    return fit.chi2 / int(fit.rows.sum())
+
+
 def _failing(early: Sequence[Fit]) -> int:
     """The first window over which the nominal model follows the motion worse than before."""
-    levels = [fit.chi2 / fit.rows.sum() for fit in early]
+    levels = [_level(fit) for fit in early]
     first = 0
     while first + 1 < len(levels) and levels[first] < 2.0 * min([TRACKED, *levels[:first]]):
         first += 1

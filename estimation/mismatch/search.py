@@ -40,6 +40,9 @@ NEXT_TO_NOTHING = 0.005
 INADEQUATE = 1.3
 """Held-out reduced chi-square from which named terms are no explanation: near relatives stand in for something else."""
 
+ASTRAY = 100.0
+"""Reduced chi-square from which a fit has lost the motion: first order around it says nothing of a further effect."""
+
 CLOSE = 80.0
 """Rivals within this of the best in -2 log evidence are refitted when the noise has been measured anew."""
 
@@ -134,9 +137,12 @@ def _extended(
         pool = [each for each in terms if not (adequate and each.effect in FREE)]
         candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
         say(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
-        if taken or best.chi2 < TRACKED * best.rows.sum():
+        if best.chi2 < (ASTRAY if taken else TRACKED) * best.rows.sum():
             fits = near(comparison, best, candidates)
         else:
+            if taken:
+                say(f"where {', '.join(sorted(taken))} still follows")
+                early = grown(comparison, best.model, best.model.embed(early[0].model, early[0].x), stops)
             fits = race(comparison, best.model, early, stops, candidates)
         if not fits or best.evidence - fits[0].evidence < LEAD_OVER_NOTHING:
             return
@@ -155,7 +161,7 @@ def _extended(
         if _is_free(found):
             say("named terms in the free correction's place")
             comparison, before, found = _by_name(comparison, before, found, named)
-        if not _is_free(found):
+        if not _is_free(found) and found.chi2 < ASTRAY * found.rows.sum():
             # The first to be taken may have imitated all: where much is left, its place is open too.
             kept = len(best.model.candidates) if found.held_chi2 <= TRACKED else 0
             final = settled(comparison, found, named, len(found.model.candidates) - kept)
