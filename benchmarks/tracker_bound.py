@@ -19,7 +19,7 @@ from estimation.tracker.bound import phase_bound
 from estimation.tracker.signal import prepare
 from estimation.tracker.step import PHASE, STATES
 from estimation.tracker.track import averaged, follow, signed, starting_belief
-from estimation.tracker.tuning import likely_walks, tuned_walk
+from estimation.tracker.tuning import likely_walks, stretches, tuned_walk
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.score import axis_error
@@ -79,7 +79,7 @@ def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
             references = {name: reference_of(quiet, device, name, sense.channel, True) for name in sense.axes}
             known = prepare(quiet, device, sense, references)
             start, _ = signed(known, starting_belief(known, device))
-            truth = follow(known, start, np.tile([1e-6, 10.0, 1e-6], (len(sense.axes), 1))).states
+            truth = follow(known, start, np.tile([1e-6, 10.0, 1e-6], (1, len(sense.axes), 1)))[0].states
             walk = np.tile([0.0, TREND_DENSITY, 0.0, 0.0], (len(sense.axes), 1))
             power = float(np.var(sense.channel.read()))
             for snr in SNR_DB:
@@ -89,8 +89,9 @@ def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
                     (own,) = (s for s in senses(noisy, device) if s.channel.name == sense.channel.name)
                     prepared = prepare(noisy, device, own, references)
                     begin, _ = signed(prepared, starting_belief(prepared, device))
-                    walk = tuned_walk(prepared, begin)
-                    found = averaged(prepared, begin, likely_walks(prepared, begin, walk))
+                    parts = stretches(prepared.signal)
+                    likely = likely_walks(prepared, begin, parts, tuned_walk(prepared, begin, parts))
+                    found = averaged(prepared, begin, likely)
                     for i, name in enumerate(sense.axes):
                         error = found.states[:, i * STATES + PHASE] - truth[:, i * STATES + PHASE]
                         error = (error + np.pi / 2) % np.pi - np.pi / 2

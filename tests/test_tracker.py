@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import DRIVES, own_electrodes, separate_electrodes, shared_electrode
+from worlds import DRIVES, noisy, own_electrodes, quiet, separate_electrodes, shared_electrode, with_sense
 
 from estimation.estimate import estimate
-from estimation.signals import reference_of, senses
 from estimation.tracker import PhaseSeen, track
 from estimation.tracker.angle import SEGMENT, SlowAngle
-from estimation.tracker.backward import kicks, run_smoother
 from estimation.tracker.orbit import axis_law, turn_of
-from estimation.tracker.signal import Prepared, prepare
-from estimation.tracker.smoother import expected, run_filter
-from estimation.tracker.step import DAMPING, GAIN, LOG, PHASE, STATES, STIFFNESS, TREND
-from estimation.tracker.track import follow, signed, starting_belief
-from estimation.tracker.tuning import tuned_walk
-from phantoms.forward import Plan, Start, quantised, simulate
+from phantoms.forward import Plan, Start, simulate
 from phantoms.waveforms import Constant, Sequence, Sine
 from recon.mapping import Grid, accumulate
 from recon.slow_mapping import accumulate_slow
 from scanner import devices
 from scanner.demodulate import block_phasors
-from scanner.device import Amdm, Device, Drive, Position
+from scanner.device import Device, Drive, Position
 from scanner.drift import Drift, settling
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion
@@ -48,14 +39,6 @@ def errors(axis: AxisMotion, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     assert np.allclose(time, axis.time)
     error = axis.phase - np.angle(z * np.exp(-1j * reference.phase(time)))
     return (error + np.pi / 2) % np.pi - np.pi / 2, np.log(axis.amplitude / np.abs(z))
-
-
-def with_sense(recording: Recording, change, device: Device | None = None) -> Recording:  # type: ignore[no-untyped-def]
-    channels = {k: (c.read(), c.unit, c.sample_rate, c.start) for k, c in recording.channels.items()}
-    for name in channels:
-        if name.startswith("sense"):
-            channels[name] = (change(channels[name][0].copy()), *channels[name][1:])
-    return Recording.from_arrays(channels, device or recording.device)
 
 
 # --- the slow flow
@@ -108,69 +91,6 @@ def test_harmonics_of_the_motion_are_those_of_the_integrated_one() -> None:
 
 
 # --- tracks
-
-
-@cache
-def quiet() -> tuple[Recording, dict]:
-    device = devices.load("imaging")
-    assert isinstance(device.readout, Amdm)
-    silent = replace(device, readout=replace(device.readout, noise_var=0.0, bits=None))
-    plan = Plan(DRIVES, 0.03, drift={axis: Drift(settling(-0.002, 0.025)) for axis in "xy"})
-    return simulate(silent, plan)
-
-
-def noisy(seed: int, sd: float = 0.01386) -> Recording:
-    """The quiet recording with a seed's noise: a simulation for each seed would cost a hundred times more."""
-    rng = np.random.default_rng(seed)
-    return with_sense(
-        quiet()[0], lambda y: quantised(y + rng.normal(0.0, sd, y.size), 12, 10.0), devices.load("imaging")
-    )
-
-
-@cache
-def prepared_of(seed: int) -> Prepared:
-    device, recording = devices.load("imaging"), noisy(seed)
-    (sense,) = senses(recording, device)
-    references = {n: reference_of(recording, device, n, sense.channel, True) for n in sense.axes}
-    return prepare(recording, device, sense, references)
-
-
-def test_measurement_is_linearised_with_the_rate_that_stiffness_and_damping_give() -> None:
-    prepared = prepared_of(8)
-    x = starting_belief(prepared, devices.load("imaging")).x
-    root = prepared.signal.roots[prepared.signal.geometry[3]]
-    x[STIFFNESS], x[DAMPING], step = 1e-3, 0.05, 1e-5
-
-    def whitened(at: np.ndarray) -> np.ndarray:
-        return sum(a @ b for a, b in zip(root, expected(prepared.rows, prepared.signal, 3, at)[0], strict=True))
-
-    _, jacobian = expected(prepared.rows, prepared.signal, 3, x)
-    for state in (PHASE, LOG, STIFFNESS, DAMPING, GAIN, STATES + STIFFNESS, x.size - 1):
-        moved = np.arange(x.size) == state
-        slope = (whitened(x + step * moved) - whitened(x - step * moved)) / (2 * step)
-        own = sum(a @ b for a, b in zip(root, jacobian, strict=True))[:, state]
-        assert np.abs(own - slope).max() < 0.05 * np.abs(slope).max()
-
-
-def test_score_is_the_slope_of_the_likelihood() -> None:
-    prepared = prepared_of(8)
-    start = starting_belief(prepared, devices.load("imaging"))
-    walk = np.tile([1e-7, 0.02, 1e-6, 1e-8], (2, 1))
-
-    def told(trend: float) -> tuple[float, np.ndarray, np.ndarray]:
-        m, n = len(prepared.time), start.x.size
-        kept = [np.empty((m, n, n) if matrix else (m, n)) for matrix in (0, 1, 0, 1, 1)]
-        own = walk.copy()
-        own[0, 1] *= trend
-        args = (start.x.copy(), start.P.copy(), start.live.copy(), own, 1e-8)
-        log_likelihood, *_ = run_filter(prepared.rows, prepared.signal, *args, *kept)
-        run_smoother(*kept)
-        return log_likelihood, *kicks(*kept[:4])
-
-    slope = (told(1.1)[0] - told(0.9)[0]) / 0.2
-    _, squares, spreads = told(1.0)
-    score = 0.5 * (squares - spreads)[TREND] * walk[0, 1] * prepared.signal.step
-    assert score == pytest.approx(slope, rel=0.1)
 
 
 def test_model_is_right_to_two_thousandths_of_a_degree() -> None:
@@ -399,32 +319,3 @@ def test_signal_that_never_changes_is_refused() -> None:
     constant = with_sense(shared_electrode()[0], np.zeros_like)
     with pytest.raises(BadInput, match="stays at 0 V"):
         track(constant, devices.load("imaging"))
-
-
-def test_windows_give_what_one_pass_gives(monkeypatch: pytest.MonkeyPatch) -> None:
-    prepared = prepared_of(8)
-    start, _ = signed(prepared, starting_belief(prepared, devices.load("imaging")))
-    walk = tuned_walk(prepared, start)
-    whole = follow(prepared, start, walk)
-    module = sys.modules["estimation.tracker.track"]
-    monkeypatch.setattr(module, "WINDOW", 10)
-    monkeypatch.setattr(module, "LAG", 35)
-    pieces = follow(prepared, start, walk)
-    assert (np.abs(pieces.states - whole.states) < 0.1 * whole.sds)[:, [0, 6]].all()
-
-
-def test_an_earlier_track_shortens_the_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
-    recording, device = noisy(8), devices.load("imaging")
-    module, rounds = sys.modules["estimation.tracker.tuning"], []
-
-    def counted(*kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rounds.append(1)
-        return kicks(*kept)
-
-    monkeypatch.setattr(module.backward, "kicks", counted)
-    alone = track(recording, device)
-    cold = len(rounds)
-    again = track(recording, device, before=alone)
-    assert len(rounds) - cold < cold
-    for name, axis in again.axes.items():
-        assert np.all(np.abs(axis.phase - alone.axes[name].phase) < 0.2 * axis.phase_sd)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_tracker import DRIVES, RATE, with_sense
-from worlds import own_electrodes
+from test_tracker import RATE
+from worlds import DRIVES, own_electrodes, with_sense
 
 from estimation.reference import Reference
 from estimation.tracker import track

@@ -3,8 +3,12 @@
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
+
+from estimation.signals import reference_of, senses
+from estimation.tracker.signal import Prepared, prepare
 from phantoms.experiment import Experiment, run
-from phantoms.forward import Plan, simulate
+from phantoms.forward import Plan, quantised, simulate
 from phantoms.waveforms import Sine
 from scanner import devices
 from scanner.device import Amdm, Device
@@ -41,3 +45,39 @@ def separate_electrodes(duration: float = 0.012, drift: float = -0.002, seed: in
 def imaging(duration: float = 0.02, seed: int = 1) -> tuple[Recording, dict]:
     """A scan of the tissue picture, as the demo's but shorter."""
     return run(Experiment(duration=duration), seed)
+
+
+def with_sense(recording: Recording, change, device: Device | None = None) -> Recording:  # type: ignore[no-untyped-def]
+    """The recording with each of its sense signals changed."""
+    channels = {k: (c.read(), c.unit, c.sample_rate, c.start) for k, c in recording.channels.items()}
+    for name in channels:
+        if name.startswith("sense"):
+            channels[name] = (change(channels[name][0].copy()), *channels[name][1:])
+    return Recording.from_arrays(channels, device or recording.device)
+
+
+@cache
+def quiet() -> tuple[Recording, dict]:
+    """Both axes in one sense signal, drifting, without noise."""
+    device = devices.load("imaging")
+    assert isinstance(device.readout, Amdm)
+    silent = replace(device, readout=replace(device.readout, noise_var=0.0, bits=None))
+    plan = Plan(DRIVES, 0.03, drift={axis: Drift(settling(-0.002, 0.025)) for axis in "xy"})
+    return simulate(silent, plan)
+
+
+def noisy(seed: int, sd: float = 0.01386) -> Recording:
+    """The quiet recording with a seed's noise: a simulation for each seed would cost a hundred times more."""
+    rng = np.random.default_rng(seed)
+    return with_sense(
+        quiet()[0], lambda y: quantised(y + rng.normal(0.0, sd, y.size), 12, 10.0), devices.load("imaging")
+    )
+
+
+@cache
+def prepared_of(seed: int) -> Prepared:
+    """The blocks of ``noisy``."""
+    device, recording = devices.load("imaging"), noisy(seed)
+    (sense,) = senses(recording, device)
+    references = {n: reference_of(recording, device, n, sense.channel, True) for n in sense.axes}
+    return prepare(recording, device, sense, references)

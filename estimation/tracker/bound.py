@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.tracker.backward import run_smoother
+from estimation.tracker.backward import smoothed
+from estimation.tracker.linear import predict, unmade
 from estimation.tracker.orbit import SENSED, law_of, turn_of
 from estimation.tracker.signal import Prepared
-from estimation.tracker.step import DAMPING, GAIN, LOG, PHASE, STATES, STIFFNESS, predict
+from estimation.tracker.smoother import unfiltered
+from estimation.tracker.step import DAMPING, GAIN, LOG, PHASE, STATES, STIFFNESS, padded
 from scanner.harmonics import readout_response
 
 Array = NDArray[np.float64]
@@ -30,19 +32,19 @@ def phase_bound(prepared: Prepared, states: Array, P: Array, walk: Array, noise_
     """
     blocks, n = states.shape
     rows, signal = prepared.rows, prepared.signal
-    xs, xp = np.zeros((blocks, n)), np.zeros((blocks, n))
-    Ps, Pp, Fs = np.empty((blocks, n, n)), np.empty((blocks, n, n)), np.empty((blocks, n, n))
-    Fs[0] = np.eye(n)
+    own, left, room = unmade(signal), unfiltered(blocks, len(rows)), np.zeros((2, padded(n), padded(n)))
+    left.states[:], left.slopes[:], left.noise[:] = 0.0, 0.0, noise_var
+    left.states[:, :n], (carried, information) = states, room
+    carried[:n, :n] = P
     for k in range(blocks):
         if k > 0:
-            P, Fs[k] = predict(rows, signal, k - 1, states[k - 1].copy(), P, walk, 0.0)
-        Pp[k] = P
-        Ps[k] = np.linalg.inv(np.linalg.inv(P) + _information(prepared, k, states[k]) / noise_var)
-        P = Ps[k].copy()
-    phases = [a * STATES + PHASE for a in range(len(prepared.laws))]
-    filtered = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2)[:, phases])
-    run_smoother(xs, Ps, xp, Pp, Fs)
-    return filtered, np.sqrt(np.diagonal(Ps, axis1=1, axis2=2)[:, phases])
+            predict(rows, signal, k - 1, left.states[k - 1].copy(), carried, walk, 0.0, own, left.taken[k])
+        information[:n, :n] = _information(prepared, k, states[k])
+        carried[:n, :n] = np.linalg.inv(np.linalg.inv(carried[:n, :n]) + information[:n, :n] / noise_var)
+        own.information[k], left.covariances[k] = information, carried
+    phases = [a * STATES + PHASE for a in range(len(rows))]
+    filtered = np.sqrt(np.diagonal(left.covariances, axis1=1, axis2=2)[:, phases])
+    return filtered, np.sqrt(smoothed(signal, own, left)[1][:, phases])
 
 
 def _information(prepared: Prepared, k: int, x: Array) -> Array:

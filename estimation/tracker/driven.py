@@ -65,7 +65,8 @@ def drive_only(recording: Recording, device: Device, seen: Mapping[str, PhaseSee
     for name in device.axes:
         prepared = with_phases(prepare_driven(recording, device, name), seen or {})
         start = steady_belief(prepared, device)
-        tracks = [follow(prepared, start, np.array([[LEAST_WALK[0], trend, LEAST_WALK[2]]])) for trend in TRENDS]
+        walks = np.array([[[LEAST_WALK[0], trend, LEAST_WALK[2]]] for trend in TRENDS])
+        tracks = follow(prepared, start, walks)
         best = int(np.argmax([each.log_likelihood for each in tracks]))
         drive = prepared.sense.channel
         sign = "ambiguous" if prepared.laws[0].pull else "known: the drive"

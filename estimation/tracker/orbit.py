@@ -20,8 +20,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from estimation.bell import bell
 from scanner.device import Axis, Position, Readout
-from scanner.laws import capacitance, capacitance_curvature, capacitance_slope
 
 Array = NDArray[np.float64]
 
@@ -105,13 +105,13 @@ class Turn(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _line(values, n):  # type: ignore[no-untyped-def]
-    """Coefficient of exp(i n u): values = sum of Re(line exp(i n u))."""
+def _line(values, n, points):  # type: ignore[no-untyped-def]
+    """Coefficient of exp(i n u): values = sum of Re(line exp(i n u)), told by the first ``points`` of them."""
     even, odd = 0.0, 0.0
-    for j in range(POINTS):
+    for j in range(points):
         even += values[j] * COS[n, j]
         odd += values[j] * SIN[n, j]
-    scale = (1.0 if n == 0 else 2.0) / POINTS
+    scale = (1.0 if n == 0 else 2.0) / points
     return complex(even * scale, -odd * scale)
 
 
@@ -128,46 +128,50 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
     Returns:
         Turn.
     """
-    room = np.zeros((10, POINTS))  # one allocation: ten of them took as long as all the rest
+    # Combs that know no side, driven twice a turn: half a turn on, motion and torque have changed their sign and the
+    # capacitance is the same, so that half the points tell all there is and every other harmonic vanishes.
+    half = law.theta_th == 0.0 and law.turn == 2
+    points = POINTS // 2 if half else POINTS
+    room = np.empty((10, POINTS))  # one allocation: ten of them took as long as all the rest
     seen_at, slope_at, bend_at, square, square_slope = room[0], room[1], room[2], room[3], room[4]
     torque, stiff, own, by_log, by_phase = room[5], room[6], room[7], room[8], room[9]
-    square[:] = force[0].real
+    narrow = 1.0 / law.theta0
     for j in range(QUARTER + 1):  # sin u takes each of its values twice in a turn, an even comb four times
         theta = amplitude * SIN[1, j]
-        value = capacitance(theta, law.C0, law.Cb, law.theta0, law.theta_th)
-        slope = capacitance_slope(theta, law.C0, law.theta0, law.theta_th)
-        bend = capacitance_curvature(theta, law.C0, law.theta0, law.theta_th)
+        value, slope, bend = bell(theta, law.C0, law.Cb, narrow, law.theta_th)
         for i in (j, 2 * QUARTER - j):
             seen_at[i], slope_at[i], bend_at[i] = value, slope, bend
+        if half:
+            continue
         if law.theta_th == 0.0:
             slope = -slope
         else:
-            value = capacitance(-theta, law.C0, law.Cb, law.theta0, law.theta_th)
-            slope = capacitance_slope(-theta, law.C0, law.theta0, law.theta_th)
-            bend = capacitance_curvature(-theta, law.C0, law.theta0, law.theta_th)
+            value, slope, bend = bell(-theta, law.C0, law.Cb, narrow, law.theta_th)
         for i in ((POINTS - j) % POINTS, 2 * QUARTER + j):
             seen_at[i], slope_at[i], bend_at[i] = value, slope, bend
+    for j in range(points):
+        square[j], square_slope[j], own[j] = force[0].real, 0.0, 0.0
     for m in range(1, DRIVEN):
         if force[m] != 0.0:
             n = m * law.turn
             line = force[m] * np.exp(-1j * n * phase)
-            for j in range(POINTS):
+            for j in range(points):
                 square[j] += line.real * COS[n, j] - line.imag * SIN[n, j]
                 square_slope[j] += n * (line.real * SIN[n, j] + line.imag * COS[n, j])  # by phi, at fixed u
-    for j in range(POINTS):
+    for j in range(points):
         torque[j] = law.pull * slope_at[j] * square[j] + law.push * square[j]
         stiff[j] = law.pull * bend_at[j] * square[j]
     moved = np.zeros(MOVED + 1, np.complex128)
     for n in range(MOVED + 1):
-        if n != 1:
+        if n != 1 and not (half and n % 2 == 0):
             held = k - n * n * w * w * law.J + 1j * n * w * b
             if n == 0:
-                held -= _line(stiff, 0).real
-            moved[n] = _line(torque, n) / held
-            for j in range(POINTS):
+                held -= _line(stiff, 0, points).real
+            moved[n] = _line(torque, n, points) / held
+            for j in range(points):
                 own[j] += moved[n].real * COS[n, j] - moved[n].imag * SIN[n, j]
     mean_bend = 0.0
-    for j in range(POINTS):
+    for j in range(points):
         swing = amplitude * SIN[1, j]
         torque[j] += stiff[j] * own[j]
         by_log[j] = stiff[j] * swing
@@ -177,19 +181,20 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
         else:
             seen_at[j] += (slope_at[j] + 0.5 * bend_at[j] * own[j]) * own[j]
             slope_at[j] = (slope_at[j] + bend_at[j] * own[j]) * swing
-            mean_bend += (slope_at[j] + bend_at[j] * swing * swing) / POINTS
+            mean_bend += (slope_at[j] + bend_at[j] * swing * swing) / points
     inertia = 2j * w * law.J + b
-    first = 1j * _line(torque, 1) / amplitude
+    first = 1j * _line(torque, 1, points) / amplitude
     rate = (first + law.J * w * w - k - 1j * w * b) / inertia
-    by_phase_rate = 1j * _line(by_phase, 1) / amplitude / inertia
-    by_log_rate = (1j * _line(by_log, 1) / amplitude - first) / inertia
+    by_phase_rate = 1j * _line(by_phase, 1, points) / amplitude / inertia
+    by_log_rate = (1j * _line(by_log, 1, points) / amplitude - first) / inertia
     change = by_phase_rate * rate.imag + by_log_rate * rate.real
     own_share = 1.0 - 2.0 * law.J * rate / inertia  # of a change of the rate, that its square leaves
     rate -= law.J * (rate * rate + change) / inertia
-    seen, seen_by_log = np.empty(SENSED + 1, np.complex128), np.empty(SENSED + 1, np.complex128)
+    seen, seen_by_log = np.zeros(SENSED + 1, np.complex128), np.zeros(SENSED + 1, np.complex128)
     for n in range(SENSED + 1):
-        seen[n] = _line(seen_at, n)
-        seen_by_log[n] = _line(slope_at, n)
+        if not half or n % 2 == int(law.position):
+            seen[n] = _line(seen_at, n, points)
+            seen_by_log[n] = _line(slope_at, n, points)
     return Turn(
         rate,
         own_share * by_phase_rate,

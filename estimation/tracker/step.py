@@ -1,9 +1,9 @@
 """One step of the tracker's state, compiled: from a block to the next by the slow flow.
 
 State of each axis: phase phi, ln A, relative change of stiffness, its trend [1/s], relative change of damping, ln gain;
-then the readout's offset, one for all axes of an electrode. Between two blocks phase and amplitude follow the slow flow
-(``orbit``), linearised about the state and integrated exactly, with each block's own drive; the trend of the stiffness,
-the damping and the gain walk at random.
+then the readout's offset, one for all axes of an electrode, and zeros up to a multiple of LANES. Between two blocks
+phase and amplitude follow the slow flow (``orbit``), linearised near the state and integrated exactly, with each
+block's own drive; the trend of the stiffness, the damping and the gain walk at random.
 """
 
 from __future__ import annotations
@@ -21,10 +21,18 @@ Complex = NDArray[np.complex128]
 
 PHASE, LOG, STIFFNESS, TREND, DAMPING, GAIN = range(6)
 STATES = 6  # of an axis
+LANES = 8  # states are made up to a multiple of these: rows of matrices then fill registers, in half the time
 
 FLOOR = 1e-3  # of theta0: a smaller amplitude is no motion
 UNKNOWN = (10.0, 3.0)  # the same at which nothing is known: without data an unstable flow would let them run away
 TRIES = 5
+RATES = 5  # of an axis, see set_rates
+NONLINEAR = 2e-3  # step of phase [rad], ln A or anything else, see change, after which a block is linearised anew
+
+
+def padded(states: int) -> int:
+    """The next multiple of LANES."""
+    return -(-states // LANES) * LANES
 
 
 class Signal(NamedTuple):
@@ -72,57 +80,79 @@ class Signal(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def flow(law, x, w, force, h, walk):  # type: ignore[no-untyped-def]
-    """One axis over ``h`` seconds: new state (6,), what phase and ln A take from the first five states (2, 5), and the
-    covariance (6, 6) that walking adds.
+def set_rates(law, turn, stiff, damp, rates):  # type: ignore[no-untyped-def]
+    """The slow rate of a turn and its derivatives by phase, ln A and the states of stiffness and damping, (RATES,)."""
+    rates[0], rates[1], rates[2] = turn.rate, turn.by_phase, turn.by_log
+    rates[3], rates[4] = turn.by_stiffness * (law.k / stiff), turn.by_damping * (law.b / damp)
 
-    walk: spectral densities of white noise on phase and ln A [1/s], trend [1/s^3], damping [1/s], gain [1/s].
+
+@njit(cache=True, error_model="numpy")
+def rates_of(law, x, w, force):  # type: ignore[no-untyped-def]
+    """The same of one axis in state ``x`` at the reference's angular frequency ``w`` [rad/s]."""
+    stiff, damp, rates = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING]), np.empty(RATES, np.complex128)
+    set_rates(law, turn_of(law, np.exp(x[LOG]), x[PHASE], w, stiff, damp, force), stiff, damp, rates)
+    return rates
+
+
+@njit(cache=True, error_model="numpy")
+def rate_at(rates, about, x):  # type: ignore[no-untyped-def]
+    """Slow rate of one axis in state ``x``, by the rates about another state."""
+    rate = rates[0] + rates[1] * (x[PHASE] - about[PHASE]) + rates[2] * (x[LOG] - about[LOG])
+    return rate + rates[3] * (x[STIFFNESS] - about[STIFFNESS]) + rates[4] * (x[DAMPING] - about[DAMPING])
+
+
+@njit(cache=True, error_model="numpy")
+def flow(rates, about, x, h, taken):  # type: ignore[no-untyped-def]
+    """One axis over ``h`` seconds, in place on its state ``x``, by the slow rates about the state ``about``.
+
+    Args:
+        rates: see ``rates_of``. taken: filled with what phase and ln A take from the first five states, (2, 5).
     """
-    k, b = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
-    turn = turn_of(law, np.exp(x[LOG]), x[PHASE], w, k, b, force)
-    a11, a12 = turn.by_phase.imag, turn.by_log.imag
-    a21, a22 = turn.by_phase.real, turn.by_log.real
+    a11, a12, a21, a22 = rates[1].imag, rates[2].imag, rates[1].real, rates[2].real
     # e0, e1, e2: exp(a h) and its first two integrals, by their series; the h here is a fraction of the decay time
-    e = np.zeros((3, 2, 2))
+    e0, e1, e2 = np.zeros(4), np.zeros(4), np.zeros(4)
     p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
     for n in range(9):
         one, two = h / (n + 1), h * h / ((n + 1) * (n + 2))
-        for i, scale in ((0, 1.0), (1, one), (2, two)):
-            e[i, 0, 0] += p11 * scale
-            e[i, 0, 1] += p12 * scale
-            e[i, 1, 0] += p21 * scale
-            e[i, 1, 1] += p22 * scale
+        for i, p in enumerate((p11, p12, p21, p22)):
+            e0[i] += p
+            e1[i] += p * one
+            e2[i] += p * two
         p11, p12, p21, p22 = (
             (a11 * p11 + a12 * p21) * one,
             (a11 * p12 + a12 * p22) * one,
             (a21 * p11 + a22 * p21) * one,
             (a21 * p12 + a22 * p22) * one,
         )
-    stiff, damp = law.k * turn.by_stiffness / k, law.b * turn.by_damping / b
-    new, taken, added = x.copy(), np.empty((2, DAMPING + 1)), np.zeros((STATES, STATES))
-    early = np.zeros(STATES)  # what a kick of the trend in the middle of the step becomes
+    rate, stiff, damp = rate_at(rates, about, x), rates[3], rates[4]
     for i in range(2):
-        by_trend = e[2, i, 0] * stiff.imag + e[2, i, 1] * stiff.real
-        new[i] += e[1, i, 0] * turn.rate.imag + e[1, i, 1] * turn.rate.real + by_trend * x[TREND]
-        taken[i, PHASE], taken[i, LOG] = e[0, i, 0], e[0, i, 1]
-        taken[i, STIFFNESS] = e[1, i, 0] * stiff.imag + e[1, i, 1] * stiff.real
+        by_phase, by_log = e1[2 * i], e1[2 * i + 1]
+        by_trend = e2[2 * i] * stiff.imag + e2[2 * i + 1] * stiff.real
+        x[i] += by_phase * rate.imag + by_log * rate.real + by_trend * x[TREND]
+        taken[i, PHASE], taken[i, LOG] = e0[2 * i], e0[2 * i + 1]
+        taken[i, STIFFNESS] = by_phase * stiff.imag + by_log * stiff.real
         taken[i, TREND] = by_trend
-        taken[i, DAMPING] = e[1, i, 0] * damp.imag + e[1, i, 1] * damp.real
-        early[i] = 0.25 * by_trend
-        added[i, i] = walk[0] * h
-    new[STIFFNESS] += h * x[TREND]
-    early[STIFFNESS], early[TREND] = 0.5 * h, 1.0
-    for i in range(STATES):
-        for j in range(STATES):
-            added[i, j] += walk[1] * h * early[i] * early[j]
-    added[DAMPING, DAMPING] += walk[2] * h
-    added[GAIN, GAIN] += walk[3] * h
+        taken[i, DAMPING] = by_phase * damp.imag + by_log * damp.real
+    x[STIFFNESS] += h * x[TREND]
+
+
+@njit(cache=True, error_model="numpy")
+def _walked(P, at, taken, h, walk):  # type: ignore[no-untyped-def]
+    """Add to a covariance what one axis, whose states begin at ``at``, walks at random in a step of ``h`` seconds.
+
+    walk: spectral densities of white noise on phase and ln A [1/s], trend [1/s^3], damping [1/s], gain [1/s].
+    """
+    early = np.array([0.25 * taken[PHASE, TREND], 0.25 * taken[LOG, TREND], 0.5 * h, 1.0])  # of a kick in the middle
+    for i in range(TREND + 1):
+        for j in range(TREND + 1):
+            P[at + i, at + j] += walk[1] * h * early[i] * early[j]
+    P[at + DAMPING, at + DAMPING] += walk[2] * h
+    P[at + GAIN, at + GAIN] += walk[3] * h
     for i in range(2):
         half = 0.5 * taken[i, DAMPING]
-        added[i, DAMPING] += walk[2] * h * half
-        added[DAMPING, i] += walk[2] * h * half
-        added[i, i] += walk[2] * h * half * half
-    return new, taken, added
+        P[at + i, at + i] += (walk[0] + walk[2] * half * half) * h
+        P[at + i, at + DAMPING] += walk[2] * h * half
+        P[at + DAMPING, at + i] += walk[2] * h * half
 
 
 @njit(cache=True, error_model="numpy")
@@ -159,7 +189,7 @@ def _switched(law, x, signal, k, a):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _carried(matrix, at, taken, h):  # type: ignore[no-untyped-def]
+def carried(matrix, at, taken, h):  # type: ignore[no-untyped-def]
     """Multiply ``matrix`` in place from the left by the Jacobian of one axis's step, whose states begin at ``at``."""
     for v in range(matrix.shape[1]):
         phase, log = 0.0, 0.0
@@ -171,43 +201,93 @@ def _carried(matrix, at, taken, h):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def predict(laws, signal, k, x, P, walk, offset_walk):  # type: ignore[no-untyped-def]
-    """State and covariance of block k + 1 from those of block k, and the Jacobian of the step; ``x`` is changed."""
-    n = x.size
-    P, F = P.copy(), np.eye(n)
-    for later in range(2):
-        for a in range(len(laws)):
-            law = law_of(laws[a])
-            at = a * STATES
-            parts = signal.step * signal.share[k, a], signal.step * (1.0 - signal.share[k, a])
-            if later:  # against this block's reference, continued straight to where its drive begins
-                psi = signal.psi[k, a] + parts[0] * signal.w[k, a]
-                x[at + PHASE] += psi - (signal.psi[k + 1, a] - parts[1] * signal.w[k + 1, a])
-                if signal.share[k, a] != 0.5:
-                    x[at + PHASE], x[at + LOG] = _switched(law, x[at : at + STATES], signal, k, a)
-            w, h = signal.w[k + later, a], parts[later]
-            new, taken, added = flow(law, x[at : at + STATES], w, signal.force[k + later, a], h, walk[a])
-            x[at : at + STATES] = new
-            _carried(F, at, taken, h)
-            _carried(P, at, taken, h)
-            _carried(P.T, at, taken, h)
-            P[at : at + STATES, at : at + STATES] += added
-        x[:] = bounded(laws, signal, x)
-    P[n - 1, n - 1] += offset_walk * signal.step
+def _composed(first, second, h):  # type: ignore[no-untyped-def]
+    """What phase and ln A take over two steps, the first of ``h`` seconds, into ``first``."""
+    for j in range(DAMPING + 1):
+        phase, log = first[0, j], first[1, j]
+        for i in range(2):
+            own = second[i, j] + (h * second[i, STIFFNESS] if j == TREND else 0.0) if j > LOG else 0.0
+            first[i, j] = second[i, PHASE] * phase + second[i, LOG] * log + own
+
+
+@njit(cache=True)
+def change(x, about, step):  # type: ignore[no-untyped-def]
+    """Largest change of a state; a trend's by what it makes of the stiffness over a block of ``step`` seconds."""
+    most = 0.0
+    for i in range(x.size):
+        moved = abs(x[i] - about[i])
+        most = max(most, moved * step if i % STATES == TREND else moved)
+    return most
+
+
+@njit(cache=True, error_model="numpy")
+def _go(law, signal, k, a, h, walk, linear, x, P, taken):  # type: ignore[no-untyped-def]
+    """Axis ``a`` over ``h`` seconds of block k's drive, in place on the whole state and its covariance."""
+    at = a * STATES
+    own, about, rates = x[at : at + STATES], linear.about[k, at : at + STATES], linear.rates[k, a]
+    if not change(own, about, signal.step) < NONLINEAR:
+        about = own.copy()
+        rates = rates_of(law, own, signal.w[k, a], signal.force[k, a])
+    flow(rates, about, own, h, taken)
+    carried(P, at, taken, h)
+    carried(P.T, at, taken, h)
+    _walked(P, at, taken, h, walk)
+
+
+@njit(cache=True, error_model="numpy")
+def leave(laws, signal, k, x, P, walk, linear, taken):  # type: ignore[no-untyped-def]
+    """State and covariance, in place, from block k's middle to where the next block's drive begins.
+
+    Args:
+        linear: ``linear.Linear``, of block k at least. taken: see ``flow``, of each axis, shape (axes, 2, 5).
+    """
+    for a in range(len(laws)):
+        law, at, h = law_of(laws[a]), a * STATES, signal.step * signal.share[k, a]
+        _go(law, signal, k, a, h, walk[a], linear, x, P, taken[a])
+        # against the next block's reference, continued straight to where its drive begins
+        psi = signal.psi[k, a] + h * signal.w[k, a]
+        x[at + PHASE] += psi - (signal.psi[k + 1, a] - (signal.step - h) * signal.w[k + 1, a])
+        if signal.share[k, a] != 0.5:
+            x[at + PHASE], x[at + LOG] = _switched(law, x[at : at + STATES], signal, k, a)
+    bound(laws, signal, x)
+
+
+@njit(cache=True, error_model="numpy")
+def ahead(laws, signal, k, x, linear):  # type: ignore[no-untyped-def]
+    """About where ``arrive`` will come to, from where ``leave`` left."""
+    out = x.copy()
+    for a in range(len(laws)):
+        at, h = a * STATES, signal.step * (1.0 - signal.share[k, a])
+        rate = linear.rates[k, a, 0]
+        out[at + PHASE] += h * (rate.imag + signal.w[k, a] - signal.w[k + 1, a])
+        out[at + LOG] += h * rate.real
+        out[at + STIFFNESS] += h * x[at + TREND]
+    bound(laws, signal, out)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def arrive(laws, signal, k, x, P, walk, offset_walk, linear, taken):  # type: ignore[no-untyped-def]
+    """State and covariance, in place, on to the middle of block k + 1; ``taken`` becomes that of the whole step."""
+    later = np.empty((2, DAMPING + 1))
+    for a in range(len(laws)):
+        h = signal.step * (1.0 - signal.share[k, a])
+        _go(law_of(laws[a]), signal, k + 1, a, h, walk[a], linear, x, P, later)
+        _composed(taken[a], later, signal.step - h)
+    bound(laws, signal, x)
+    offset = STATES * len(laws)
+    P[offset, offset] += offset_walk * signal.step
     for a in range(len(laws)):
         for i, most in ((a * STATES + PHASE, UNKNOWN[0]), (a * STATES + LOG, UNKNOWN[1])):
             if P[i, i] > most * most:
                 scale = most / np.sqrt(P[i, i])
                 P[i, :] *= scale
                 P[:, i] *= scale
-    return P, F
 
 
 @njit(cache=True, error_model="numpy")
-def bounded(laws, signal, x):  # type: ignore[no-untyped-def]
-    """The state with each amplitude between no motion and the largest that a line can tell."""
-    out = x.copy()
+def bound(laws, signal, x):  # type: ignore[no-untyped-def]
+    """Keep each amplitude, in place, between no motion and the largest that a line can tell."""
     for a in range(len(laws)):
         floor, top = np.log(FLOOR * law_of(laws[a]).theta0), np.log(signal.ladder[a, 0, -1])
-        out[a * STATES + LOG] = min(max(x[a * STATES + LOG], floor), top)
-    return out
+        x[a * STATES + LOG] = min(max(x[a * STATES + LOG], floor), top)

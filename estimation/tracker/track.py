@@ -10,14 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.signals import Sense, intensity_clock, is_capacitive, reference_of, senses
-from estimation.tracker import backward, smoother
+from estimation.tracker import backward, linear, smoother
 from estimation.tracker.angle import SlowAngle, SlowMotion
 from estimation.tracker.orbit import MOVED, law_of, turn_of
 from estimation.tracker.signal import Prepared, prepare
 from estimation.tracker.smoother import LOST, SIGNIFICANT
-from estimation.tracker.step import DAMPING, FLOOR, LOG, PHASE, STATES, STIFFNESS, Signal, flow
+from estimation.tracker.step import DAMPING, FLOOR, LOG, PHASE, RATES, STATES, STIFFNESS, Signal, flow, rates_of
 from estimation.tracker.switches import EDGE
-from estimation.tracker.tuning import START_WALK, Belief, Likely, densities, filtered, likely_walks, tuned_walk, window
+from estimation.tracker.tuning import (
+    OFFSET_WALK,
+    START_WALK,
+    Belief,
+    Likely,
+    densities,
+    filtered,
+    likely_walks,
+    stretches,
+    tuned_walk,
+    window,
+)
 from scanner.device import Amdm, Device, Position
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion
@@ -91,9 +102,10 @@ def track(
         prepared = prepare(recording, device, sense, references)
         start, signs = signed(prepared, starting_belief(prepared, device))
         # by the signal alone: it would bend the motion to each of a few phases seen
-        walk = tuned_walk(prepared, start, _walk_of(before, sense))
+        parts = stretches(prepared.signal)
+        walk = tuned_walk(prepared, start, parts, _walk_of(before, sense))
         helped = with_phases(prepared, seen or {})
-        found = averaged(helped, start, likely_walks(prepared, start, walk), causal)
+        found = averaged(helped, start, likely_walks(prepared, start, parts, walk), causal)
         for i, name in enumerate(sense.axes):
             if not found.live[i]:
                 raise BadInput(
@@ -176,28 +188,42 @@ def _listen(signal: Signal, a: int, x: Array) -> bool:
     return False
 
 
-def follow(prepared: Prepared, start: Belief, values: Array, causal: bool = False) -> Track:
-    """The track of all blocks, window by window, so that memory does not grow with the covariances of all blocks."""
-    blocks, walk = len(prepared.time), densities(values)
-    states, sds = np.empty((blocks, start.x.size)), np.empty((blocks, start.x.size))
-    live = start.live.copy()
-    total, chi2, count, first, belief = 0.0, 0.0, 0, 0, start
+def follow(prepared: Prepared, start: Belief, walks: Array, causal: bool = False) -> list[Track]:
+    """The track of all blocks under each of the ``walks``, shape (walks, axes, 3).
+
+    It goes window by window, so that memory does not grow with the covariances of all blocks.
+    """
+    blocks, axes = len(prepared.time), len(prepared.laws)
+    states, sds = np.empty((2, len(walks), blocks, start.x.size))
+    live = np.tile(start.live, (len(walks), 1))
+    totals, beliefs, first = np.zeros((len(walks), 3)), [start] * len(walks), 0
     while first < blocks:
         done = min(first + WINDOW, blocks)
-        part = window(prepared.signal, first, min(done + LAG, blocks))
-        ll, squares, used, found, (xs, Ps, xp, Pp, Fs) = filtered(prepared, part, belief, walk)
-        live = live | found
-        inner = done - first
-        if done < blocks:
-            motion = xp[inner, LOG::STATES][: len(prepared.laws)]
-            floor = np.log([2.0 * FLOOR * law.theta0 for law in prepared.laws])
-            belief = Belief(xp[inner].copy(), Pp[inner].copy(), motion > floor)
-        if not causal:
-            backward.run_smoother(xs, Ps, xp, Pp, Fs)
-        states[first:done] = xs[:inner]
-        sds[first:done] = np.sqrt(np.maximum(np.diagonal(Ps[:inner], axis1=1, axis2=2), 0.0))
-        total, chi2, count, first = total + ll, chi2 + squares, count + used, done
-    return Track(states, sds, total, chi2 / max(count, 1), live)
+        inner, part = done - first, window(prepared.signal, first, min(done + LAG, blocks))
+        own = linear.unmade(part)  # about the first track: the others are near it
+        for i, values in enumerate(walks):
+            walk = densities(values)
+            run = filtered(prepared, part, own, beliefs[i], walk)
+            live[i] |= run.live
+            totals[i] += run.log_likelihood, run.chi2, run.used
+            if done < blocks:
+                x, P = run.blocks.states[inner - 1].copy(), run.blocks.covariances[inner - 1].copy()
+                room = np.empty((axes, 2, DAMPING + 1))
+                linear.predict(prepared.rows, part, inner - 1, x, P, walk, OFFSET_WALK, own, room)
+                floor = np.log([2.0 * FLOOR * law.theta0 for law in prepared.laws])
+                n = start.x.size
+                beliefs[i] = Belief(x[:n], P[:n, :n], x[LOG::STATES][:axes] > floor)
+            if causal:
+                xs, variances = run.blocks.states, np.diagonal(run.blocks.covariances, axis1=1, axis2=2)
+            else:
+                xs, variances = backward.smoothed(part, own, run.blocks)
+            states[i, first:done] = xs[:inner, : start.x.size]
+            sds[i, first:done] = np.sqrt(np.maximum(variances[:inner, : start.x.size], 0.0))
+        first = done
+    return [
+        Track(xs, each, total, chi2 / max(count, 1.0), found)
+        for xs, each, (total, chi2, count), found in zip(states, sds, totals.tolist(), live, strict=True)
+    ]
 
 
 def averaged(prepared: Prepared, start: Belief, likely: Likely, causal: bool = False) -> Track:
@@ -206,7 +232,7 @@ def averaged(prepared: Prepared, start: Belief, likely: Likely, causal: bool = F
     Where noise leaves the drift's law uncertain, the track for the most probable law is as good as any, but its
     covariance takes that law for known: intervals of 95 % would hold the truth in 91 % (docs/bound.md).
     """
-    tracks = [follow(prepared, start, walk, causal) for walk in likely.walks]
+    tracks = follow(prepared, start, likely.walks, causal)
     centre = tracks[len(tracks) // 2]
     states, sds = centre.states.copy(), centre.sds.copy()
     for a in range(len(prepared.laws)):
@@ -234,12 +260,13 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     if not (prepared.signal.lines[:, 1] % 2).any():
         return start, ["ambiguous"] * axes
     signal = window(prepared.signal, 0, PROBED)
-    kept = filtered(prepared, signal, start, densities(np.tile(START_WALK, (axes, 1))))[-1]
+    walk = densities(np.tile(START_WALK, (axes, 1)))
+    states = filtered(prepared, signal, linear.unmade(signal), start, walk).blocks.states
     agreement, weight = np.zeros(axes), np.zeros(axes)
-    for k, state in enumerate(kept[0]):
+    for k, state in enumerate(states):
         unroot = signal.unroots[signal.geometry[k]]
         fitted, variances = unroot @ signal.whitened[k], signal.noise_var[k] * (unroot**2).sum(axis=1)
-        told = smoother.expected(prepared.rows, signal, k, state)[0][0]
+        told = linear.expected(prepared.rows, signal, k, state, np.empty((axes, RATES), np.complex128))[0][0]
         for i, (a, order) in enumerate(signal.lines):
             pair = slice(1 + 2 * i, 3 + 2 * i)
             if order % 2 and (variances[pair] > 0.0).all():
@@ -253,15 +280,15 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
 
 def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, float, int], sign: str) -> AxisMotion:
     signal, at = prepared.signal, i * STATES
-    axes = len(prepared.laws)
-    rates = np.empty((len(prepared.time), axes), np.complex128)
-    moved = np.empty((len(prepared.time), axes, MOVED + 1), np.complex128)
-    smoother.turns(prepared.rows, signal, found.states, rates, moved)
-    log = found.states[:, at + LOG]
+    rates = np.empty(len(prepared.time), np.complex128)
+    moved = np.empty((len(prepared.time), MOVED + 1), np.complex128)
+    own, w, force = found.states[:, at : at + STATES], signal.w[:, i], signal.force[:, i]
+    smoother.turns(law_of(prepared.rows[i]), w, force, own, rates, moved)
+    log = own[:, LOG]
     reference = prepared.references[prepared.sense.axes[i]]
     # a block sees the reference averaged over itself, which is not its value in the middle when the drive sweeps
-    phase = found.states[:, at + PHASE] + signal.psi[:, i] - reference.phase(prepared.time)
-    knots: list[NDArray[Any]] = [prepared.time, phase, rates[:, i], log, moved[:, i]]
+    phase = own[:, PHASE] + signal.psi[:, i] - reference.phase(prepared.time)
+    knots: list[NDArray[Any]] = [prepared.time, phase, rates, log, moved]
     for k in np.flatnonzero(signal.share[:, i] != 0.5)[::-1]:
         knots = [np.insert(a, k + 1, b, axis=0) for a, b in zip(knots, _at_switch(prepared, found, i, k), strict=True)]
     lines = knots[4] / np.exp(knots[3])[:, None]
@@ -273,7 +300,7 @@ def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, fl
         time=prepared.time,
         phase=phase,
         amplitude=np.exp(log),
-        frequency=(signal.w[:, i] + rates[:, i].imag) / (2 * np.pi),
+        frequency=(w + rates.imag) / (2 * np.pi),
         phase_sd=found.sds[:, at + PHASE],
         angle=SlowAngle(slow, *clock),
         reference=reference.kind,
@@ -297,7 +324,8 @@ def _at_switch(prepared: Prepared, found: Track, i: int, k: int) -> tuple[NDArra
     sides = []
     for j, h, side in ((k, share, -EDGE), (k + 1, share - signal.step, EDGE)):
         w, force = signal.w[j, i], signal.force[j, i]
-        x, *_ = flow(law, found.states[j, i * STATES : (i + 1) * STATES], w, force, h, np.zeros(4))
+        x = found.states[j, i * STATES : (i + 1) * STATES].copy()
+        flow(rates_of(law, x, w, force), x.copy(), x, h, np.empty((2, DAMPING + 1)))
         stiff, damp = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
         turn = turn_of(law, np.exp(x[LOG]), x[PHASE], w, stiff, damp, force)
         phase = x[PHASE] + signal.psi[j, i] + w * h - reference.phase(np.array([time + side]))[0]

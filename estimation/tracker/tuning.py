@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.tracker import backward, smoother
+from estimation.tracker.linear import Linear, unmade
 from estimation.tracker.signal import Prepared
-from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, TREND, Signal
+from estimation.tracker.smoother import Filtered
+from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, TREND, Signal, padded
 
 Array = NDArray[np.float64]
 
@@ -40,6 +42,13 @@ class Belief:
     live: NDArray[np.bool_]
 
 
+class Part(NamedTuple):
+    """Blocks of a signal, and their linearisations, which serve every run over them."""
+
+    signal: Signal
+    linear: Linear
+
+
 class Likely(NamedTuple):
     """Walks that may be, and how much of each: a track between them is the straight line between theirs.
 
@@ -58,10 +67,10 @@ def densities(values: Array) -> Array:
     return np.concatenate([values, np.full((len(values), 1), GAIN_WALK)], axis=1)
 
 
-def tuned_walk(prepared: Prepared, start: Belief, walk: Array | None = None) -> Array:
+def tuned_walk(prepared: Prepared, start: Belief, parts: list[Part], walk: Array | None = None) -> Array:
     """Process noise of each axis, shape (axes, 3), see ``START_WALK``: of the trend most probable, else most likely.
 
-    The search starts from ``walk``, where one is given.
+    It is searched on ``parts``, from ``walk`` where one is given.
 
     Where the likelihood's score vanishes, a state is kicked as much as the smoothed track says (``backward.kicks``);
     until then each density grows by the ratio of the two. What has less than a degree of freedom is not waited for. The
@@ -70,7 +79,6 @@ def tuned_walk(prepared: Prepared, start: Belief, walk: Array | None = None) -> 
     find none.
     """
     signal, axes = prepared.signal, len(prepared.laws)
-    parts = _stretches(signal)
     walk = np.tile(START_WALK, (axes, 1)) if walk is None else walk
     for _ in range(ROUNDS):
         told, held = _kicked(prepared, parts, start, walk)
@@ -85,23 +93,22 @@ def tuned_walk(prepared: Prepared, start: Belief, walk: Array | None = None) -> 
     return walk
 
 
-def _kicked(prepared: Prepared, parts: list[Signal], start: Belief, walk: Array) -> tuple[Array, Array]:
+def _kicked(prepared: Prepared, parts: list[Part], start: Belief, walk: Array) -> tuple[Array, Array]:
     """Both sides of the likelihood's score by each density, see ``backward.kicks``; shapes (axes, 3)."""
-    squares, spreads = np.zeros((2, start.x.size))
+    squares, spreads = np.zeros((2, padded(start.x.size)))
     for part in parts:
-        kept = filtered(prepared, part, start, densities(walk))[-1]
-        backward.run_smoother(*kept)
-        squares, spreads = np.add((squares, spreads), backward.kicks(*kept[:4]))
+        told = backward.kicks(*part, filtered(prepared, *part, start, densities(walk)).blocks)
+        squares, spreads = np.add((squares, spreads), told)
     return _by_walk(squares, len(walk)), _by_walk(spreads, len(walk))
 
 
-def likely_walks(prepared: Prepared, start: Belief, walk: Array) -> Likely:
-    """The walks that the signal leaves possible about the most probable one: one, or three where it tells little.
+def likely_walks(prepared: Prepared, start: Belief, parts: list[Part], walk: Array) -> Likely:
+    """The walks that a signal's parts leave possible about the most probable one: one, or three where it tells little.
 
     The trend's density on either side, for all axes at once, as each axis's score is its own: the posterior's slope
     by ln q is the score and the prior's half, a parabola through three of them, and its integral the posterior.
     """
-    signal, parts = prepared.signal, _stretches(prepared.signal)
+    signal = prepared.signal
     nodes = np.array([-APART, 0.0, APART])
     walks = np.repeat(walk[None], nodes.size, axis=0)
     walks[:, :, TRENDS] *= np.exp(nodes)[:, None]
@@ -128,12 +135,12 @@ def _by_walk(sums: Array, axes: int) -> Array:
     return np.stack([own[:, PHASE] + own[:, LOG], own[:, TREND], own[:, DAMPING]], axis=1)
 
 
-def _stretches(signal: Signal) -> list[Signal]:
-    blocks = len(signal.whitened)
-    if blocks <= TUNED_BLOCKS:
-        return [signal]
-    third = TUNED_BLOCKS // 3
-    return [window(signal, at, at + third) for at in (0, (blocks - third) // 2, blocks - third)]
+def stretches(signal: Signal) -> list[Part]:
+    """The parts of a signal that its process noise is tuned on."""
+    blocks, third = len(signal.whitened), TUNED_BLOCKS // 3
+    starts = (0, (blocks - third) // 2, blocks - third)
+    own = [signal] if blocks <= TUNED_BLOCKS else [window(signal, at, at + third) for at in starts]
+    return [Part(each, unmade(each)) for each in own]
 
 
 def window(signal: Signal, first: int, stop: int) -> Signal:
@@ -155,12 +162,27 @@ def window(signal: Signal, first: int, stop: int) -> Signal:
     return signal._replace(**{name: getattr(signal, name)[first:stop] for name in by_block})
 
 
-def filtered(
-    prepared: Prepared, signal: Signal, start: Belief, walk: Array
-) -> tuple[float, float, int, NDArray[np.bool_], tuple[Array, Array, Array, Array, Array]]:
-    """(log-likelihood, chi2, measurements, live, (xs, Ps, xp, Pp, Fs)) of ``smoother.run_filter``."""
-    m, n = len(signal.whitened), start.x.size
-    kept = (np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n)))
-    live = start.live.copy()
-    told = smoother.run_filter(prepared.rows, signal, start.x.copy(), start.P.copy(), live, walk, OFFSET_WALK, *kept)
-    return *told, live, kept
+class Run(NamedTuple):
+    """A filter's run over a signal.
+
+    Attributes:
+        log_likelihood: of the projections. chi2: squared normalised innovations. used: measurements.
+        live: whether the motion of each axis was found. blocks: what it left of them.
+    """
+
+    log_likelihood: float
+    chi2: float
+    used: int
+    live: NDArray[np.bool_]
+    blocks: Filtered
+
+
+def filtered(prepared: Prepared, signal: Signal, linear: Linear, start: Belief, walk: Array) -> Run:
+    """``smoother.run_filter`` from a belief; ``linear`` is of the same blocks as the signal."""
+    live, n = start.live.copy(), start.x.size
+    x, P = np.zeros(padded(n)), np.zeros((padded(n), padded(n)))
+    x[:n], P[:n, :n] = start.x, start.P
+    blocks = smoother.unfiltered(len(signal.whitened), len(prepared.laws))
+    args = x, P, live, walk, OFFSET_WALK, linear, blocks
+    log_likelihood, chi2, used = smoother.run_filter(prepared.rows, signal, *args)
+    return Run(log_likelihood, chi2, used, live, blocks)
