@@ -62,24 +62,24 @@ def _to_predicted(signal, k, linear, filtered, slope, information, room):  # typ
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _carried_back(matrix, at, taken, h):  # type: ignore[no-untyped-def]
-    """Multiply ``matrix`` in place from the left by the transpose of what ``step.carried`` multiplies it by."""
-    for v in range(matrix.shape[1]):
-        phase, log, stiffness = matrix[at + PHASE, v], matrix[at + LOG, v], matrix[at + STIFFNESS, v]
+def _carried_back(rows, taken, h):  # type: ignore[no-untyped-def]
+    """Multiply one axis's ``rows`` in place from the left by the transpose of what ``step.carried`` does."""
+    for v in range(rows.shape[1]):
+        phase, log, stiffness = rows[PHASE, v], rows[LOG, v], rows[STIFFNESS, v]
         for j in range(DAMPING + 1):
-            own = matrix[at + j, v] if j > LOG else 0.0
-            matrix[at + j, v] = own + taken[0, j] * phase + taken[1, j] * log
-        matrix[at + TREND, v] += h * stiffness
+            own = rows[j, v] if j > LOG else 0.0
+            rows[j, v] = own + taken[0, j] * phase + taken[1, j] * log
+        rows[TREND, v] += h * stiffness
 
 
 @njit(cache=True, error_model="numpy")
 def _to_filtered(signal, k, filtered, slope, information):  # type: ignore[no-untyped-def]
     """Slope and information of all from block k on, in place, to those by the state of the block before."""
     for a in range(signal.psi.shape[1]):
-        at, taken = a * STATES, filtered.taken[k, a]
-        _carried_back(slope.reshape(-1, 1), at, taken, signal.step)
-        _carried_back(information, at, taken, signal.step)
-        _carried_back(information.T, at, taken, signal.step)
+        own, taken = slice(a * STATES, (a + 1) * STATES), filtered.taken[k, a]
+        for matrix in (slope.reshape(-1, 1)[own], information[own]):
+            _carried_back(matrix, taken, signal.step)
+        _carried_back(information.T[own], taken, signal.step)
 
 
 @njit(cache=True, error_model="numpy")

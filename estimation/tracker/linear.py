@@ -115,69 +115,93 @@ def expected(laws, signal, k, x, rates):  # type: ignore[no-untyped-def]
             jacobian[2, 0, at + s] = 2.0 * mean_bend * turn.rate.real * by.real + 0.5 * by_mean * by_bend.real
         slip = signal.w[k, a] + turn.rate.imag - signal.tuned[k, a]
         gain, u = np.exp(x[at + GAIN]), np.exp(1j * (signal.psi[k, a] + x[at + PHASE]))
+        power, reached = 1.0 + 0.0j, 0
         for i in range(signal.lines.shape[0]):
-            if signal.lines[i, 0] == a:
-                order = signal.lines[i, 1]
-                grows = 0.0 if turn.seen[order] == 0.0 else (turn.seen_by_log[order] / turn.seen[order]).real
-                fades = 1j * grows / order  # a line that decays has a complex frequency
-                rate = turn.rate.imag - fades * turn.rate.real
-                passed = signal.passed[k, i] + signal.passed_by_w[k, i] * rate
-                by_passed = signal.passed_by_w[k, i] / passed if passed != 0.0 else 0.0j
-                turned = gain * passed * u**order
-                line, by_log = turned * turn.seen[order], turned * turn.seen_by_log[order]
-                by_phase = 1j * order * line
-                first = by_log * turn.rate.real + by_phase * slip
-                second = 0.5 * (by_log * bend.real + by_phase * bend.imag)
-                if line != 0.0:
-                    second += 0.5 * first * first / line
-                for j, part in ((1 + 2 * i, 1.0 + 0.0j), (2 + 2 * i, 1.0j)):  # Re with the cosine, -Im with the sine
-                    values[0, j], values[1, j], values[2, j] = (
-                        (part * line).real,
-                        (part * first).real,
-                        (part * second).real,
-                    )
-                    jacobian[0, j, at + PHASE], jacobian[0, j, at + LOG] = (part * by_phase).real, (part * by_log).real
-                    jacobian[0, j, at + GAIN] = values[0, j]
-                    for s, by, by_trend in moves:
-                        by_bend = turn.by_phase * by.imag + turn.by_log * by.real + by_trend
-                        jacobian[0, j, at + s] += (part * line * by_passed * (by.imag - fades * by.real)).real
-                        by_first = by_log * by.real + by_phase * by.imag
-                        by_second = 0.5 * (by_log * by_bend.real + by_phase * by_bend.imag)
-                        if line != 0.0:
-                            by_second += by_first * first / line
-                        jacobian[1, j, at + s] = (part * by_first).real
-                        jacobian[2, j, at + s] = (part * by_second).real
+            if signal.lines[i, 0] != a:
+                continue
+            order, cosine, sine = signal.lines[i, 1], 1 + 2 * i, 2 + 2 * i
+            while reached < order:
+                power *= u
+                reached += 1
+            grows = 0.0 if turn.seen[order] == 0.0 else (turn.seen_by_log[order] / turn.seen[order]).real
+            fades = 1j * grows / order  # a line that decays has a complex frequency
+            rate = turn.rate.imag - fades * turn.rate.real
+            passed = signal.passed[k, i] + signal.passed_by_w[k, i] * rate
+            by_passed = signal.passed_by_w[k, i] / passed if passed != 0.0 else 0.0j
+            turned = gain * passed * power
+            line, by_log = turned * turn.seen[order], turned * turn.seen_by_log[order]
+            by_phase = 1j * order * line
+            first = by_log * turn.rate.real + by_phase * slip
+            changes = first / line if line != 0.0 else 0.0j
+            second = 0.5 * (by_log * bend.real + by_phase * bend.imag + first * changes)
+            for n, value in enumerate((line, first, second)):  # Re with the cosine, -Im with the sine
+                values[n, cosine], values[n, sine] = value.real, -value.imag
+            jacobian[0, cosine, at + PHASE], jacobian[0, sine, at + PHASE] = by_phase.real, -by_phase.imag
+            jacobian[0, cosine, at + LOG], jacobian[0, sine, at + LOG] = by_log.real, -by_log.imag
+            jacobian[0, cosine, at + GAIN], jacobian[0, sine, at + GAIN] = line.real, -line.imag
+            for s, by, by_trend in moves:
+                by_bend = turn.by_phase * by.imag + turn.by_log * by.real + by_trend
+                by_value = line * by_passed * (by.imag - fades * by.real)
+                by_first = by_log * by.real + by_phase * by.imag
+                by_second = 0.5 * (by_log * by_bend.real + by_phase * by_bend.imag) + by_first * changes
+                jacobian[0, cosine, at + s] += by_value.real
+                jacobian[0, sine, at + s] -= by_value.imag
+                jacobian[1, cosine, at + s], jacobian[1, sine, at + s] = by_first.real, -by_first.imag
+                jacobian[2, cosine, at + s], jacobian[2, sine, at + s] = by_second.real, -by_second.imag
     return values, jacobian
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _gathered(roots, whitened, values, jacobian, lines, rows, rest):  # type: ignore[no-untyped-def]
+    """Whitened Jacobian and what the projections have beyond ``values``, into ``rows`` and ``rest``; how many there are.
+
+    A line tells of its own axis alone, so that a row is gathered axis by axis from that axis's columns; the mean, the
+    first column, comes from all of them.
+    """
+    m, n, count = whitened.size, rows.shape[1], 0
+    for i in range(m):
+        size, left = 0.0, whitened[i]
+        for j in range(m):
+            size += roots[0, i, j] * roots[0, i, j]
+            left -= roots[0, i, j] * values[0, j] + roots[1, i, j] * values[1, j] + roots[2, i, j] * values[2, j]
+        if size <= 0.0:  # a direction in which the block has no samples
+            continue
+        r0, r1, r2 = roots[0, i, 0], roots[1, i, 0], roots[2, i, 0]
+        for u in range(n):
+            rows[count, u] = r0 * jacobian[0, 0, u] + r1 * jacobian[1, 0, u] + r2 * jacobian[2, 0, u]
+        for j in range(1, m):
+            r0, r1, r2, at = roots[0, i, j], roots[1, i, j], roots[2, i, j], STATES * lines[(j - 1) // 2, 0]
+            for u in range(at, at + STATES):
+                rows[count, u] += r0 * jacobian[0, j, u] + r1 * jacobian[1, j, u] + r2 * jacobian[2, j, u]
+        rest[count] = left
+        count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _summed(rows, rest, count, information, slope):  # type: ignore[no-untyped-def]
+    """rows' rows and rows' rest into ``information`` and ``slope``."""
+    n = slope.size
+    for u in range(n):
+        slope[u] = 0.0
+        for v in range(n):
+            information[u, v] = 0.0
+    for i in range(count):
+        for u in range(n):
+            own = rows[i, u]
+            slope[u] += own * rest[i]
+            for v in range(n):
+                information[u, v] += own * rows[i, v]
+
+
+@njit(cache=True, error_model="numpy")
 def linearise(laws, signal, k, x, linear):  # type: ignore[no-untyped-def]
     """Linearise block k about the state ``x``, into ``linear``."""
     values, jacobian = expected(laws, signal, k, x, linear.rates[k])
-    linear.about[k] = x
-    roots, whitened = signal.roots[signal.geometry[k]], signal.whitened[k]
-    m, n, count = values.shape[1], x.size, 0
-    information, slope = linear.information[k], linear.slope[k]
-    information[:], slope[:] = 0.0, 0.0
-    for i in range(m):
-        size, rest, row = 0.0, whitened[i], linear.rows[k, count]
-        row[:] = 0.0
-        for j in range(m):
-            r0, r1, r2 = roots[0, i, j], roots[1, i, j], roots[2, i, j]
-            size += r0 * r0
-            rest -= r0 * values[0, j] + r1 * values[1, j] + r2 * values[2, j]
-            j0, j1, j2 = jacobian[0, j], jacobian[1, j], jacobian[2, j]
-            for u in range(n):
-                row[u] += r0 * j0[u] + r1 * j1[u] + r2 * j2[u]
-        if size <= 0.0:  # a direction in which the block has no samples
-            continue
-        linear.rest[k, count] = rest
-        for u in range(n):
-            slope[u] += row[u] * rest
-            for v in range(n):
-                information[u, v] += row[u] * row[v]
-        count += 1
-    linear.counts[k] = count
+    rows, rest, roots = linear.rows[k], linear.rest[k], signal.roots[signal.geometry[k]]
+    count = _gathered(roots, signal.whitened[k], values, jacobian, signal.lines, rows, rest)
+    _summed(rows, rest, count, linear.information[k], linear.slope[k])
+    linear.about[k], linear.counts[k] = x, count
 
 
 @njit(cache=True, error_model="numpy")

@@ -91,34 +91,51 @@ def _acquire(signal, k, a, x, P):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _in_turn(rows, rest, count, off, P, noise):  # type: ignore[no-untyped-def]
+    """Measurements one at a time, in place on ``off``, a state from where they were linearised, and its covariance.
+
+    Plain arrays and no views: on matrices this small those take as long as the sums.
+
+    Returns:
+        (squared normalised innovations, logarithm of their variances' product).
+    """
+    n, chi2, logdet = off.size, 0.0, 0.0
+    PH = np.empty(n)
+    for i in range(count):
+        e, S = rest[i], noise
+        for u in range(n):
+            held = 0.0
+            for v in range(n):
+                held += P[u, v] * rows[i, v]
+            PH[u] = held
+            S += rows[i, u] * held
+            e -= rows[i, u] * off[u]
+        scale = 1.0 / S
+        for u in range(n):
+            gain = PH[u] * scale
+            off[u] += gain * e
+            for v in range(n):
+                P[u, v] -= gain * PH[v]
+        chi2 += e * e * scale
+        logdet += np.log(S)
+    return chi2, logdet
+
+
+@njit(cache=True, error_model="numpy")
 def _update(signal, k, x, P, linear, noise):  # type: ignore[no-untyped-def]
-    """Bring block k's measurements, as linearised, into ``x`` and ``P``, one at a time.
+    """Bring block k's measurements, as linearised, into ``x`` and ``P``, in place.
 
     noise: variance of a sample [V^2].
 
     Returns:
         (log-likelihood, squared normalised innovations, measurements), the last two of the projections alone.
     """
-    n, about, count = x.size, linear.about[k], linear.counts[k]
-    PH = np.empty(n)
-    chi2, logdet, known = 0.0, 0.0, 0.0  # a known phase that misfits is no jump of the motion
-    for i in range(count):
-        H, e, S = linear.rows[k, i], linear.rest[k, i], noise
-        for u in range(n):
-            held = 0.0
-            for v in range(n):
-                held += P[u, v] * H[v]
-            PH[u] = held
-            S += H[u] * held
-            e -= H[u] * (x[u] - about[u])
-        scale = 1.0 / S
-        for u in range(n):
-            gain = PH[u] * scale
-            x[u] += gain * e
-            for v in range(n):
-                P[u, v] -= gain * PH[v]
-        chi2 += e * e * scale
-        logdet += np.log(S)
+    about, count, known = linear.about[k], linear.counts[k], 0.0  # a known phase that misfits is no jump of the motion
+    for u in range(x.size):
+        x[u] -= about[u]
+    chi2, logdet = _in_turn(linear.rows[k], linear.rest[k], count, x, P, noise)
+    for u in range(x.size):
+        x[u] += about[u]
     for a in range(signal.psi.shape[1]):
         if np.isfinite(signal.known_var[k, a]):
             at = a * STATES + PHASE

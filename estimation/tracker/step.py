@@ -101,58 +101,55 @@ def rate_at(rates, about, x):  # type: ignore[no-untyped-def]
     return rate + rates[3] * (x[STIFFNESS] - about[STIFFNESS]) + rates[4] * (x[DAMPING] - about[DAMPING])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def flow(rates, about, x, h, taken):  # type: ignore[no-untyped-def]
     """One axis over ``h`` seconds, in place on its state ``x``, by the slow rates about the state ``about``.
 
     Args:
         rates: see ``rates_of``. taken: filled with what phase and ln A take from the first five states, (2, 5).
     """
-    a11, a12, a21, a22 = rates[1].imag, rates[2].imag, rates[1].real, rates[2].real
-    # e0, e1, e2: exp(a h) and its first two integrals, by their series; the h here is a fraction of the decay time
-    e0, e1, e2 = np.zeros(4), np.zeros(4), np.zeros(4)
-    p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
+    by_phase, by_log, stiff, damp = rates[1], rates[2], rates[3], rates[4]
+    trace = by_phase.imag + by_log.real
+    det = by_phase.imag * by_log.real - by_phase.real * by_log.imag
+    # exp(a h) and its first two integrals, each p + q a, by their series; the h here is a fraction of the decay time
+    p0, q0, p1, q1, p2, q2, p, q = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0
     for n in range(9):
-        one, two = h / (n + 1), h * h / ((n + 1) * (n + 2))
-        for i, p in enumerate((p11, p12, p21, p22)):
-            e0[i] += p
-            e1[i] += p * one
-            e2[i] += p * two
-        p11, p12, p21, p22 = (
-            (a11 * p11 + a12 * p21) * one,
-            (a11 * p12 + a12 * p22) * one,
-            (a21 * p11 + a22 * p21) * one,
-            (a21 * p12 + a22 * p22) * one,
-        )
-    rate, stiff, damp = rate_at(rates, about, x), rates[3], rates[4]
-    for i in range(2):
-        by_phase, by_log = e1[2 * i], e1[2 * i + 1]
-        by_trend = e2[2 * i] * stiff.imag + e2[2 * i + 1] * stiff.real
-        x[i] += by_phase * rate.imag + by_log * rate.real + by_trend * x[TREND]
-        taken[i, PHASE], taken[i, LOG] = e0[2 * i], e0[2 * i + 1]
-        taken[i, STIFFNESS] = by_phase * stiff.imag + by_log * stiff.real
-        taken[i, TREND] = by_trend
-        taken[i, DAMPING] = by_phase * damp.imag + by_log * damp.real
+        one = h / (n + 1)
+        two = one * h / (n + 2)
+        p0, q0, p1, q1, p2, q2 = p0 + p, q0 + q, p1 + p * one, q1 + q * one, p2 + p * two, q2 + q * two
+        p, q = -det * q * one, (p + trace * q) * one
+    rate = rate_at(rates, about, x)
+    gone = p1 * rate + q1 * (by_phase * rate.imag + by_log * rate.real)
+    turned = by_phase * stiff.imag + by_log * stiff.real
+    by_stiffness, by_trend = p1 * stiff + q1 * turned, p2 * stiff + q2 * turned
+    by_damping = p1 * damp + q1 * (by_phase * damp.imag + by_log * damp.real)
+    x[PHASE] += gone.imag + by_trend.imag * x[TREND]
+    x[LOG] += gone.real + by_trend.real * x[TREND]
     x[STIFFNESS] += h * x[TREND]
+    taken[0, PHASE], taken[0, LOG] = p0 + q0 * by_phase.imag, q0 * by_log.imag
+    taken[1, PHASE], taken[1, LOG] = q0 * by_phase.real, p0 + q0 * by_log.real
+    taken[0, STIFFNESS], taken[1, STIFFNESS] = by_stiffness.imag, by_stiffness.real
+    taken[0, TREND], taken[1, TREND] = by_trend.imag, by_trend.real
+    taken[0, DAMPING], taken[1, DAMPING] = by_damping.imag, by_damping.real
 
 
 @njit(cache=True, error_model="numpy")
-def _walked(P, at, taken, h, walk):  # type: ignore[no-untyped-def]
-    """Add to a covariance what one axis, whose states begin at ``at``, walks at random in a step of ``h`` seconds.
+def _walked(P, taken, h, walk):  # type: ignore[no-untyped-def]
+    """Add to one axis's covariance (STATES, STATES) what it walks at random in a step of ``h`` seconds.
 
     walk: spectral densities of white noise on phase and ln A [1/s], trend [1/s^3], damping [1/s], gain [1/s].
     """
-    early = np.array([0.25 * taken[PHASE, TREND], 0.25 * taken[LOG, TREND], 0.5 * h, 1.0])  # of a kick in the middle
-    for i in range(TREND + 1):
-        for j in range(TREND + 1):
-            P[at + i, at + j] += walk[1] * h * early[i] * early[j]
-    P[at + DAMPING, at + DAMPING] += walk[2] * h
-    P[at + GAIN, at + GAIN] += walk[3] * h
+    early = 0.25 * taken[0, TREND], 0.25 * taken[1, TREND], 0.5 * h, 1.0  # what a kick in the middle becomes
+    for i, kicked in enumerate(early):
+        for j, too in enumerate(early):
+            P[i, j] += walk[1] * h * kicked * too
+    P[DAMPING, DAMPING] += walk[2] * h
+    P[GAIN, GAIN] += walk[3] * h
     for i in range(2):
         half = 0.5 * taken[i, DAMPING]
-        P[at + i, at + i] += (walk[0] + walk[2] * half * half) * h
-        P[at + i, at + DAMPING] += walk[2] * h * half
-        P[at + DAMPING, at + i] += walk[2] * h * half
+        P[i, i] += (walk[0] + walk[2] * half * half) * h
+        P[i, DAMPING] += walk[2] * h * half
+        P[DAMPING, i] += walk[2] * h * half
 
 
 @njit(cache=True, error_model="numpy")
@@ -189,15 +186,15 @@ def _switched(law, x, signal, k, a):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def carried(matrix, at, taken, h):  # type: ignore[no-untyped-def]
-    """Multiply ``matrix`` in place from the left by the Jacobian of one axis's step, whose states begin at ``at``."""
-    for v in range(matrix.shape[1]):
+def carried(rows, taken, h):  # type: ignore[no-untyped-def]
+    """Multiply one axis's ``rows`` (STATES, n) of a matrix, in place, from the left by the Jacobian of its step."""
+    for v in range(rows.shape[1]):
         phase, log = 0.0, 0.0
         for j in range(DAMPING + 1):
-            phase += taken[0, j] * matrix[at + j, v]
-            log += taken[1, j] * matrix[at + j, v]
-        matrix[at + PHASE, v], matrix[at + LOG, v] = phase, log
-        matrix[at + STIFFNESS, v] += h * matrix[at + TREND, v]
+            phase += taken[0, j] * rows[j, v]
+            log += taken[1, j] * rows[j, v]
+        rows[PHASE, v], rows[LOG, v] = phase, log
+        rows[STIFFNESS, v] += h * rows[TREND, v]
 
 
 @njit(cache=True, error_model="numpy")
@@ -229,9 +226,9 @@ def _go(law, signal, k, a, h, walk, linear, x, P, taken):  # type: ignore[no-unt
         about = own.copy()
         rates = rates_of(law, own, signal.w[k, a], signal.force[k, a])
     flow(rates, about, own, h, taken)
-    carried(P, at, taken, h)
-    carried(P.T, at, taken, h)
-    _walked(P, at, taken, h, walk)
+    carried(P[at : at + STATES], taken, h)
+    carried(P.T[at : at + STATES], taken, h)
+    _walked(P[at : at + STATES, at : at + STATES], taken, h, walk)
 
 
 @njit(cache=True, error_model="numpy")
