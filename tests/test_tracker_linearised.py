@@ -7,7 +7,7 @@ import pytest
 from worlds import noisy, prepared_of
 
 from estimation.tracker import track
-from estimation.tracker.backward import kicks, smoothed
+from estimation.tracker.backward import kicks, run_smoother
 from estimation.tracker.linear import expected, predict, unmade
 from estimation.tracker.orbit import axis_law, turn_of
 from estimation.tracker.signal import Prepared
@@ -52,12 +52,13 @@ def test_smoother_and_score_are_those_of_the_textbook() -> None:
     made = linear.about.copy()
     xs, Ps, squares, spreads = rauch_tung_striebel(prepared, linear, run)
     assert (linear.about == made).all()
-    states, variances = smoothed(prepared.signal, linear, run.blocks)
+    told = kicks(prepared.signal, linear, run.blocks)
+    run_smoother(prepared.signal.step, run.blocks)
     deviations = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2))
     used = slice(0, 2 * STATES + 1)
-    assert np.abs((states - xs) / np.maximum(deviations, 1e-12))[:, used].max() < 1e-4
-    assert np.sqrt(variances)[:, used] == pytest.approx(deviations[:, used], rel=2e-4)
-    told = kicks(prepared.signal, linear, run.blocks)
+    assert np.abs((run.blocks.states - xs) / np.maximum(deviations, 1e-12))[:, used].max() < 1e-6
+    own = np.sqrt(np.diagonal(run.blocks.covariances, axis1=1, axis2=2))
+    assert own[:, used] == pytest.approx(deviations[:, used], rel=1e-6)
     walked = [0, 1, TREND, DAMPING, STATES, STATES + 1, STATES + TREND, STATES + DAMPING]
     assert told[0][walked] == pytest.approx(squares[walked], rel=1e-4)
     assert told[1][walked] == pytest.approx(spreads[walked], rel=1e-4)

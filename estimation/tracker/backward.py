@@ -1,16 +1,11 @@
-"""Backward over the filtered blocks, compiled: the fixed-interval smoother, and what it tells of the process noise.
-
-What later blocks say of a state reaches it as the slope of their log-likelihood and its information, carried through
-each block's measurements and step (Bryson and Frazier 1963; de Jong, Biometrika 75, 594, 1988): no covariance is
-inverted, and what a kick between two blocks would do to the likelihood stands there ready.
-"""
+"""Backward over the filtered blocks, compiled: the fixed-interval smoother, and what it tells of the process noise."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND
+from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND, carried
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
@@ -22,6 +17,60 @@ def _product(A, B, out):  # type: ignore[no-untyped-def]
         for v in range(A.shape[1]):
             for j in range(B.shape[1]):
                 out[i, j] += A[i, v] * B[v, j]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _solved(A, B, n):  # type: ignore[no-untyped-def]
+    """Solve A X = B in place on ``B`` for the first ``n`` states of a covariance ``A``, which becomes its factor."""
+    columns = B.shape[1]
+    for i in range(n):
+        for j in range(i + 1):
+            rest = A[i, j]
+            for v in range(j):
+                rest -= A[i, v] * A[j, v]
+            A[i, j] = rest / A[j, j] if j < i else np.sqrt(rest)
+    for i in range(n):
+        for v in range(i):
+            for c in range(columns):
+                B[i, c] -= A[i, v] * B[v, c]
+        scale = 1.0 / A[i, i]
+        for c in range(columns):
+            B[i, c] *= scale
+    for i in range(n - 1, -1, -1):
+        for v in range(i + 1, n):
+            for c in range(columns):
+                B[i, c] -= A[v, i] * B[v, c]
+        scale = 1.0 / A[i, i]
+        for c in range(columns):
+            B[i, c] *= scale
+
+
+@njit(cache=True, error_model="numpy")
+def run_smoother(step, filtered):  # type: ignore[no-untyped-def]
+    """Rauch-Tung-Striebel, in place on the filter's states and covariances; ``step`` from block to block [s].
+
+    The slopes of ``kicks`` would give the same, but for the first blocks as a difference from a covariance up to 1e7
+    times as large.
+    """
+    xs, Ps = filtered.states, filtered.covariances
+    n, axes = xs.shape[1], filtered.taken.shape[1]
+    back, change, room = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    for k in range(xs.shape[0] - 2, -1, -1):
+        back[:] = Ps[k]
+        for a in range(axes):
+            carried(back[a * STATES : (a + 1) * STATES], filtered.taken[k + 1, a], step)
+        room[:] = filtered.predicted_covariances[k + 1]
+        _solved(room, back, axes * STATES + 1)  # the gain, transposed
+        for u in range(n):
+            later = xs[k + 1, u] - filtered.predicted_states[k + 1, u]
+            for v in range(n):
+                xs[k, v] += back[u, v] * later
+                change[u, v] = Ps[k + 1, u, v] - filtered.predicted_covariances[k + 1, u, v]
+        _product(change, back, room)
+        _product(back.T, room, change)
+        for u in range(n):
+            for v in range(n):
+                Ps[k, u, v] += 0.5 * (change[u, v] + change[v, u])
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
@@ -83,31 +132,14 @@ def _to_filtered(signal, k, filtered, slope, information):  # type: ignore[no-un
 
 
 @njit(cache=True, error_model="numpy")
-def smoothed(signal, linear, filtered):  # type: ignore[no-untyped-def]
-    """States and their variances from all blocks, both of shape (blocks, n)."""
-    blocks, n = filtered.states.shape
-    states, variances = filtered.states.copy(), np.empty((blocks, n))
-    slope, information, room = np.zeros(n), np.zeros((n, n)), np.empty((3, n, n))
-    for k in range(blocks - 1, -1, -1):
-        P = filtered.covariances[k]
-        _product(information, P, room[0])
-        for u in range(n):
-            variances[k, u] = P[u, u]
-            for v in range(n):
-                states[k, u] += P[u, v] * slope[v]
-                variances[k, u] -= P[u, v] * room[0, v, u]
-        if k > 0:
-            _to_predicted(signal, k, linear, filtered, slope, information, room)
-            _to_filtered(signal, k, filtered, slope, information)
-    return states, variances
-
-
-@njit(cache=True, error_model="numpy")
 def kicks(signal, linear, filtered):  # type: ignore[no-untyped-def]
     """What all blocks say of a kick of each state between two of them: the two sides of the likelihood's score.
 
-    With r the slope by such a kick and N its information, half the sum of r_j^2 - N_jj is the derivative of the
-    log-likelihood by the variance of kicks of state j (Koopman and Shephard, Biometrika 79, 823, 1992).
+    What later blocks say reaches an earlier one as the slope of their log-likelihood and its information, carried
+    through each block's measurements and step (Bryson and Frazier 1963; de Jong, Biometrika 75, 594, 1988): no
+    covariance is inverted and nothing smoothed. With r the slope by a kick and N its information, half the sum of
+    r_j^2 - N_jj is the derivative of the log-likelihood by the variance of kicks of state j (Koopman and Shephard,
+    Biometrika 79, 823, 1992).
 
     Returns:
         (sums of r_j^2, sums of N_jj), each of shape (n,).

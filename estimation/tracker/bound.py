@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.tracker.backward import smoothed
+from estimation.tracker.backward import run_smoother
 from estimation.tracker.linear import predict, unmade
 from estimation.tracker.orbit import SENSED, law_of, turn_of
 from estimation.tracker.signal import Prepared
@@ -32,19 +32,22 @@ def phase_bound(prepared: Prepared, states: Array, P: Array, walk: Array, noise_
     """
     blocks, n = states.shape
     rows, signal = prepared.rows, prepared.signal
-    own, left, room = unmade(signal), unfiltered(blocks, len(rows)), np.zeros((2, padded(n), padded(n)))
-    left.states[:], left.slopes[:], left.noise[:] = 0.0, 0.0, noise_var
-    left.states[:, :n], (carried, information) = states, room
+    own, left = unmade(signal), unfiltered(blocks, len(rows))
+    carried, x = np.zeros((padded(n), padded(n))), np.zeros(padded(n))
     carried[:n, :n] = P
+    left.states[:], left.predicted_states[:] = 0.0, 0.0
     for k in range(blocks):
         if k > 0:
-            predict(rows, signal, k - 1, left.states[k - 1].copy(), carried, walk, 0.0, own, left.taken[k])
-        information[:n, :n] = _information(prepared, k, states[k])
-        carried[:n, :n] = np.linalg.inv(np.linalg.inv(carried[:n, :n]) + information[:n, :n] / noise_var)
-        own.information[k], left.covariances[k] = information, carried
+            x[:n] = states[k - 1]
+            predict(rows, signal, k - 1, x, carried, walk, 0.0, own, left.taken[k])
+        left.predicted_covariances[k] = carried
+        information = _information(prepared, k, states[k]) / noise_var
+        carried[:n, :n] = np.linalg.inv(np.linalg.inv(carried[:n, :n]) + information)
+        left.covariances[k] = carried
     phases = [a * STATES + PHASE for a in range(len(rows))]
     filtered = np.sqrt(np.diagonal(left.covariances, axis1=1, axis2=2)[:, phases])
-    return filtered, np.sqrt(smoothed(signal, own, left)[1][:, phases])
+    run_smoother(signal.step, left)
+    return filtered, np.sqrt(np.diagonal(left.covariances, axis1=1, axis2=2)[:, phases])
 
 
 def _information(prepared: Prepared, k: int, x: Array) -> Array:

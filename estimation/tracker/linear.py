@@ -153,7 +153,7 @@ def expected(laws, signal, k, x, rates):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _gathered(roots, whitened, values, jacobian, lines, rows, rest):  # type: ignore[no-untyped-def]
-    """Whitened Jacobian and what the projections have beyond ``values``, into ``rows`` and ``rest``; how many there are.
+    """Whitened Jacobian and what the projections have beyond ``values``, into ``rows`` and ``rest``; how many rows.
 
     A line tells of its own axis alone, so that a row is gathered axis by axis from that axis's columns; the mean, the
     first column, comes from all of them.

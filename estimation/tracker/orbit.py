@@ -151,10 +151,11 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
             seen_at[i], slope_at[i], bend_at[i] = value, slope, bend
     for j in range(points):
         square[j], square_slope[j], own[j] = force[0].real, 0.0, 0.0
+    back, turned = np.exp(-1j * law.turn * phase), 1.0 + 0.0j
     for m in range(1, DRIVEN):
+        turned *= back
         if force[m] != 0.0:
-            n = m * law.turn
-            line = force[m] * np.exp(-1j * n * phase)
+            n, line = m * law.turn, force[m] * turned
             for j in range(points):
                 square[j] += line.real * COS[n, j] - line.imag * SIN[n, j]
                 square_slope[j] += n * (line.real * SIN[n, j] + line.imag * COS[n, j])  # by phi, at fixed u
@@ -182,14 +183,15 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
             seen_at[j] += (slope_at[j] + 0.5 * bend_at[j] * own[j]) * own[j]
             slope_at[j] = (slope_at[j] + bend_at[j] * own[j]) * swing
             mean_bend += (slope_at[j] + bend_at[j] * swing * swing) / points
-    inertia = 2j * w * law.J + b
-    first = 1j * _line(torque, 1, points) / amplitude
-    rate = (first + law.J * w * w - k - 1j * w * b) / inertia
-    by_phase_rate = 1j * _line(by_phase, 1, points) / amplitude / inertia
-    by_log_rate = (1j * _line(by_log, 1, points) / amplitude - first) / inertia
+    light = 1.0 / (2j * w * law.J + b)
+    push = 1j / amplitude * light  # by which a torque changes the rate
+    first = push * _line(torque, 1, points)
+    rate = first + (law.J * w * w - k - 1j * w * b) * light
+    by_phase_rate = push * _line(by_phase, 1, points)
+    by_log_rate = push * _line(by_log, 1, points) - first
     change = by_phase_rate * rate.imag + by_log_rate * rate.real
-    own_share = 1.0 - 2.0 * law.J * rate / inertia  # of a change of the rate, that its square leaves
-    rate -= law.J * (rate * rate + change) / inertia
+    own_share = 1.0 - 2.0 * law.J * rate * light  # of a change of the rate, that its square leaves
+    rate -= law.J * (rate * rate + change) * light
     seen, seen_by_log = np.zeros(SENSED + 1, np.complex128), np.zeros(SENSED + 1, np.complex128)
     for n in range(SENSED + 1):
         if not half or n % 2 == int(law.position):
@@ -199,8 +201,8 @@ def turn_of(law, amplitude, phase, w, k, b, force):  # type: ignore[no-untyped-d
         rate,
         own_share * by_phase_rate,
         own_share * by_log_rate,
-        own_share * -k / inertia,
-        own_share * -1j * w * b / inertia,
+        own_share * -k * light,
+        own_share * -1j * w * b * light,
         moved,
         seen,
         seen_by_log,

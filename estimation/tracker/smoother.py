@@ -43,6 +43,7 @@ class Filtered(NamedTuple):
 
     Attributes:
         states: shape (blocks, n), n made up to a multiple of LANES. covariances: shape (blocks, n, n).
+        predicted_states, predicted_covariances: before the block's own measurements, shapes likewise.
         taken: of the step that leads to the block, see ``step.leave``, shape (blocks, axes, 2, 5).
         slopes: of the log-likelihood of the block's measurements by its state there, shape (blocks, n).
         noise: variance of a sample, infinite where the block told nothing, shape (blocks,) [V^2].
@@ -50,6 +51,8 @@ class Filtered(NamedTuple):
 
     states: Array
     covariances: Array
+    predicted_states: Array
+    predicted_covariances: Array
     taken: Array
     slopes: Array
     noise: Array
@@ -58,7 +61,7 @@ class Filtered(NamedTuple):
 def unfiltered(blocks: int, axes: int) -> Filtered:
     """Room for what a filter leaves."""
     n = padded(STATES * axes + 1)
-    by_block = (n,), (n, n), (axes, 2, DAMPING + 1), (n,), ()
+    by_block = (n,), (n, n), (n,), (n, n), (axes, 2, DAMPING + 1), (n,), ()
     return Filtered(*(np.empty((blocks, *shape)) for shape in by_block))
 
 
@@ -239,6 +242,7 @@ def run_filter(laws, signal, x, P, live, walk, offset_walk, linear, filtered):  
                 noise *= misfit if misfit < BROKEN else BROKEN  # what no state explains counts as noise
             else:
                 x, P, told = before, P_before, False
+        filtered.predicted_states[k], filtered.predicted_covariances[k] = before, P_before
         total, count = total + here[0], count + here[2]
         chi2 += here[1] * noise / signal.noise_var[k]
         filtered.noise[k] = noise if told else np.inf

@@ -18,7 +18,6 @@ from estimation.tracker.smoother import LOST, SIGNIFICANT
 from estimation.tracker.step import DAMPING, FLOOR, LOG, PHASE, RATES, STATES, STIFFNESS, Signal, flow, rates_of
 from estimation.tracker.switches import EDGE
 from estimation.tracker.tuning import (
-    OFFSET_WALK,
     START_WALK,
     Belief,
     Likely,
@@ -193,8 +192,8 @@ def follow(prepared: Prepared, start: Belief, walks: Array, causal: bool = False
 
     It goes window by window, so that memory does not grow with the covariances of all blocks.
     """
-    blocks, axes = len(prepared.time), len(prepared.laws)
-    states, sds = np.empty((2, len(walks), blocks, start.x.size))
+    blocks, n = len(prepared.time), start.x.size
+    states, sds = np.empty((2, len(walks), blocks, n))
     live = np.tile(start.live, (len(walks), 1))
     totals, beliefs, first = np.zeros((len(walks), 3)), [start] * len(walks), 0
     while first < blocks:
@@ -202,23 +201,18 @@ def follow(prepared: Prepared, start: Belief, walks: Array, causal: bool = False
         inner, part = done - first, window(prepared.signal, first, min(done + LAG, blocks))
         own = linear.unmade(part)  # about the first track: the others are near it
         for i, values in enumerate(walks):
-            walk = densities(values)
-            run = filtered(prepared, part, own, beliefs[i], walk)
+            run = filtered(prepared, part, own, beliefs[i], densities(values))
             live[i] |= run.live
             totals[i] += run.log_likelihood, run.chi2, run.used
             if done < blocks:
-                x, P = run.blocks.states[inner - 1].copy(), run.blocks.covariances[inner - 1].copy()
-                room = np.empty((axes, 2, DAMPING + 1))
-                linear.predict(prepared.rows, part, inner - 1, x, P, walk, OFFSET_WALK, own, room)
+                x, P = run.blocks.predicted_states[inner, :n], run.blocks.predicted_covariances[inner, :n, :n]
                 floor = np.log([2.0 * FLOOR * law.theta0 for law in prepared.laws])
-                n = start.x.size
-                beliefs[i] = Belief(x[:n], P[:n, :n], x[LOG::STATES][:axes] > floor)
-            if causal:
-                xs, variances = run.blocks.states, np.diagonal(run.blocks.covariances, axis1=1, axis2=2)
-            else:
-                xs, variances = backward.smoothed(part, own, run.blocks)
-            states[i, first:done] = xs[:inner, : start.x.size]
-            sds[i, first:done] = np.sqrt(np.maximum(variances[:inner, : start.x.size], 0.0))
+                beliefs[i] = Belief(x.copy(), P.copy(), x[LOG::STATES][: floor.size] > floor)
+            if not causal:
+                backward.run_smoother(part.step, run.blocks)
+            variances = np.diagonal(run.blocks.covariances[:inner], axis1=1, axis2=2)[:, :n]
+            states[i, first:done] = run.blocks.states[:inner, :n]
+            sds[i, first:done] = np.sqrt(np.maximum(variances, 0.0))
         first = done
     return [
         Track(xs, each, total, chi2 / max(count, 1.0), found)
