@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.tracker.backward import run_smoother
-from estimation.tracker.linear import predict, unmade
+from estimation.tracker.linear import linearise, predict, unmade
 from estimation.tracker.orbit import SENSED, law_of, turn_of
 from estimation.tracker.signal import Prepared
 from estimation.tracker.smoother import unfiltered
@@ -36,6 +36,8 @@ def phase_bound(prepared: Prepared, states: Array, P: Array, walk: Array, noise_
     carried, x = np.zeros((padded(n), padded(n))), np.zeros(padded(n))
     carried[:n, :n] = P
     left.states[:], left.predicted_states[:] = 0.0, 0.0
+    x[:n] = states[0]
+    linearise(rows, signal, 0, x, own)
     for k in range(blocks):
         if k > 0:
             x[:n] = states[k - 1]
