@@ -72,15 +72,15 @@ def test_products_of_blocks_are_those_of_the_samples(length, blocks, evens, odds
     edge=st.booleans(),
     seed=st.integers(0, 1000),
 )
-def test_a_run_of_equal_samples_is_left_out_where_it_is_an_extreme(at, run, low, edge, seed):  # type: ignore[no-untyped-def]
+def test_a_run_of_equal_samples_lies_beyond_a_rail_where_it_is_an_extreme(at, run, low, edge, seed):  # type: ignore[no-untyped-def]
     values = np.random.default_rng(seed).normal(size=1000)
     run = min(run, 1000 - at)
     values[at : at + run] = (9.0 if edge else 0.5) * (-1.0 if low else 1.0)
     told = project(channel(values), np.array([0]), 1000, np.array([(0, 2)]), np.full((1, 1), 2 * np.pi * 13840.0))
-    assert told.counts[0] == 1000 - (run if edge and run >= CLIPPED_RUN else 0)
+    assert told.beyond[0] == (run if edge and run >= CLIPPED_RUN else 0)
 
 
-def test_demodulation_leaves_out_what_is_missing_or_clipped() -> None:
+def test_demodulation_leaves_out_what_is_missing_and_tells_what_is_clipped() -> None:
     rng = np.random.default_rng(1)
     lines, tuned = np.array([(0, 2), (0, 4)]), np.array([2 * np.pi * 13840.0])
     length = 1000
@@ -91,10 +91,10 @@ def test_demodulation_leaves_out_what_is_missing_or_clipped() -> None:
     told = project(channel(values), np.array([0, length]), length, lines, np.tile(tuned, (2, 1)))
     clipped = int(np.sum(values[length:] == 1.7))
     assert told.counts[0] == 800
-    assert length - clipped <= told.counts[1] <= length - clipped + 3 * CLIPPED_RUN  # a noisy run's ends stay
-    amplitude = np.hypot(*solved(told)[:, 1:3].T)
-    assert np.allclose(amplitude, 1.0, atol=0.005)
-    assert np.allclose(residual_variance(told), 1e-4, rtol=0.2)
+    assert (told.counts[1], told.beyond[1]) == (1000, clipped)
+    assert np.allclose(told.rails[1], [-np.inf, 1.7], atol=2e-3)
+    assert np.hypot(*solved(told)[0, 1:3]) == pytest.approx(1.0, abs=0.005)
+    assert residual_variance(told)[0] == pytest.approx(1e-4, rel=0.2)
 
 
 def test_demodulation_follows_a_sweep_with_tables_of_its_own() -> None:

@@ -4,7 +4,8 @@ A block's samples are projected on a constant and on cosine and sine of every ha
 of two axes are not orthogonal over a block, so what is kept is the projection s = B'y and the Gram matrix G = B'B, of
 which whatever is linear in the harmonics loses nothing. One table of B serves all blocks as long as the reference's
 frequency stays, which makes the projection one matrix product, taken from the samples as they are stored; a block with
-missing or clipped samples gets a Gram matrix of its own from the samples that are left.
+missing samples gets a Gram matrix of its own from the samples that are left. What samples beyond a converter's rails
+tell depends on the track (``censored``); until there is one, the mean of what may lie beyond stands for them.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class Projections:
             what a line, its rate and its rate's rate give. geometry: which of them is a block's, shape (blocks,).
         squares: y'y, shape (blocks,). counts: samples used, shape (blocks,).
         tuned: angular frequency that the table of each block is made for, shape (blocks, references) [rad/s].
+        rails: between which samples were measured, infinite for none, shape (blocks, 2). beyond: how many were not.
     """
 
     sums: Array
@@ -45,6 +47,8 @@ class Projections:
     squares: Array
     counts: Index
     tuned: Array
+    rails: Array
+    beyond: Index
 
 
 def basis(length: int, rate: float, lines: Index, tuned: Array) -> Array:
@@ -53,7 +57,7 @@ def basis(length: int, rate: float, lines: Index, tuned: Array) -> Array:
     Args:
         lines: (reference, order) of each line, shape (lines, 2). tuned: of each reference [rad/s].
     """
-    turn = np.exp(1j * np.outer(tuned, _offsets(length, rate)))
+    turn = np.exp(1j * np.outer(tuned, offsets(length, rate)))
     powers = np.cumprod(np.broadcast_to(turn, (lines[:, 1].max(initial=1), *turn.shape)), axis=0)
     turned = powers[lines[:, 1] - 1, lines[:, 0]]
     rows = np.stack([turned.real, turned.imag], axis=1).reshape(-1, length)
@@ -77,14 +81,15 @@ def project(
         lines: as in ``basis``. omega: angular frequency of each reference in each block, shape (blocks, references).
         settling: samples at the channel's beginning that are left out.
         squared: the samples' squares are projected.
-        may_clip: runs of equal samples at a block's extremes are a converter's end and left out. A drive's flat tops
-            are what the mirror feels.
+        may_clip: runs of equal samples at a block's extremes are a converter's rails, and the signal was beyond them.
+            A drive's flat tops are what the mirror feels.
     """
     blocks, m = starts.size, 1 + 2 * len(lines)
     sums, squares, tuned = np.zeros((blocks, m)), np.zeros(blocks), np.empty_like(omega)
-    geometry, counts = np.zeros(blocks, np.int64), np.full(blocks, length)
+    geometry, counts, beyond = np.zeros(blocks, np.int64), np.full(blocks, length), np.zeros(blocks, np.int64)
+    rails = np.tile([-np.inf, np.inf], (blocks, 1))
     grams: list[Array] = []
-    offset = _offsets(length, channel.sample_rate)
+    offset = offsets(length, channel.sample_rate)
     by_parity = np.r_[0, 1:m:2, 2:m:2]  # a constant and cosines are even about the block's middle, sines odd
     highest = np.array([max(lines[lines[:, 0] == i, 1], default=1) for i in range(omega.shape[1])])
     for group in _steady_groups(omega * highest, 2 * np.pi * TABLE_REACH * channel.sample_rate / length):
@@ -107,21 +112,42 @@ def project(
                 odd |= _clipped(stored, own_starts, length)
             for i in np.flatnonzero(odd):
                 k, row = part.start + int(i), stored[own_starts[i] : own_starts[i] + length]
-                used = _usable(row) if may_clip else np.isfinite(row)
+                used = np.isfinite(row)
+                if may_clip:
+                    rails[k] = np.sort(channel.scaled(_rails(row)))
                 used[: max(settling - int(starts[k]), 0)] = False
-                own, left = table[:, used], channel.scaled(row[used])
-                left = left**2 if squared else left
+                own, measured = table[:, used], channel.scaled(row[used])
+                left = measured**2 if squared else _filled(measured, rails[k])
                 sums[k], squares[k], counts[k] = own @ left, left @ left, left.size
-                geometry[k] = len(grams)
-                grams.append(_moments(own, offset[used]))
-    return Projections(sums, np.array(grams), geometry, squares, counts, tuned)
+                beyond[k] = np.sum((measured < rails[k, 0]) | (measured > rails[k, 1]))
+                if not used.all():
+                    geometry[k] = len(grams)
+                    grams.append(_moments(own, offset[used]))
+    return Projections(sums, np.array(grams), geometry, squares, counts, tuned, rails, beyond)
+
+
+def _filled(values: Array, rails: Array) -> Array:
+    """Samples with the mean of what a normal signal has beyond two rails in place of what lies there, shape (n,).
+
+    That signal leaves the rails, (2,), as often as the samples do: a rail's own value may be a tenth of what is beyond.
+    """
+    from scipy.special import ndtri
+
+    sides = values < rails[0], values > rails[1]
+    if not (rails[0] < rails[1] and all(side.any() for side in sides)):
+        return values
+    shares = np.array([side.mean() for side in sides])
+    z = ndtri([shares[0], 1.0 - shares[1]])
+    sd = (rails[1] - rails[0]) / (z[1] - z[0])
+    middle, reach = rails[1] - sd * z[1], sd * np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * shares)
+    return np.select(sides, [middle - reach[0], middle + reach[1]], values)
 
 
 def _moments(table: Array, offset: Array) -> Array:
     return np.stack([table @ table.T, (table * offset) @ table.T, (table * offset * offset) @ table.T])
 
 
-def _offsets(length: int, rate: float) -> Array:
+def offsets(length: int, rate: float) -> Array:
     """Times of a block's samples from its middle [s]."""
     return (np.arange(length, dtype=np.float64) - 0.5 * (length - 1)) / rate
 
@@ -191,20 +217,21 @@ def _clipped(values, starts, length):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _usable(row):  # type: ignore[no-untyped-def]
-    """Samples that are finite and in no run of equal ones at the block's extremes, shape (length,)."""
-    used = np.isfinite(row)
-    if not used.any():
-        return used
-    low, high = row[used].min(), row[used].max()
-    if low == high:
-        return used
-    run = 0
-    for j in range(row.size + 1):
-        if j < row.size and (row[j] == low or row[j] == high) and (run == 0 or row[j] == row[j - 1]):
-            run += 1
-            continue
-        if run >= CLIPPED_RUN:
-            used[j - run : j] = False
-        run = 1 if j < row.size and (row[j] == low or row[j] == high) else 0
-    return used
+def _rails(row):  # type: ignore[no-untyped-def]
+    """Values (2,) between which samples were measured, infinite where no run of equal ones lies at that extreme.
+
+    A rail is taken half way to the value nearest to it: with few bits the extreme is itself measured by as much, and a
+    comparator's two values have its threshold between them.
+    """
+    out, known = np.array([-np.inf, np.inf]), row[np.isfinite(row)]
+    if known.size == 0 or known.min() == known.max():
+        return out
+    for i, extreme in ((0, known.min()), (1, known.max())):
+        run, longest = 0, 0
+        for j in range(row.size):
+            run = run + 1 if row[j] == extreme else 0
+            longest = max(longest, run)
+        if longest >= CLIPPED_RUN:
+            rest = known[known != extreme]
+            out[i] = 0.5 * (float(extreme) + float(rest.min() if i == 0 else rest.max()))
+    return out

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from estimation.signals import Sense, drive_voltage, intensity_clock, reference_of
 from estimation.tracker.orbit import axis_law, law_of, turn_of
-from estimation.tracker.signal import Driven, Prepared, driven_blocks
+from estimation.tracker.signal import NEVER_CLIPPED, Driven, Prepared, driven_blocks
 from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND, Signal
 from estimation.tracker.track import (
     STIFFNESS_SPREAD,
@@ -87,7 +87,8 @@ def prepare_driven(recording: Recording, device: Device, name: str) -> Prepared:
     time, width = _blocks(channel, reference.frequency)
     driven = driven_blocks(drive_voltage(recording, name), reference, time, width, law)
     signal = _silent(driven, width, 2 if law.pull else 1, LARGEST * law.theta0)
-    return Prepared(Sense(channel, UNREAD, (name,)), {name: driven.reference}, (law,), time, signal, 0.0)
+    sense, references = Sense(channel, UNREAD, (name,)), {name: driven.reference}
+    return Prepared(sense, references, (law,), time, signal, 0.0, NEVER_CLIPPED, 1.0)
 
 
 def _blocks(channel: Channel, frequency: float) -> tuple[Array, float]:

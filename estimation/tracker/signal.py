@@ -37,6 +37,22 @@ MODEL_SHARE = 3e-3  # of the signal's rms: what laws linearised over a block lea
 DISTURBED = 1.5  # times the usual variance about a block's fit: the block holds something else
 
 
+class Clipped(NamedTuple):
+    """Blocks with samples beyond a rail.
+
+    Attributes:
+        block: which they are, shape (n,). pieces: first and last but one sample that each may use, shape (n, 2).
+        rails: between which samples were measured, infinite for none, shape (n, 2) [V].
+    """
+
+    block: Index
+    pieces: Index
+    rails: Array
+
+
+NEVER_CLIPPED = Clipped(np.zeros(0, np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2)))
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A sense channel, its axes' laws and its blocks.
@@ -47,6 +63,7 @@ class Prepared:
         time: of the blocks' middles, shape (blocks,) [s].
         signal: for the smoother.
         clean: fraction of the samples that were used.
+        clipped: blocks in which the signal left its rails. noise_var: of a sample in most blocks [V^2].
     """
 
     sense: Sense
@@ -55,6 +72,8 @@ class Prepared:
     time: Array
     signal: Signal
     clean: float
+    clipped: Clipped
+    noise_var: float
 
     @property
     def rows(self) -> Array:
@@ -103,7 +122,8 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
     if not projections.counts.any():
         raise BadInput("holds no sample that can be used", file=channel.file, channel=channel.name)
     passed, passed_by_w = _passed(sense, lines, w)
-    whitened, roots, unroots = _whitened(projections)
+    white, roots, unroots = whitened(projections.sums, projections.grams, projections.geometry)
+    noise, usual = _noise(projections, channel, starts, cut, lines, w, sense.readout.noise_sd)
     signal = Signal(
         psi=psi,
         w=w,
@@ -116,18 +136,27 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
         mean_gain=float(readout_response(sense.readout, 0.0).real),
         mean_delay=float(readout_response(sense.readout, SLOW).imag / (2 * np.pi * SLOW)),
         tuned=np.ascontiguousarray(projections.tuned),
-        whitened=whitened,
+        whitened=white,
         roots=np.ascontiguousarray(roots),
         unroots=unroots,
         geometry=projections.geometry,
-        noise_var=_noise(projections, channel, starts, cut, lines, w),
+        noise_var=noise,
         known=np.zeros(psi.shape),
         known_var=np.full(psi.shape, np.inf),
         ladder=np.stack([_ladder(axis, sense) for axis in axes]),
         main=2 if is_capacitive(sense.readout) else 1,
     )
     references = {name: own.reference for name, own in zip(sense.axes, driven, strict=True)}
-    return Prepared(sense, references, laws, time, signal, float(projections.counts.sum()) / (count * length))
+    clean = float((projections.counts - projections.beyond).sum()) / (count * length)
+    return Prepared(sense, references, laws, time, signal, clean, _clipped(projections, starts, cut, settling), usual)
+
+
+def _clipped(projections: Projections, starts: Index, cut: Index, settling: int) -> Clipped:
+    """The blocks with a rail."""
+    block = np.flatnonzero(np.isfinite(projections.rails).any(axis=1))
+    pieces = cut[block].copy()
+    pieces[:, 0] = np.maximum(pieces[:, 0], settling - starts[block])
+    return Clipped(block, pieces, projections.rails[block])
 
 
 def _block_length(axes: list[Axis], frequencies: list[float], rate: float) -> int:
@@ -224,13 +253,16 @@ def _passed(sense: Sense, lines: Index, w: Array) -> tuple[Complex, Complex]:
     return readout_response(sense.readout, f), (high - low) / (2.0 * step * w[:, lines[:, 0]])
 
 
-def _noise(projections: Projections, channel: Channel, starts: Index, cut: Index, lines: Index, w: Array) -> Array:
-    """Variance of each block's samples, shape (blocks,): that of most blocks, more where one holds a disturbance.
+def _noise(
+    projections: Projections, channel: Channel, starts: Index, cut: Index, lines: Index, w: Array, noise_sd: float
+) -> tuple[Array, float]:
+    """Variance of each block's samples, shape (blocks,), and of most blocks': more where one holds a disturbance.
 
     Lines that slip or decay within a block leave much of themselves about a steady fit, and are no disturbance: blocks
     that seem to hold one are fitted with lines beside each line as well, which make it free to change.
     """
     own = residual_variance(projections)
+    own[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator tells no volts
     samples = np.maximum(projections.counts, 1)
     swing = float(np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2))
     usual = max(float(np.nanmedian(own)), MODEL_SHARE**2 * swing)
@@ -241,19 +273,23 @@ def _noise(projections: Projections, channel: Channel, starts: Index, cut: Index
     for k in np.flatnonzero(own > DISTURBED * usual):
         omega = np.concatenate([w[k], w[k] - beside, w[k] + beside, [np.pi * beside]])
         own[k] = residual_variance(project_one(channel, int(starts[k]), cut[k], length, free, omega))[0]
-    return np.where(own > DISTURBED * usual, own, usual)
+    return np.where(own > DISTURBED * usual, own, usual), usual
 
 
-def _whitened(projections: Projections) -> tuple[Array, Array, Array]:
-    """(R's, R'G of all three moments, R), R'GR = 1, by eigenvectors; directions with no samples stay zero."""
-    values, vectors = np.linalg.eigh(projections.grams[:, 0])
+def whitened(sums: Array, grams: Array, geometry: Index) -> tuple[Array, Array, Array]:
+    """(R's, R'G of all three moments, R), R'GR = 1, by eigenvectors; directions with no samples stay zero.
+
+    Args:
+        sums, grams, geometry: as in ``blocks.Projections``.
+    """
+    values, vectors = np.linalg.eigh(grams[:, 0])
     held = values > 1e-9 * np.maximum(values[:, -1:], 1.0)
     unroots = vectors * np.where(held, 1.0 / np.sqrt(np.where(held, values, 1.0)), 0.0)[:, None, :]
-    whitened = np.empty_like(projections.sums)
+    out = np.empty_like(sums)
     for g, unroot in enumerate(unroots):
-        mine = projections.geometry == g
-        whitened[mine] = projections.sums[mine] @ unroot
-    return whitened, np.swapaxes(unroots, 1, 2)[:, None] @ projections.grams, np.ascontiguousarray(unroots)
+        mine = geometry == g
+        out[mine] = sums[mine] @ unroot
+    return out, np.swapaxes(unroots, 1, 2)[:, None] @ grams, np.ascontiguousarray(unroots)
 
 
 def _ladder(axis: Axis, sense: Sense) -> Array:

@@ -35,6 +35,7 @@ LOST = (0.5, 0.3)  # sd of phase [rad] and ln A beyond which the block itself te
 SIGNIFICANT = 6.0  # standard deviations that a line must have to be taken for a motion
 MISFIT = 4.0  # mean squared innovation beyond which the motion itself must have jumped
 BROKEN = 100.0  # beyond which it is looked for anew
+ASTRAY = 0.5  # change of state beyond which a linearisation kept from elsewhere is no place to start from
 OPEN = (0.02, 3.0)  # sd of the stiffness and its trend [1/s] that a jump may at most give them
 
 
@@ -175,6 +176,8 @@ def _slope(signal, k, x, linear, noise, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy")
 def _measured(laws, signal, k, before, P_before, linear, noise):  # type: ignore[no-untyped-def]
     """State and covariance with block k's measurements, linearised anew until they stay; what ``_update`` returns."""
+    if not change(before, linear.about[k], signal.step) < ASTRAY:
+        linearise(laws, signal, k, before, linear)
     for tried in range(TRIES):
         x, P = before.copy(), P_before.copy()
         here = _update(signal, k, x, P, linear, noise)

@@ -78,6 +78,18 @@ class Signal(NamedTuple):
     ladder: Array
     main: int
 
+    def with_blocks(self, block: NDArray[np.int64], whitened: Array, roots: Array, unroots: Array) -> Signal:
+        """The signal with other projections of some blocks, each with a geometry of its own."""
+        kept = 1 + np.delete(self.geometry, block).max(initial=-1)
+        geometry, white = self.geometry.copy(), self.whitened.copy()
+        geometry[block], white[block] = kept + np.arange(block.size), whitened
+        return self._replace(
+            geometry=geometry,
+            whitened=white,
+            roots=np.concatenate([self.roots[:kept], roots]),
+            unroots=np.concatenate([self.unroots[:kept], unroots]),
+        )
+
 
 @njit(cache=True, error_model="numpy")
 def set_rates(law, turn, stiff, damp, rates):  # type: ignore[no-untyped-def]

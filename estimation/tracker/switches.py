@@ -162,13 +162,14 @@ def project_pieces(
 ) -> Projections:
     """The projections with the blocks that a switch cuts made anew from their piece; see ``blocks.project``."""
     cut = np.flatnonzero(np.diff(pieces).ravel() < pieces[:, 1].max())
-    out = replace(whole, **{name: getattr(whole, name).copy() for name in ("sums", "squares", "counts", "tuned")})
+    by_block = ("sums", "squares", "counts", "beyond", "rails", "tuned")
+    out = replace(whole, **{name: getattr(whole, name).copy() for name in by_block})
     grams, geometry, count = [whole.grams], whole.geometry.copy(), len(whole.grams)
     for k in cut:
         own = project_one(
             channel, int(starts[k]), pieces[k], int(pieces[:, 1].max()), lines, omega[k], squared, may_clip
         )
-        for name in ("sums", "squares", "counts", "tuned"):
+        for name in by_block:
             getattr(out, name)[k] = getattr(own, name)[0]
         geometry[k] = count + own.geometry[0]
         grams.append(own.grams)

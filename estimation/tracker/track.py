@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from estimation.signals import Sense, intensity_clock, is_capacitive, reference_of, senses
 from estimation.tracker import backward, linear, smoother
 from estimation.tracker.angle import SlowAngle, SlowMotion
+from estimation.tracker.censored import expanded_about
 from estimation.tracker.orbit import MOVED, law_of, turn_of
 from estimation.tracker.signal import Prepared, prepare
 from estimation.tracker.smoother import LOST, SIGNIFICANT
@@ -42,6 +43,7 @@ POSITION_GAIN_SD = 1e-4  # relative: what a position sensor says is what the ang
 OFFSET_SD = 1.0  # of the readout [V]
 WINDOW, LAG = 4096, 512  # blocks smoothed at a time, and how far a window looks ahead of what it gives
 LISTENED = 64  # blocks that may be taken together to find a motion in noise
+EXPANSIONS, STAYS = 30, 0.05  # of clipped blocks about a track, at most; its change at which it stays [sd]
 PROBED = 200  # blocks from which the sign is told
 
 
@@ -101,10 +103,12 @@ def track(
         prepared = prepare(recording, device, sense, references)
         start, signs = signed(prepared, starting_belief(prepared, device))
         # by the signal alone: it would bend the motion to each of a few phases seen
-        parts = stretches(prepared.signal)
-        walk = tuned_walk(prepared, start, parts, _walk_of(before, sense))
+        walk = _walk_of(before, sense)
+        prepared = uncensored(prepared, start, walk, causal)
+        walk = tuned_walk(prepared, start, stretches(prepared.signal), walk)
+        prepared = uncensored(prepared, start, walk, causal)
         helped = with_phases(prepared, seen or {})
-        found = averaged(helped, start, likely_walks(prepared, start, parts, walk), causal)
+        found = averaged(helped, start, likely_walks(prepared, start, stretches(prepared.signal), walk), causal)
         for i, name in enumerate(sense.axes):
             if not found.live[i]:
                 raise BadInput(
@@ -220,6 +224,18 @@ def follow(prepared: Prepared, start: Belief, walks: Array, causal: bool = False
     ]
 
 
+def uncensored(prepared: Prepared, start: Belief, walk: Array, causal: bool) -> Prepared:
+    """The blocks with what their samples beyond a rail tell, expanded about the track until it stays."""
+    before: Array | None = None
+    for _ in range(EXPANSIONS if prepared.clipped.block.size else 0):
+        found = follow(prepared, start, walk[None], causal)[0]
+        if before is not None and (np.abs(found.states - before) <= STAYS * found.sds).all():
+            break
+        before = found.states
+        prepared = expanded_about(prepared, before)
+    return prepared
+
+
 def averaged(prepared: Prepared, start: Belief, likely: Likely, causal: bool = False) -> Track:
     """The track averaged over the process noise that may be, its deviations with what that leaves uncertain.
 
@@ -302,11 +318,13 @@ def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, fl
     )
 
 
-def _walk_of(motion: Motion | None, sense: Sense) -> Array | None:
-    """The process noise that a track tells of one channel, shape (axes, 3); None where it tells none."""
+def _walk_of(motion: Motion | None, sense: Sense) -> Array:
+    """The process noise that a track tells of one channel, shape (axes, 3); the tuning's start where it tells none."""
     facts = {} if motion is None else motion.info.get(sense.channel.name, {})
     told = facts.get("walk") if isinstance(facts, Mapping) else None
-    return None if told is None else np.array([list(told[axis].values()) for axis in sense.axes])
+    if told is None:
+        return np.tile(START_WALK, (len(sense.axes), 1))
+    return np.array([list(told[axis].values()) for axis in sense.axes])
 
 
 def _at_switch(prepared: Prepared, found: Track, i: int, k: int) -> tuple[NDArray[Any], ...]:
