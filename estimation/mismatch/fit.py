@@ -21,7 +21,8 @@ from estimation.mismatch.noise import Whitener
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_POOL = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())
+POOL = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())
+"""For independent trajectories: compiled code and numpy let go of the interpreter."""
 
 FOLDS = 20
 """Blocks of time that a recording is cut into; every ``HELD``-th is held out of every fit."""
@@ -137,8 +138,7 @@ class Comparison:
             size = np.linalg.norm(columns[:, i])
             steps[i] = np.clip(0.3 / size if size else 1e-2, 1e-7, 3e-2)
 
-        # Compiled code and numpy let go of the interpreter: threads share the columns.
-        list(_POOL.map(fill, [i for i in range(x.size) if i not in additive]))
+        list(POOL.map(fill, [i for i in range(x.size) if i not in additive]))
         return columns
 
 

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import Comparison, Fit
+from estimation.mismatch.fit import POOL, Comparison, Fit
 from estimation.mismatch.model import Candidate, Model
 from scanner.device import Device
 from scanner.terms import Term
@@ -96,7 +96,7 @@ def screen(
     """
     rows = base.rows & (comparison.time < stop)
     known = Projection(base, rows, gone)
-    return [_best_start(comparison, base, each, known, rows, stop) for each in candidates]
+    return list(POOL.map(lambda each: _best_start(comparison, base, each, known, rows, stop), candidates))
 
 
 def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: Projection, rows: NDArray[np.bool_],
