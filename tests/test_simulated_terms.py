@@ -36,6 +36,8 @@ def stated(device: Device, term: Term, axis: str = "x") -> Device:
     values = term.values([2.0 * (p.sign or 1) for p in term.free], scales)
     if term.effect == "saturation":
         values = (0.5,)
+    if term.effect == "mode-coupling":  # of its natural size it takes longer to grow
+        values = (5.0, rate / (4 * np.pi), *values[2:])
     terms = {term.effect: dict(zip((p.name for p in term.parameters), values, strict=True))}
     return replace(device, axes=dict(device.axes) | {axis: replace(device.axis(axis), terms=terms)})
 

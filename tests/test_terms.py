@@ -47,6 +47,21 @@ def test_cubic_stiffness_shifts_the_frequency_by_three_eighths(sign: float) -> N
     assert frequency(angle) / F0 - 1 == pytest.approx(3 / 8 * ratio, rel=0.02)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_mode_at_half_the_frequency_holds_the_swing_at_its_threshold(sign: float) -> None:
+    """It grows where g A passes 2/Q2 (Nayfeh & Mook 5.3), and then takes all that the drive gives beyond."""
+    k, quality, threshold = LINEAR.mechanics.k, 100.0, 0.1
+    axis = replace(LINEAR, mechanics=Mechanics(1e-12, 1e-12 * W / quality, k))
+    values = sign * 2.0 / (40.0 * threshold), 0.5 * F0, 40.0, threshold
+    time = STEP * (np.arange(100 * 800)[:, None] + [0.0, 0.5, 1.0])
+    for driven, held in ((0.08, 0.08), (0.2, threshold)):
+        inputs = Inputs(driven * k / quality / 1e-9 * np.cos(W * time), STEP)
+        angle = move(axis, [Added(catalogue()["mode-coupling"], values)], inputs, (0.0, driven * W)).angle[-1000:]
+        assert np.ptp(angle) / 2 == pytest.approx(held, rel=0.02)
+        # what it takes at the swing's frequency it takes of the mean as well: q² has both in equal parts
+        assert angle.mean() == pytest.approx(sign * (held - driven) / quality, abs=2e-5)
+
+
 def test_quintic_stiffness_shifts_the_frequency_by_five_sixteenths() -> None:
     angle = free_motion(LINEAR, "quintic-stiffness", (0.02 * LINEAR.mechanics.k / 0.1**4,), 0.1)
     assert frequency(angle) / F0 - 1 == pytest.approx(5 / 16 * 0.02, rel=0.03)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.screen import PROMISING, Screened, screen, stepped
+from estimation.mismatch.screen import PROMISING, Screened, screen, small, stepped
 from estimation.mismatch.start import measured_whiteners
-from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
 
@@ -49,7 +48,7 @@ EASE = 5
 LOST = 3.0
 """Growth of the reduced chi-square, from one window to the next, by which the motion has been lost."""
 
-FAR = 30.0
+FAR = 8.0
 """Growth of it from which the model is no longer about to lose the motion: a window in between tells more."""
 
 TOGETHER, ALONE = 3, 12
@@ -290,6 +289,7 @@ def _unspoilt(each: Screened, followed: Fit) -> Array:
     """Where a candidate starts: the nominal values of the last window that was followed, its law not there yet."""
     x = each.model.embed(followed.model, followed.x)
     for i, f in enumerate(each.model.free):
-        if f.kind == "term" and f.parameter is not None and f.parameter.kind not in AMPLITUDES:
+        grows = each.candidate.term.seeds and (f.kind, f.owner) == ("hidden", each.candidate.key)
+        if grows or (f.kind == "term" and f.parameter is not None and not small(each.candidate, f.parameter)):
             x[i] = each.x[i]
     return x

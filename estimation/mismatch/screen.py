@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.fit import POOL, Comparison, Fit
 from estimation.mismatch.model import Candidate, Model
 from scanner.device import Device
-from scanner.terms import Term
+from scanner.terms import Parameter, Term
 from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
@@ -79,7 +79,12 @@ def _of_readout(term: Term) -> bool:
 
 def starts(candidate: Candidate) -> list[tuple[float, ...]]:
     """Values of x to search from: zero for amplitudes, the term's own grid for the others."""
-    return list(product(*[(0.0,) if p.kind in AMPLITUDES else p.starts for p in candidate.term.free]))
+    return list(product(*[(0.0,) if small(candidate, p) else p.starts for p in candidate.term.free]))
+
+
+def small(candidate: Candidate, parameter: Parameter) -> bool:
+    """Whether a parameter is an amplitude from whose zero the effect follows to first order."""
+    return parameter.kind in AMPLITUDES and not candidate.term.seeds
 
 
 def screen(
@@ -103,11 +108,12 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
                 stop: float) -> Screened:  # fmt: skip
     model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
     best: Screened | None = None
-    for grid in starts(candidate):
+    at = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == candidate.key]
+    moving, hidden = amplitudes(model, candidate), states(model, candidate)
+    for grid, seed in product(starts(candidate), candidate.term.seeds or ((0.0,) * len(candidate.term.hidden),)):
         x = model.embed(base.model, base.x)
-        at = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == candidate.key]
         x[at] = grid
-        moving, hidden = amplitudes(model, candidate), states(model, candidate)
+        x[hidden] = seed * (len(hidden) // max(len(seed), 1))
         if moving:
             columns = _sensitivities(comparison, base, model, x, moving, hidden, rows, stop)
             normal, gradient, response = known.system(columns[rows])
@@ -115,7 +121,7 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
             estimate = np.clip(estimate, -LARGEST, LARGEST)
             step = model.embed(base.model, known.spread(response @ estimate))
             placed(step, model, candidate, estimate)
-        else:  # a term without an amplitude (a clip level): what a finite size of it changes
+        else:  # nothing to follow from zero (a clip level, a mode that grows): what a finite size of it changes
             columns = (comparison.residual(model, x, stop) - base.residual)[:, None]
             gain, share = gain_of(*known.system(columns[rows])[:2])
             gain = gain if share[0] > 0.3 else 0.0
@@ -139,7 +145,7 @@ def amplitudes(model: Model, candidate: Candidate) -> list[int]:
     return [
         i
         for i, f in enumerate(model.free)
-        if f.kind == "term" and f.owner == candidate.key and f.parameter.kind in AMPLITUDES  # type: ignore[union-attr]
+        if f.parameter is not None and f.owner == candidate.key and small(candidate, f.parameter)
     ]
 
 

@@ -83,7 +83,8 @@ def columns(comparison: Comparison, fit: Fit, candidate: Candidate) -> list[Arra
         alone.append(replace(candidate, term=replace(candidate.term, parameters=parameters)))
     shown = []
     for each in screen(comparison, fit, alone):
-        own, hidden = np.split(each.columns, [each.columns.shape[1] - len(states(each.model, each.candidate))], axis=1)
+        started = 0 if candidate.term.seeds else len(states(each.model, each.candidate))
+        own, hidden = np.split(each.columns, [each.columns.shape[1] - started], axis=1)
         if np.any(own):
             rows = comparison.rows
             shown.append(own - hidden @ np.linalg.lstsq(hidden[rows], own[rows], rcond=None)[0])

@@ -1,4 +1,4 @@
-"""One-to-two exchange with another mode: the mirror pumps it with θ², it gives back q θ."""
+"""Two-to-one exchange with a mode at half the frequency: pumped through its stiffness, it grows above a threshold."""
 
 from __future__ import annotations
 
@@ -8,32 +8,35 @@ from numba import njit
 from scanner.terms.term import Parameter, Term
 from scanner.trajectory import TORQUE
 
+PUSH = 1e-3
+"""Direct push on the mode, over A^(1/2): next to nothing, but what grows needs something to grow from."""
+
 
 @njit(TORQUE, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
     w2 = 2.0 * np.pi * p[1]
-    return -p[0] * nominal[2] * theta * z0, z1, w2 * w2 * (-theta * theta - z0) - w2 / p[2] * z1
+    pushed = PUSH * theta / np.sqrt(p[3])
+    swing = w2 * w2 * (pushed - (1.0 + p[0] * theta) * z0) - w2 / p[2] * z1
+    return -0.5 * np.copysign(nominal[2], p[0]) * z0 * z0, z1, swing
 
 
 TERM = Term(
     effect="mode-coupling",
     stage="mechanics",
-    equation="J θ'' + b θ' + k θ (1 + g q) = τ,  q'' + (ω2/Q2) q' + ω2² q = −ω2² θ²",
+    equation="J θ'' + b θ' + k (θ ± q²/2) = τ,  q'' + (ω2/Q2) q' + ω2² (1 + g θ) q = 0,  ± the sign of g",
     parameters=(
-        Parameter("g", "1/rad^2", lambda s: 0.02 / s.amplitude**2, sign=1),
-        Parameter(
-            "f2",
-            "Hz",
-            lambda s: s.rate / 3.141592653589793,
-            kind="log",
-            spread=0.3,
-            starts=(-0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4),
-        ),
-        Parameter("Q2", "1", lambda s: 100.0, kind="log"),
+        Parameter("g", "1/rad", lambda s: 0.08 / s.amplitude, starts=(0.6, -0.6, 1.5, -1.5)),
+        Parameter("f2", "Hz", lambda s: s.rate / (4.0 * np.pi), kind="log", spread=0.01, starts=(-0.2, 0.0, 0.2)),
+        Parameter("Q2", "1", lambda s: 80.0, kind="log", spread=0.5),
+        Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
     ),
-    hidden=(lambda s: s.amplitude**2, lambda s: 2.0 * s.rate * s.amplitude**2),
-    source="Antonio, Zanette & López, Nat. Commun. 3, 806 (2012)",
-    lookalikes={"cubic-damping": "no sidebands and no threshold there: record above and below the threshold"},
+    hidden=(lambda s: s.amplitude**0.5, lambda s: 0.5 * s.rate * s.amplitude**0.5),
+    seeds=((1.0, 0.0), (0.0, 1.0), (0.2, 0.2), (0.04, 0.04), (0.008, 0.008), (0.0016, 0.0016)),
+    source="Nayfeh & Mook, Nonlinear Oscillations, Wiley (1979), 6.5: internal resonance of two to one",
+    lookalikes={
+        "cubic-damping": "no sidebands and no threshold there: record above and below the threshold",
+        "overtone-coupling": "no threshold there",
+    },
     # An internal resonance takes a motion at the axis's own.
     applies=lambda axis, scales: 0.5 < scales.rate * np.sqrt(scales.J / scales.k) < 2.0,
     torque=torque,

@@ -141,6 +141,7 @@ class Term:
         lookalikes: effect -> what tells the two apart.
         hidden: scales of the hidden states (angle for angle), at most two. What they do to the mirror is in proportion
             to the first parameter, an amplitude.
+        seeds: where the effect grows out of them instead, values of x of the hidden states to search from.
         applies: whether an axis can show the effect at all, from its axis and scales.
         channels: kinds of channel that ``output`` acts on, one variant each: ``"sense"``, ``"angle"``,
             ``"intensity"`` or ``"place"``.
@@ -164,6 +165,7 @@ class Term:
     clock: Callable[[Array, Sequence[float]], Array] | None = None
     corners: Callable[[Sequence[float]], tuple[float, ...]] | None = None
     hidden: tuple[Callable[[Scales], float], ...] = ()
+    seeds: tuple[tuple[float, ...], ...] = ()
     applies: Callable[[Axis, Scales], bool] = lambda axis, scales: True
     channels: tuple[str, ...] = ("sense",)
     at_output: bool = False
