@@ -157,10 +157,24 @@ def test_whitened_noise_is_white_and_of_unit_size() -> None:
 
     rng = np.random.default_rng(11)
     noise = lfilter([1.0], [1.0, -0.9], rng.normal(0, 0.1, 20000))
-    psd = noise_psd(noise, 8001, 1e-4, [100.0], 5.0)
+    psd, _ = noise_psd(noise, 8001, 1e-4, [100.0], 5.0)
     white = whitener(psd, noise.size, (20, 20))(noise)
     assert white.std() == pytest.approx(1.0, abs=0.03)
     assert abs(np.corrcoef(white[:-1], white[1:])[0, 1]) < 0.05
+
+
+def test_slow_noise_is_excused_as_far_as_a_steeper_spectrum_explains_it() -> None:
+    n = 4000
+    white = np.random.default_rng(5).normal(0.0, 1.0, n)
+    turn = 2 * np.pi * np.arange(n) / n
+    whiten = whitener(np.ones(n // 2 + 1), n, (0, 0), first=10.0)
+    slow, measured = 4.0 * np.sqrt(2 / n) * np.cos(turn), 4.0 * np.sqrt(2 / n) * np.cos(12 * turn)
+    assert whiten.excused(white) < 2.0
+    assert whiten.excused(white + measured) < 2.0
+    excused = whiten.excused(white + slow)  # sixteen in chi-square are there to be excused
+    assert 4.0 < excused < 16.0
+    assert whiten.excused(white + 10.0 * slow) < 0.99 * 1600.0  # and never all of a large drift
+    assert replace(whiten, first=0.0).excused(white + slow) == 0.0
 
 
 def test_red_noise_is_measured_between_the_lines_of_a_multisine() -> None:

@@ -97,6 +97,16 @@ class Comparison:
         with np.errstate(over="ignore", invalid="ignore"):
             return self._residual(model, x, stop)
 
+    def excused(self, fit: Fit) -> float:
+        """What of a fit's chi-square slow noise beyond the measured one may be, see ``Whitener.excused``."""
+        total, first = 0.0, 0
+        shown = np.where(fit.rows, fit.residual, 0.0)
+        for whiten in (each for run in self.whiteners for each in run):
+            if whiten.first > 1.0:
+                total += whiten.excused(shown[first : first + whiten.samples])
+            first += whiten.samples
+        return total
+
     def _residual(self, model: Model, x: Array, stop: float) -> Array:
         parts = []
         for run, whiteners, signals in zip(self.runs, self.whiteners, model.outputs(x, stop), strict=True):

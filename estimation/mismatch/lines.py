@@ -50,7 +50,7 @@ def strongest_foreign_line(fit: Fit) -> float | None:
             motion = run.scales[output.axes[0]].rate / (2 * np.pi)
             lines = [*(motion * np.arange(1, MULTIPLES + 1)), *run.lines[output.axes[0]]]
             width = 0.06 * motion if run.lines[output.axes[0]].size < 200 else 4.0 / duration
-            ratio = power / noise_psd(rest, power.size, output.step, lines, width)
+            ratio = power / noise_psd(rest, power.size, output.step, lines, width)[0]
             ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0
             best = max(best, _strongest(ratio, power, duration))
             if run.lines[output.axes[0]].size > CROWDED:

@@ -72,13 +72,14 @@ def possible(fit: Fit) -> bool:
     )
 
 
-def convincing(before: Fit, after: Fit) -> bool:
+def convincing(comparison: Comparison, before: Fit, after: Fit) -> bool:
     """Whether a term is there: well ahead of nothing, and better on samples that no fit has seen.
 
-    Where those hardly show it (a nominal value pulled off that it relieves, a clip level reached in the first turns
-    only), they may stay as they were, within the scatter of what the term changes there.
+    What slow noise would explain as well, if it rises more steeply than it was continued, is no lead. Where held-out
+    samples hardly show a term (a nominal value pulled off that it relieves, a clip level reached in the first turns
+    only), they may stay as they were, within the scatter of what it changes there.
     """
-    lead = before.evidence - after.evidence
+    lead = before.evidence - comparison.excused(before) - (after.evidence - comparison.excused(after))
     if lead < LEAD_OVER_NOTHING:
         return False
     gained = float(np.sum(before.residual[before.held] ** 2) - np.sum(after.residual[after.held] ** 2))

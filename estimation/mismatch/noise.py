@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 Array = NDArray[np.float64]
 
@@ -27,6 +28,9 @@ LEAST_BINS = 14
 SLOPE_SD = 0.3
 """Standard deviation of the power law that continues the spectrum below its first window."""
 
+STEEPER = 0.6
+"""By how much it may really rise more steeply: two medians of fourteen bins tell no better."""
+
 
 @dataclass(frozen=True)
 class Whitener:
@@ -38,6 +42,7 @@ class Whitener:
         keep: which whitened samples are compared, shape (2 (m - 1),).
         guard: samples at the start and end of the residual that are not compared.
         psd: variance of every bin, shape (m,).
+        first: the slowest bin whose noise was measured; below it the spectrum is continued. 0 where all was.
     """
 
     size: int
@@ -45,6 +50,7 @@ class Whitener:
     keep: NDArray[np.bool_]
     guard: tuple[int, int]
     psd: Array
+    first: float = 0.0
 
     @property
     def samples(self) -> int:
@@ -64,14 +70,30 @@ class Whitener:
         spectrum = np.fft.rfft(guarded)[: self.weights.size] * self.weights
         return np.fft.irfft(spectrum, self.samples) * np.sqrt(self.samples)
 
+    def excused(self, residual: Array) -> float:
+        """By how much -2 log likelihood falls if noise slower than was measured rises more steeply than was assumed.
 
-def whitener(psd: Array, size: int, guard: tuple[int, int]) -> Whitener:
+        Args:
+            residual: whitened, zero where it does not count, shape (samples,).
+        """
+        bins = np.arange(1, int(np.ceil(self.first)))
+        reach = np.log(self.first / bins)
+        power = 2.0 * np.abs(np.fft.rfft(residual)[bins]) ** 2 / residual.size
+        share = np.count_nonzero(residual) / residual.size
+
+        def worse(slope: float) -> float:
+            return float(power @ np.expm1(-slope * reach) + 2.0 * share * slope * reach.sum() + (slope / STEEPER) ** 2)
+
+        return -min(0.0, minimize_scalar(worse, bounds=(0.0, 4.0), method="bounded").fun)
+
+
+def whitener(psd: Array, size: int, guard: tuple[int, int], first: float = 0.0) -> Whitener:
     """The whitening for a noise of variance ``psd`` in the bins 0 ... m - 1 of a residual of ``size`` samples."""
     weights = 1.0 / np.sqrt(psd)
     samples = 2 * (weights.size - 1)
     time = np.arange(samples) / samples
     keep = (time >= guard[0] / size) & (time < 1.0 - guard[1] / size)
-    return Whitener(size, weights, keep, guard, psd)
+    return Whitener(size, weights, keep, guard, psd, first)
 
 
 def flat_psd(data: Array, bins: int) -> Array:
@@ -89,7 +111,9 @@ def periodogram(residual: Array) -> Array:
     return np.abs(np.fft.rfft(residual * window)) ** 2 * (residual.size / np.sum(window**2))
 
 
-def noise_psd(residual: Array, bins: int, step: float, lines: Sequence[float] | Array, width: float) -> Array:
+def noise_psd(
+    residual: Array, bins: int, step: float, lines: Sequence[float] | Array, width: float
+) -> tuple[Array, float]:
     """Variance of every bin of a residual's transform that is noise.
 
     Args:
@@ -100,7 +124,7 @@ def noise_psd(residual: Array, bins: int, step: float, lines: Sequence[float] | 
         width: to either side of a line [Hz].
 
     Returns:
-        shape (bins,).
+        variances, shape (bins,), and the slowest bin that was measured.
     """
     power = periodogram(residual)
     frequency = np.arange(power.size) / (residual.size * step)
@@ -122,7 +146,7 @@ def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -
     return np.cumsum(marks[:-1]) > 0
 
 
-def _running_median(position: Array, power: Array, wanted: Array) -> Array:
+def _running_median(position: Array, power: Array, wanted: Array) -> tuple[Array, float]:
     """Mean power from medians over windows that widen with frequency, at the wanted positions.
 
     Windows hold at least ``LEAST_BINS`` bins and a quarter of their frequency.
@@ -149,4 +173,4 @@ def _running_median(position: Array, power: Array, wanted: Array) -> Array:
         below = wanted < centres[0]
         distance = np.log(centres[0] / np.maximum(wanted[below], 0.5))
         smooth[below] += slope * distance + 0.5 * (SLOPE_SD * distance) ** 2  # mean of a log-normal level
-    return np.exp(smooth)
+    return np.exp(smooth), float(centres[0])

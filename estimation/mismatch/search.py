@@ -152,7 +152,7 @@ def _extended(
         close = sorted((fit for fit in close if possible(fit)), key=lambda fit: fit.evidence)
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
-        close = [fit for fit in close if convincing(before, fit)]
+        close = [fit for fit in close if convincing(comparison, before, fit)]
         if not close:
             yield _State(comparison, nominal, before, rivals)
             return
@@ -192,12 +192,13 @@ def _by_name(comparison: Comparison, before: Fit, free: Fit, named: Sequence[Can
         comparison, the fit before, the fit with the terms or, where none will do, with the free correction.
     """
     others = instead(comparison, free, free.model.candidates[-1], named, pairs=True)
-    others = [fit for fit in others if fit.evidence < free.evidence and convincing(before, fit)]
+    others = [fit for fit in others if fit.evidence < free.evidence and convincing(comparison, before, fit)]
     if not others:
         return comparison, before, free
     found = others[0]
     fewer = [fit for fit in others if len(fit.model.candidates) < len(found.model.candidates)]
-    if fewer and not convincing(fewer[0], found):  # the second of two is held to what any second effect is held to
+    # the second of two is held to what any second effect is held to
+    if fewer and not convincing(comparison, fewer[0], found):
         found = fewer[0]
     comparison = Comparison(comparison.runs, measured_whiteners(found.model, found.x))
     return comparison, solve(comparison, before.model, before.x), solve(comparison, found.model, found.x)

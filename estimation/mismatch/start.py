@@ -55,8 +55,8 @@ def measured_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
             width = 0.06 * max(motions)  # of a motion that decays
             if _crowded(output, lines, width, min(motions)):
                 width = 0.0
-            psd = noise_psd(output.data - signal, output.bins, output.step, lines, width)
-            row.append(whitener(psd, output.data.size, output.guard))
+            psd, first = noise_psd(output.data - signal, output.bins, output.step, lines, width)
+            row.append(whitener(psd, output.data.size, output.guard, first))
         made.append(row)
     return made
 
