@@ -164,7 +164,7 @@ def _residuals(found: Search) -> Section:
             part = slice(first, first + whiten.samples)
             first += whiten.samples
             pair = [found.nominal.residual[part], found.final.residual[part]]
-            frequency = np.arange(whiten.weights.size) / (output.data.size * output.step)
+            frequency = np.arange(whiten.psd.size) / (output.data.size * output.step)
             figures.append(_time_figure(f"{run.name}: {output.name}", whiten.time * run.duration, pair))
             figures.append(_spectrum_figure(f"{run.name}: {output.name}", frequency, pair))
     text = "Whitened residuals of the nominal device and of the improved one: noise alone has a deviation of 1."

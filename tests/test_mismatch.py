@@ -163,11 +163,27 @@ def test_whitened_noise_is_white_and_of_unit_size() -> None:
     assert abs(np.corrcoef(white[:-1], white[1:])[0, 1]) < 0.05
 
 
+def test_the_ends_of_red_noise_are_as_white_as_its_middle() -> None:
+    """A step from noise to nothing would be lifted above the noise by the whitening, and pass for a drift."""
+    from scipy.signal import lfilter
+
+    n, guard = 4000, (25, 25)
+    rng = np.random.default_rng(8)
+    frequency = np.arange(n // 2 + 1) / n
+    psd = n / np.abs(1.0 - 0.998 * np.exp(-2j * np.pi * frequency)) ** 2
+    whiten = whitener(psd, n, guard)
+    ends = [
+        whiten(lfilter([1.0], [1.0, -0.998], rng.normal(size=3 * n))[-n:])[whiten.keep][[0, 1, -2, -1]]
+        for _ in range(200)
+    ]
+    assert np.mean(np.square(ends)) == pytest.approx(1.0, abs=0.15)
+
+
 def test_slow_noise_is_excused_as_far_as_a_steeper_spectrum_explains_it() -> None:
     n = 4000
     white = np.random.default_rng(5).normal(0.0, 1.0, n)
     turn = 2 * np.pi * np.arange(n) / n
-    whiten = whitener(np.ones(n // 2 + 1), n, (0, 0), first=10.0)
+    whiten = whitener(np.full(n // 2 + 1, float(n)), n, (0, 0), first=10.0)
     slow, measured = 4.0 * np.sqrt(2 / n) * np.cos(turn), 4.0 * np.sqrt(2 / n) * np.cos(12 * turn)
     assert whiten.excused(white) < 2.0
     assert whiten.excused(white + measured) < 2.0

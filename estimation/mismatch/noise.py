@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct, idct
 from scipy.optimize import minimize_scalar
 
 Array = NDArray[np.float64]
@@ -38,7 +39,7 @@ class Whitener:
 
     Attributes:
         size: samples of the residual.
-        weights: one over the noise's standard deviation in every bin that is compared, shape (m,).
+        weights: one over the noise's standard deviation in every half bin that is compared, shape (samples,).
         keep: which whitened samples are compared, shape (2 (m - 1),).
         guard: samples at the start and end of the residual that are not compared.
         psd: variance of every bin, shape (m,).
@@ -55,20 +56,22 @@ class Whitener:
     @property
     def samples(self) -> int:
         """Number of whitened samples, guards included."""
-        return 2 * (self.weights.size - 1)
+        return int(self.weights.size)
 
     @property
     def time(self) -> Array:
         """Position of every whitened sample as a fraction of the recording."""
-        return np.arange(self.samples) / self.samples
+        return (np.arange(self.samples) + 0.5) / self.samples
 
     def __call__(self, residual: Array) -> Array:
-        """Whitened residual, shape (samples,)."""
-        guarded = residual.copy()
-        guarded[: self.guard[0]] = 0.0
-        guarded[guarded.size - self.guard[1] :] = 0.0
-        spectrum = np.fft.rfft(guarded)[: self.weights.size] * self.weights
-        return np.fft.irfft(spectrum, self.samples) * np.sqrt(self.samples)
+        """Whitened residual, shape (samples,).
+
+        At both ends of what is compared it goes on as its mirror image (a cosine transform): taken round in a circle,
+        red noise would end in a step, whose half derivative reaches far into the recording and passes for a drift.
+        """
+        low, high = self.guard[0], residual.size - self.guard[1]
+        mirrored = np.pad(residual[low:high], self.guard, "symmetric")
+        return np.asarray(idct(dct(mirrored, norm="ortho")[: self.samples] * self.weights, norm="ortho"))
 
     def excused(self, residual: Array) -> float:
         """By how much -2 log likelihood falls if noise slower than was measured rises more steeply than was assumed.
@@ -89,9 +92,9 @@ class Whitener:
 
 def whitener(psd: Array, size: int, guard: tuple[int, int], first: float = 0.0) -> Whitener:
     """The whitening for a noise of variance ``psd`` in the bins 0 ... m - 1 of a residual of ``size`` samples."""
-    weights = 1.0 / np.sqrt(psd)
-    samples = 2 * (weights.size - 1)
-    time = np.arange(samples) / samples
+    samples = 2 * (psd.size - 1)
+    weights = np.sqrt(size) * np.exp(-0.5 * np.interp(0.5 * np.arange(samples), np.arange(psd.size), np.log(psd)))
+    time = (np.arange(samples) + 0.5) / samples
     keep = (time >= guard[0] / size) & (time < 1.0 - guard[1] / size)
     return Whitener(size, weights, keep, guard, psd, first)
 
