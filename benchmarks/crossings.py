@@ -3,7 +3,8 @@
 Information of one sample about the phase, in units of (h' / s)^2 for a signal h with noise s: 1 where nothing clips.
 With a rail at c, z = (c - |h|) / s, P and Q the chances to be inside and beyond, g the normal density, it is
 P - z g - g^2 / P of the values inside, and g^2 / (P Q) of whether they are inside, which is all that the times at which
-the signal meets the rails can tell (Tobin, Econometrica 26, 24, 1958). Run: python benchmarks/crossings.py
+the signal meets the rails can tell; both together are what the bound counts (Tobin, Econometrica 26, 24, 1958).
+Run: python -m benchmarks.crossings
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from estimation.tracker.bound import share_kept
 from scanner import devices
 from scanner.device import Transimpedance
 from scanner.laws import capacitance_slope, transimpedance_voltage
@@ -36,9 +38,12 @@ def phase_sds(rail: float, noise: float) -> dict[str, float]:
     sd = noise * readout.noise_sd
     each = (np.gradient(h, u) / sd) ** 2
     limit = rail * np.abs(h).max()
-    inside = _inside((limit - np.abs(h)) / sd)
-    met, zero = _whether((limit - np.abs(h)) / sd), _whether(h / sd)
-    shares = {"whole": 1.0, "between_rails": inside, "with_crossings": inside + met, "comparator": zero}
+    shares = {
+        "whole": 1.0,
+        "between_rails": _inside((limit - np.abs(h)) / sd),
+        "with_crossings": share_kept(np.abs(h), (-np.inf, limit), sd),
+        "comparator": _whether(h / sd),
+    }
     samples = RATE / axis.resonance
     return {name: float(np.rad2deg((samples * np.mean(each * share)) ** -0.5)) for name, share in shares.items()}
 

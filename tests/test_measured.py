@@ -53,6 +53,9 @@ def test_the_beam_decays_by_its_laws_of_amplitude(measured_data: Path, found) ->
     with convert(next((measured_data / "beam_decay").glob("*.lvm")), MAPPING) as whole:
         told = found(whole.slice(FROM, FROM + 3.0), "cubic-stiffness", "quadratic-drag", "coulomb-friction")
     assert {each.effect for each in told.findings} == {"cubic-stiffness", "quadratic-drag"}
+    weights = [each.heldout["before"] for each in told.findings]  # of the misfit, were it left out
+    assert weights == sorted(weights, reverse=True)
+    assert weights[-1] > 10.0 * told.findings[0].heldout["after"]
     data = told.search.comparison.runs[0].outputs[0].data
     frequency, modelled = (slow_motion(s - s.mean(), 1000.0)[1] for s in (data, simulated(told.search.final)))
     unseen = held_out(data.size, 1000.0)

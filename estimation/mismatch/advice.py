@@ -12,8 +12,8 @@ from estimation.mismatch.experiment import Run
 from estimation.mismatch.fit import Comparison, Fit
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.noise import Whitener
+from estimation.mismatch.screen import amplitudes
 from estimation.mismatch.sensitivity import APART, columns, left_over, linearised, stated_whitener
-from scanner.terms.term import AMPLITUDES
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ def distances_from(comparison: Comparison, fit: Fit, candidate: Candidate, rival
     A rival that changes nothing leaves all of it.
     """
     own = np.array([f.kind == "term" and f.owner == candidate.key for f in fit.model.free])
-    signal, rest = _signal(comparison, fit, candidate, own)[fit.rows], fit.jacobian[np.ix_(fit.rows, ~own)]
+    signal, rest = _signal(comparison, fit, candidate)[fit.rows], fit.jacobian[np.ix_(fit.rows, ~own)]
     found = []
     for rival in rivals:
         blocks = [block[fit.rows] for block in columns(comparison, fit, rival)]
@@ -36,11 +36,11 @@ def distances_from(comparison: Comparison, fit: Fit, candidate: Candidate, rival
     return found
 
 
-def _signal(comparison: Comparison, fit: Fit, candidate: Candidate, own: NDArray[np.bool_]) -> Array:
+def _signal(comparison: Comparison, fit: Fit, candidate: Candidate) -> Array:
     """What a candidate does to the whitened residual, shape (N,): to first order where it has an amplitude."""
-    amplitudes = [i for i in np.flatnonzero(own) if (p := fit.model.free[i].parameter) and p.kind in AMPLITUDES]
-    if amplitudes:
-        return np.asarray(fit.jacobian[:, amplitudes] @ fit.x[amplitudes])
+    moving = amplitudes(fit.model, candidate)
+    if moving:
+        return np.asarray(fit.jacobian[:, moving] @ fit.x[moving])
     kept = [each for each in fit.model.candidates if each is not candidate]
     less = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
     return fit.residual - comparison.residual(less, less.embed(fit.model, fit.x))

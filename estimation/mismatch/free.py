@@ -115,7 +115,8 @@ def _readout(signal: Array, p: Sequence[float], view: View) -> Array:
 
 
 def _timing(signal: Array, p: Sequence[float], view: View) -> Array:
-    late = waves(np.pi * view.time / p[0], p[1:])
+    swing = (view.theta**2 + (view.rate / p[1]) ** 2) / p[2] ** 2
+    late = waves(np.pi * view.time / p[0], p[5:]) + swing * (p[3] + p[4] * swing)
     return signal - late * np.gradient(signal, view.step)
 
 
@@ -189,9 +190,12 @@ FREE: dict[str, Term] = {
             SOURCE, output=_readout,
         ),
         Term(
-            "free-timing", "timing", "y(t − δ(t))",
+            "free-timing", "timing", "y(t − δ(t, r))",
             (
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
+                Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
+                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
+                *(Parameter(f"r{i}", "s", lambda s: 0.05 / s.rate) for i in (2, 4)),
                 *(Parameter(f"d{i}", "s", lambda s: 0.05 / s.rate) for i in range(DELAYS + 1)),
             ),
             SOURCE, output=_timing, channels=("sense", "angle"),

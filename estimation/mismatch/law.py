@@ -16,6 +16,34 @@ Array = NDArray[np.float64]
 EARNS = 12.0
 """Fall of chi-square that a part of a formula has to be worth."""
 
+LENGTH = "T: the recording's length"
+STATE = "x = θ/A, y = θ'/(A ω)"
+VARIABLES = {
+    "free-mechanics": ("f/(k A)", f"{STATE}, {LENGTH}"),
+    "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
+    "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
+    "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),
+    "free-readout": ("δy/s", f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), s: the signal's rms, {LENGTH}"),
+    "free-timing": ("delay/s", f"r² = x² + y², {STATE}, {LENGTH}"),
+    "free-optics": ("δθ/A", "x = θ/A"),
+}
+"""What the formula of a free correction gives, and the variables that it is written in."""
+
+POLYNOMIALS = {
+    "free-capacitance": {"a1": "u", "a3": "u³", "a4": "u⁴", "a5": "u⁵", "a6": "u⁶"},
+    "free-drive": {"v0": "u", "v1": "v", "v2": "u²", "v3": "u³", "v4": "u v", "v5": "v³"},
+    "free-readout": {
+        "y0": "u²", "y1": "u³", "y2": "w", "w0": "u y", "w1": "u x y", "w2": "u r", "w3": "u r³", "w4": "u r⁵",
+    },
+    "free-timing": {"r2": "r²", "r4": "r⁴"},
+}  # fmt: skip
+"""Parts of free corrections that are no cosines, as a formula shows them."""
+
+SWAYING = {"k": "x ", "b": "y ", "g": "u ", "o": "", "d": ""}
+"""What the cosines of each letter multiply."""
+
+POWER = ("", "", "²", "³", "⁴", "⁵")
+
 
 class Section(NamedTuple):
     """A cut through a free correction along which its law can be drawn.
@@ -57,9 +85,14 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
     value = columns @ fit.x[at]
     band = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", columns, fit.covariance[np.ix_(at, at)], columns), 0.0))
     points = [[float(a), float(b), float(c)] for a, b, c in zip(section.grid, value, band, strict=True)]
-    labels = {"x": section.x_label, "y": section.label, "unit": section.unit}
-    labels["columns"] = [section.x_label, section.label, "sd"]  # type: ignore[assignment]
-    return labels | {"points": points, "formula": formula(fit, at)}
+    return {
+        "x": section.x_label,
+        "y": section.label,
+        "unit": section.unit,
+        "columns": [section.x_label, section.label, "sd"],
+        "points": points,
+        "formula": formula(fit, at),
+    }
 
 
 def _sections(effect: str, s: Scales) -> list[Section]:
@@ -106,39 +139,12 @@ def _sections(effect: str, s: Scales) -> list[Section]:
                 Section(waves("o"), "offset / rms", "1", time, "time (s)"),
             ]
         case "free-timing":
-            return [Section(waves("d"), "delay", "s", time, "time (s)")]
+            r = 0.5 * (u + 1.0)
+            swing = Section({"r2": r**2, "r4": r**4}, "delay", "s", s.amplitude * r, "swing (rad)")
+            return [Section(waves("d"), "delay", "s", time, "time (s)"), swing]
         case _:
             hats = {f"c{i}": s.amplitude * np.interp(u, KNOTS, hat) for i, hat in enumerate(np.eye(KNOTS.size))}
             return [Section(hats, "angle error", "rad", s.amplitude * u, "angle (rad)")]
-
-
-LENGTH = "T: the recording's length"
-STATE = "x = θ/A, y = θ'/(A ω)"
-VARIABLES = {
-    "free-mechanics": ("f/(k A)", f"{STATE}, {LENGTH}"),
-    "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
-    "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
-    "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),
-    "free-readout": ("δy/s", f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), s: the signal's rms, {LENGTH}"),
-    "free-timing": ("delay/s", LENGTH),
-    "free-optics": ("δθ/A", "x = θ/A"),
-}
-"""What the formula of a free correction gives, and the variables that it is written in."""
-
-POLYNOMIALS = {
-    "free-capacitance": {"a1": "u", "a3": "u³", "a4": "u⁴", "a5": "u⁵", "a6": "u⁶"},
-    "free-drive": {"v0": "u", "v1": "v", "v2": "u²", "v3": "u³", "v4": "u v", "v5": "v³"},
-    "free-readout": {
-        "y0": "u²", "y1": "u³", "y2": "w", "w0": "u y", "w1": "u x y", "w2": "u r", "w3": "u r³", "w4": "u r⁵",
-    },
-}  # fmt: skip
-"""Parts of free corrections that are no cosines, as a formula shows them."""
-
-SWAYING = {"k": "x ", "b": "y ", "g": "u ", "o": "", "d": ""}
-"""What the cosines of each letter multiply."""
-
-
-POWER = ("", "", "²", "³", "⁴", "⁵")
 
 
 def _symbol(effect: str, name: str) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.screen import PROMISING, Screened, screen, small, stepped
+from estimation.mismatch.screen import PROMISING, Screened, screen, stepped
 from estimation.mismatch.start import measured_whiteners
 
 Array = NDArray[np.float64]
@@ -207,6 +207,12 @@ def _brink(comparison: Comparison, model: Model, early: Sequence[Fit], stops: Se
     first = _failing(early)
     followed, reached, stop = early[max(first - 1, 0)], stops[first - 1] if first else 0.0, stops[first]
     failing = solve(comparison, model, model.embed(early[first].model, early[first].x), stop, 8)
+    for later in stops[first + 1 :]:
+        if _level(failing) > EXPLAINED:
+            break
+        # what failed under the noise first guessed does not under the noise as measured
+        followed, reached, stop = failing, stop, later
+        failing = solve(comparison, model, failing.x, stop, 8)
     while _level(failing) > FAR * max(_level(followed), 1.0) and stop > FINEST**2 * reached > 0.0:
         middle = float(np.sqrt(reached * stop))
         fit = solve(comparison, model, model.embed(followed.model, followed.x), middle, 8)
@@ -289,8 +295,6 @@ def _eased(stops: Sequence[float]) -> Iterator[float]:
 def _unspoilt(each: Screened, followed: Fit) -> Array:
     """Where a candidate starts: the nominal values of the last window that was followed, its law not there yet."""
     x = each.model.embed(followed.model, followed.x)
-    for i, f in enumerate(each.model.free):
-        grows = each.candidate.term.seeds and (f.kind, f.owner) == ("hidden", each.candidate.key)
-        if grows or (f.kind == "term" and f.parameter is not None and not small(each.candidate, f.parameter)):
-            x[i] = each.x[i]
+    own = [f.owner == each.candidate.key for f in each.model.free]
+    x[own] = each.x[own]
     return x

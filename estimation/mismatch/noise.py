@@ -79,13 +79,13 @@ class Whitener:
         Args:
             residual: whitened, zero where it does not count, shape (samples,).
         """
-        bins = np.arange(1, int(np.ceil(self.first)))
+        bins = 0.5 * np.arange(1, 2 * int(np.ceil(self.first)) - 1)
         reach = np.log(self.first / bins)
-        power = 2.0 * np.abs(np.fft.rfft(residual)[bins]) ** 2 / residual.size
+        power = dct(residual, norm="ortho")[1 : bins.size + 1] ** 2
         share = np.count_nonzero(residual) / residual.size
 
         def worse(slope: float) -> float:
-            return float(power @ np.expm1(-slope * reach) + 2.0 * share * slope * reach.sum() + (slope / STEEPER) ** 2)
+            return float(power @ np.expm1(-slope * reach) + share * slope * reach.sum() + (slope / STEEPER) ** 2)
 
         return -min(0.0, minimize_scalar(worse, bounds=(0.0, 4.0), method="bounded").fun)
 

@@ -79,10 +79,10 @@ def _of_readout(term: Term) -> bool:
 
 def starts(candidate: Candidate) -> list[tuple[float, ...]]:
     """Values of x to search from: zero for amplitudes, the term's own grid for the others."""
-    return list(product(*[(0.0,) if small(candidate, p) else p.starts for p in candidate.term.free]))
+    return list(product(*[(0.0,) if is_amplitude(candidate, p) else p.starts for p in candidate.term.free]))
 
 
-def small(candidate: Candidate, parameter: Parameter) -> bool:
+def is_amplitude(candidate: Candidate, parameter: Parameter) -> bool:
     """Whether a parameter is an amplitude from whose zero the effect follows to first order."""
     return parameter.kind in AMPLITUDES and not candidate.term.seeds
 
@@ -145,7 +145,7 @@ def amplitudes(model: Model, candidate: Candidate) -> list[int]:
     return [
         i
         for i, f in enumerate(model.free)
-        if f.parameter is not None and f.owner == candidate.key and small(candidate, f.parameter)
+        if f.parameter is not None and f.owner == candidate.key and is_amplitude(candidate, f.parameter)
     ]
 
 

@@ -16,7 +16,7 @@ from estimation.mismatch.experiment import Output
 from estimation.mismatch.fit import Comparison, Fit, made_fit
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.noise import Whitener, flat_psd, whitener
-from estimation.mismatch.screen import all_candidates, screen, starts, states
+from estimation.mismatch.screen import all_candidates, amplitudes, screen, starts
 from scanner.errors import BadInput
 from scanner.terms import Term
 
@@ -83,8 +83,7 @@ def columns(comparison: Comparison, fit: Fit, candidate: Candidate) -> list[Arra
         alone.append(replace(candidate, term=replace(candidate.term, parameters=parameters)))
     shown = []
     for each in screen(comparison, fit, alone):
-        started = 0 if candidate.term.seeds else len(states(each.model, each.candidate))
-        own, hidden = np.split(each.columns, [each.columns.shape[1] - started], axis=1)
+        own, hidden = np.split(each.columns, [max(1, len(amplitudes(each.model, each.candidate)))], axis=1)
         if np.any(own):
             rows = comparison.rows
             shown.append(own - hidden @ np.linalg.lstsq(hidden[rows], own[rows], rcond=None)[0])

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.tracker.backward import run_smoother
+from estimation.tracker.blocks import offsets
 from estimation.tracker.linear import linearise, predict, unmade
 from estimation.tracker.orbit import SENSED, law_of, turn_of
 from estimation.tracker.signal import Prepared
@@ -81,7 +82,7 @@ def _information(prepared: Prepared, k: int, x: Array, noise_var: float, rails: 
     """Fisher information of all samples of block ``k``, shape (states, states)."""
     signal, channel = prepared.signal, prepared.sense.channel
     length = round(signal.step * channel.sample_rate)
-    offset = (np.arange(length) - 0.5 * (length - 1)) / channel.sample_rate
+    offset = offsets(length, channel.sample_rate)
     gradient, h = np.zeros((x.size, length)), np.full(length, x[-1])
     gradient[-1] = 1.0
     orders = np.arange(SENSED + 1)

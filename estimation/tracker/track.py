@@ -105,10 +105,13 @@ def track(
         # by the signal alone: it would bend the motion to each of a few phases seen
         walk = _walk_of(before, sense)
         prepared = uncensored(prepared, start, walk, causal)
-        walk = tuned_walk(prepared, start, stretches(prepared.signal), walk)
-        prepared = uncensored(prepared, start, walk, causal)
+        parts = stretches(prepared.signal)
+        walk = tuned_walk(prepared, start, parts, walk)
+        if prepared.clipped.block.size:
+            prepared = uncensored(prepared, start, walk, causal)
+            parts = stretches(prepared.signal)
         helped = with_phases(prepared, seen or {})
-        found = averaged(helped, start, likely_walks(prepared, start, stretches(prepared.signal), walk), causal)
+        found = averaged(helped, start, likely_walks(prepared, start, parts, walk), causal)
         for i, name in enumerate(sense.axes):
             if not found.live[i]:
                 raise BadInput(
