@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 from estimation.mismatch.diagnosis import diagnose
 from estimation.mismatch.experiment import between, experiment, thinned
@@ -67,6 +68,10 @@ def signals(k3: float, b2: float, shaken: float = 0.0) -> tuple[np.ndarray, np.n
 
 def recording(k3: float = 0.0, b2: float = 0.0, seed: int = 0, coloured: bool = False, **change: float) -> Recording:
     drive, angle = signals(k3, b2, change.get("shaken", 0.0))
+    if "late" in change:  # seconds at a swing of 1 mrad, and as its square
+        time = np.arange(N) / RATE
+        square = angle**2 + (np.gradient(angle, 1 / RATE) / (2 * np.pi * F0)) ** 2
+        angle = CubicSpline(time, angle)(time - change["late"] * square / 1e-6)
     rng = np.random.default_rng(seed)
     noise = rng.normal(0, 2e-3, N)
     if coloured:
@@ -125,6 +130,18 @@ def test_a_stiffness_shaken_from_outside_is_unknown_in_the_mechanics() -> None:
     assert "= 0.01 x cos(12 π t/T) with" in curve["formula"]
     time, value, sd = np.array(curve["points"]).T
     assert np.all(np.abs(value - 0.01 * np.cos(2 * np.pi * 6 * time * RATE / N)) < 4.0 * sd + 1e-4)
+
+
+def test_a_delay_that_grows_with_the_swing_is_unknown_in_the_timing() -> None:
+    """No term of the catalogue does that: of all laws of the mechanics together, three came close."""
+    told = diagnose([recording(late=2e-6, seed=6)])
+    assert [(each.effect, each.stage) for each in told.findings] == [("unknown", "timing")]
+    curve = told.findings[0].curve
+    assert curve is not None
+    assert (curve["x"], curve["y"]) == ("swing (rad)", "delay")
+    swing, delay, sd = np.array(curve["points"]).T
+    assert (np.abs(delay - 2e-6 * (swing / 1e-3) ** 2) < 4.0 * sd + 1e-9).all()
+    assert sd[-1] < 0.1 * delay[-1]
 
 
 def test_the_nominal_fit_finds_the_values_within_their_errors() -> None:
