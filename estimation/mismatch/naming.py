@@ -77,7 +77,8 @@ def convincing(comparison: Comparison, before: Fit, after: Fit) -> bool:
 
     What slow noise would explain as well, if it rises more steeply than it was continued, is no lead. Where held-out
     samples hardly show a term (a nominal value pulled off that it relieves, a clip level reached in the first turns
-    only), they may stay as they were, within the scatter of what it changes there.
+    only), they may stay as they were, within the scatter of what it changes there. Beside a clip level they may not:
+    slow noise is clipped with the signal, and looks like an offset in the turns that are.
     """
     lead = before.evidence - comparison.excused(before) - (after.evidence - comparison.excused(after))
     if lead < LEAD_OVER_NOTHING:
@@ -90,7 +91,8 @@ def convincing(comparison: Comparison, before: Fit, after: Fit) -> bool:
         return unharmed
     share = min(SHARE_HELD * fitted * int(after.held.sum()) / int(after.rows.sum()), LEAD_OVER_NOTHING)
     if changed < share:
-        return unharmed and lead > 2.0 * LEAD_OVER_NOTHING
+        beside_clip = any(each.term.at_output for each in before.model.candidates)
+        return unharmed and lead > 2.0 * LEAD_OVER_NOTHING and not beside_clip
     return gained > share
 
 
