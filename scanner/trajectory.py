@@ -134,6 +134,11 @@ def _integrate(theta, omega, z, voltage, other, t, step, laws, angle, rate):  # 
         angle[i + 1], rate[i + 1] = theta, omega
 
 
+(_integration,) = (made.entry_point for made in _integrate.overloads.values())  # type: ignore[attr-defined]
+# Called past numba's dispatcher, which would find out anew at every call what functions these are: it takes as long
+# as a thousand steps, and no other thread runs meanwhile. All arguments have to be of the types above.
+
+
 @njit(types.void(types.FunctionType(BELL), _vector, _vector, _vector, _f8[:, ::1]), cache=True, nogil=True)
 def _fill_bell(law, angle, p, nominal, out):  # type: ignore[no-untyped-def]
     for i in range(angle.size):
@@ -168,7 +173,7 @@ def nominal_values(axis: Axis) -> Array:
     mechanics, comb, drive = axis.require_mechanics(), axis.capacitance, axis.drive
     bell = (comb.C0, comb.theta0, comb.theta_th) if comb else (0.0, 1.0, 0.0)
     push = (drive.torque_per_volt or 0.0) if drive and drive.kind == "linear" else 0.0
-    return np.array([mechanics.J, mechanics.b, mechanics.k, *bell, push])
+    return np.array([mechanics.J, mechanics.b, mechanics.k, *bell, push], np.float64)
 
 
 def integrate(
@@ -206,10 +211,14 @@ def integrate(
         _filled([each.law for each in bells], no_bell), _table([each.parameters for each in bells]), len(bells),
         nominal_values(axis), electrostatic,
     )  # fmt: skip
-    others = np.zeros((n, 3)) if other is None else np.ascontiguousarray(other)
+    others = np.zeros((n, 3)) if other is None else _doubles(other)
     theta, omega = float(start[0]), float(start[1])
-    _integrate(theta, omega, hidden, np.ascontiguousarray(voltage), others, float(t0), float(step), laws, angle, rate)
+    _integration(theta, omega, hidden, _doubles(voltage), others, float(t0), float(step), laws, angle, rate)
     return angle, rate
+
+
+def _doubles(values: Array) -> Array:
+    return np.ascontiguousarray(values, np.float64)
 
 
 def thirds(half_steps: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from estimation.mismatch.instead import Leads, behind, instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import MAINS, Candidate, Model
 from estimation.mismatch.naming import LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
+from estimation.mismatch.noise import Whitener
 from estimation.mismatch.screen import all_candidates
 from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
 from scanner.device import Device
@@ -43,8 +44,9 @@ INADEQUATE = 1.3
 ASTRAY = 100.0
 """Reduced chi-square from which a fit has lost the motion: first order around it says nothing of a further effect."""
 
-CLOSE = 80.0
-"""Rivals within this of the best in -2 log evidence are refitted when the noise has been measured anew."""
+CLOSE, NEARLY = 80.0, 0.1
+"""Rivals within this of the best in -2 log evidence, or within this share of what the best gained, are refitted when
+the noise has been measured anew."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     stops = windows(model)
     comparison = Comparison(runs, first_whiteners(model))
     early = grown(comparison, model, started(comparison, model, stops[0]).x, stops)
-    comparison = Comparison(runs, measured_whiteners(model, early[-1].x))
+    comparison = Comparison(runs, _quietest(_by_hum(comparison, early[-1])))
     nominal = solve(comparison, model, early[-1].x)
     named = list(terms.values())
     states = [_State(comparison, nominal, nominal, {})]
@@ -148,7 +150,8 @@ def _extended(
             return
         say(f"refit with {fits[0].model.candidates[-1].key}")
         comparison = Comparison(best.model.runs, measured_whiteners(fits[0].model, fits[0].x))
-        close = [solve(comparison, fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + CLOSE][:6]
+        behind_by = max(CLOSE, NEARLY * (best.evidence - fits[0].evidence))
+        close = [solve(comparison, fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + behind_by][:6]
         close = sorted((fit for fit in close if possible(fit)), key=lambda fit: fit.evidence)
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
@@ -263,11 +266,23 @@ def _round(
 
 def with_hum(comparison: Comparison, fit: Fit) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none."""
-    fits = []
+    return min(_by_hum(comparison, fit), key=lambda each: each.evidence)
+
+
+def _by_hum(comparison: Comparison, fit: Fit) -> Iterator[Fit]:
+    """The fit without hum, and with hum of each mains frequency alone."""
     for mains in ((), *((each,) for each in MAINS)):
         model = Model(fit.model.runs, fit.model.device, fit.model.candidates, mains)
-        fits.append(solve(comparison, model, model.embed(fit.model, fit.x), turns=3))
-    return min(fits, key=lambda each: each.evidence)
+        yield solve(comparison, model, model.embed(fit.model, fit.x), turns=3)
+
+
+def _quietest(fits: Iterable[Fit]) -> list[list[Whitener]]:
+    """The least noise that one of the fits leaves.
+
+    Hum of both mains at once takes after a baseline that drifts, and leaves lines that would excuse it as slow noise.
+    """
+    found = [measured_whiteners(fit.model, fit.x) for fit in fits]
+    return min(found, key=lambda noise: sum(float(np.log(each.psd).sum()) for row in noise for each in row))
 
 
 def with_line(comparison: Comparison, fit: Fit) -> Fit:
