@@ -23,6 +23,13 @@ ALSO_CALLED = {
 SIGN_FREE = {"k2", "theta_c"}
 """An even capacitance cannot know these signs; an angle channel can."""
 
+ABOUT = f"""# Sealed recordings
+
+`make concealed` writes this page: recordings made by a truth generator that shares nothing with the diagnosis, each
+diagnosed by the command line, then held against its sealed key. An effect is visible from {CLEAR} σ on behind the
+nominal values, and clear if its nearest look-alike leaves as much of it. Every third recording is in coloured noise.
+"""
+
 Answer = Callable[["Run"], bool]
 
 
@@ -145,7 +152,7 @@ def summary(runs: Sequence[Run]) -> dict[str, Any]:
 def markdown(score: dict[str, Any]) -> str:
     """The summary as a page."""
     counts = ", ".join(f"{count} {kind}" for kind, count in score["recordings"].items())
-    lines = [f"Recordings: {counts}.", "", "| | rate | 95 % interval | of |", "|---|---|---|---|"]
+    lines = [ABOUT, f"Recordings: {counts}.", "", "| | rate | 95 % interval | of |", "|---|---|---|---|"]
     for name, of in score["rates"].items():
         if of["of"]:
             low, high = of["ci95"]
