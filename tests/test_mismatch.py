@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from estimation.mismatch.free import FREE
 from estimation.mismatch.instead import instead
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import Candidate, Model
+from estimation.mismatch.naming import _mirrored
 from estimation.mismatch.noise import noise_psd, whitener
 from estimation.mismatch.screen import all_candidates
 from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
@@ -80,6 +82,7 @@ def recording(k3: float = 0.0, b2: float = 0.0, seed: int = 0, coloured: bool = 
         slow = lfilter([1.0], [1.0, -0.95], rng.normal(0, 1e-3, N))
         noise = noise + slow + 1e-3 * np.cos(2 * np.pi * 50 * np.arange(N) / RATE + 1.0)
     sense = 20.0 * angle * (1 + change.get("gain", 0.0) * np.arange(N) / N) + noise
+    sense += change.get("drift", 0.0) * np.cos(np.pi * np.arange(N) / N)
     channels = {"drive_x": (drive, "V", RATE, 0.0), "sense_x": (sense, "V", RATE, 0.0)}
     return Recording.from_arrays(channels, device=DEVICE, name="bench <b>")
 
@@ -116,6 +119,21 @@ def test_a_readout_gain_that_drifts_is_placed_in_the_readout() -> None:
     found = diagnose([recording(gain=0.1, seed=8)])
     assert [(f.effect, f.stage) for f in found.findings] == [("gain-drift", "readout")]
     assert found.findings[0].parameters[0].value == pytest.approx(0.1, rel=0.15)
+
+
+def test_a_drifting_baseline_is_neither_hum_nor_slow_noise() -> None:
+    """Hum of both mains at once takes after it, and what they leave passes for noise that would excuse it."""
+    told = diagnose([recording(drift=0.03, seed=8)])
+    assert [(each.effect, each.stage) for each in told.findings] == [("offset-drift", "readout")]
+    low, high = told.findings[0].parameters[0].ci95
+    assert low < 0.03 < high
+
+
+def test_a_mode_told_with_the_wrong_sign_goes_on_with_the_other() -> None:
+    model = Model([experiment(recording(), DEVICE)], DEVICE, [Candidate(catalogue()["second-mode"], "x", "sense")])
+    fit = SimpleNamespace(model=model, x=np.linspace(-0.9, -0.1, len(model.free)))
+    changed = _mirrored(fit) != fit.x  # type: ignore[arg-type]
+    assert [f.name for f, turned in zip(model.free, changed, strict=True) if turned] == ["c", "0", "1"]
 
 
 def test_a_stiffness_shaken_from_outside_is_unknown_in_the_mechanics() -> None:

@@ -24,6 +24,10 @@ Mask = NDArray[np.bool_]
 POOL = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())
 """For independent trajectories: compiled code and numpy let go of the interpreter."""
 
+BURST = 1e9
+"""Change of the whitened residual by a unit of a free number from which the motion has burst its bounds (a force that
+outweighs the spring): no first order holds there, and its square would drown all other columns."""
+
 FOLDS = 20
 """Blocks of time that a recording is cut into; every ``HELD``-th is held out of every fit."""
 
@@ -146,6 +150,8 @@ class Comparison:
             moved[i] += steps[i]
             columns[:, i] = (self.residual(model, moved, stop) - base) / steps[i]
             size = np.linalg.norm(columns[:, i])
+            if not size < BURST:
+                columns[:, i] = 0.0
             steps[i] = np.clip(0.3 / size if size else 1e-2, 1e-7, 3e-2)
 
         list(POOL.map(fill, [i for i in range(x.size) if i not in additive]))

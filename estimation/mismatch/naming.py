@@ -265,9 +265,21 @@ def _raced(
         kept = [fit for fit in fits if fit.evidence < best + margin]
         if now > EXPLAINED:  # of what explains little yet, being ahead is no merit
             kept = fits[: max(FINALISTS, len(kept))]
-        running = [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
+        # What leads with a sign that physics forbids goes on with the other: a ringing mode fits with both.
+        mirrored = [(fit.model, _mirrored(fit)) for fit in fits[1:] if not possible(fit) and fit.evidence < best]
+        kept = [fit for fit in kept if possible(fit) or fit.evidence >= best]
+        running = mirrored + [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
         reached, level = ahead.pop(), now
     return [fit for fit in fits if possible(fit)]
+
+
+def _mirrored(fit: Fit) -> Array:
+    """Its free numbers, the newest term's amplitudes with the sign that physics allows, its hidden states turned."""
+    key, x = fit.model.candidates[-1].key, fit.x.copy()
+    for i, f in enumerate(fit.model.free):
+        if f.owner == key and (f.kind == "hidden" or (f.parameter is not None and f.parameter.sign * x[i] < 0.0)):
+            x[i] = -x[i]
+    return x
 
 
 def _level(fit: Fit) -> float:

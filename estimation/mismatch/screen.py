@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import POOL, Comparison, Fit
+from estimation.mismatch.fit import BURST, POOL, Comparison, Fit
 from estimation.mismatch.model import Candidate, Model
 from scanner.device import Device
 from scanner.terms import Parameter, Term
@@ -65,11 +65,6 @@ def all_candidates(device: Device, model: Model, terms: Iterable[Term]) -> list[
                     and not (repeated and channel.startswith("sense") and _of_readout(term))
                 ]
     return found
-
-
-BURST = 1e9
-"""Change of the whitened residual by a unit of an amplitude from which the motion has burst its bounds (a force that
-outweighs the spring): no first order holds there, and its square would drown all other columns."""
 
 
 def _of_readout(term: Term) -> bool:

@@ -22,9 +22,9 @@ TERM = Term(
     parameters=(
         Parameter("c", "1", lambda s: 0.01, sign=1),
         Parameter(
-            "f2", "Hz", lambda s: s.rate / 6.283185307179586, kind="log", starts=tuple(0.15 * i for i in range(-9, 10))
+            "f2", "Hz", lambda s: s.rate / 6.283185307179586, kind="log", starts=tuple(0.08 * i for i in range(-17, 18))
         ),
-        Parameter("Q2", "1", lambda s: 40.0, kind="log"),
+        Parameter("Q2", "1", lambda s: 40.0, kind="log", starts=(-0.7,)),  # broad enough to be seen between two of them
     ),
     hidden=(lambda s: s.amplitude, lambda s: s.amplitude * s.rate),
     source="Den Hartog, Mechanical Vibrations, 1956, section 3.2",
