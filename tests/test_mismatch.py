@@ -22,7 +22,7 @@ from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.naming import _mirrored
 from estimation.mismatch.noise import noise_psd, whitener
-from estimation.mismatch.screen import all_candidates
+from estimation.mismatch.screen import Projection, all_candidates, gain_of
 from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
 from recon.cli import main
 from scanner.device import Axis, Device, Drive, Mechanics, Position
@@ -134,6 +134,14 @@ def test_a_mode_told_with_the_wrong_sign_goes_on_with_the_other() -> None:
     fit = SimpleNamespace(model=model, x=np.linspace(-0.9, -0.1, len(model.free)))
     changed = _mirrored(fit) != fit.x  # type: ignore[arg-type]
     assert [f.name for f, turned in zip(model.free, changed, strict=True) if turned] == ["c", "0", "1"]
+
+
+def test_around_a_motion_that_has_burst_nothing_is_promised() -> None:
+    free = [SimpleNamespace(kind="nominal", owner="x")] * 2
+    model = SimpleNamespace(free=free, precision=np.ones(2))
+    burst = SimpleNamespace(jacobian=np.full((3, 2), 1e20), residual=np.full(3, 1e6), x=np.zeros(2), model=model)
+    known = Projection(burst, np.ones(3, bool))  # type: ignore[arg-type]
+    assert gain_of(*known.system(np.ones((3, 1)))[:2])[0] == 0.0
 
 
 def test_a_stiffness_shaken_from_outside_is_unknown_in_the_mechanics() -> None:

@@ -24,10 +24,6 @@ Mask = NDArray[np.bool_]
 POOL = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())
 """For independent trajectories: compiled code and numpy let go of the interpreter."""
 
-BURST = 1e9
-"""Change of the whitened residual by a unit of a free number from which the motion has burst its bounds (a force that
-outweighs the spring): no first order holds there, and its square would drown all other columns."""
-
 FOLDS = 20
 """Blocks of time that a recording is cut into; every ``HELD``-th is held out of every fit."""
 
@@ -150,8 +146,6 @@ class Comparison:
             moved[i] += steps[i]
             columns[:, i] = (self.residual(model, moved, stop) - base) / steps[i]
             size = np.linalg.norm(columns[:, i])
-            if not size < BURST:
-                columns[:, i] = 0.0
             steps[i] = np.clip(0.3 / size if size else 1e-2, 1e-7, 3e-2)
 
         list(POOL.map(fill, [i for i in range(x.size) if i not in additive]))
@@ -191,7 +185,11 @@ def solve(
         gradient = part.T @ residual[rows] + precision * x
         gain = promised = 0.0
         while damping < 1e8:
-            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            try:
+                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            except np.linalg.LinAlgError:  # of a motion that has burst its bounds
+                damping *= 6.0
+                continue
             tried = comparison.residual(model, x + step, stop)
             new = tried[rows] @ tried[rows] + precision @ ((x + step) ** 2)
             if new < value:

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import BURST, POOL, Comparison, Fit
+from estimation.mismatch.fit import POOL, Comparison, Fit
 from estimation.mismatch.model import Candidate, Model
 from scanner.device import Device
 from scanner.terms import Parameter, Term
@@ -65,6 +65,11 @@ def all_candidates(device: Device, model: Model, terms: Iterable[Term]) -> list[
                     and not (repeated and channel.startswith("sense") and _of_readout(term))
                 ]
     return found
+
+
+BURST = 1e9
+"""Change of the whitened residual by a unit of an amplitude from which the motion has burst its bounds (a force that
+outweighs the spring): no first order holds there, and its square would drown all other columns."""
 
 
 def _of_readout(term: Term) -> bool:
@@ -214,7 +219,10 @@ class Projection:
             normal matrix (q, q), gradient (q,), and how the kept free numbers answer to the amplitudes, (p, q).
         """
         cross = self._old.T @ new
-        solved = np.linalg.solve(self._normal, np.column_stack([cross, self._gradient]))
+        try:
+            solved = np.linalg.solve(self._normal, np.column_stack([cross, self._gradient]))
+        except np.linalg.LinAlgError:  # the motion of the fit has burst its bounds: no first order holds around it
+            return np.eye(new.shape[1]), np.zeros(new.shape[1]), np.zeros(cross.shape)
         normal = new.T @ new - cross.T @ solved[:, :-1] + np.eye(new.shape[1])
         return normal, new.T @ self._residual - cross.T @ solved[:, -1], -solved[:, :-1]
 
