@@ -27,11 +27,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.speed import digitised
 from estimation.tracker import track
 from phantoms.experiment import Experiment, run
 from recon.mapping import Grid
 from recon.pipeline import Options, mapped
-from scanner.channel import checked_channel
 from scanner.device import Amdm, Device
 from scanner.recording import Recording
 
@@ -85,13 +85,11 @@ def separate(device: Device) -> Device:
 
 def repeated(period: Recording, size: int, axes: str = "xy") -> Recording:
     """A recording of ``size`` samples of the same scan, int16, that takes no memory; of some axes only if so said."""
-    channels = {}
-    for name, channel in period.channels.items():
-        if name.rpartition("_")[2] in (*axes, name):
-            values = channel.read()
-            gain = float(np.abs(values).max()) / 32767
-            raw = Repeated(np.round(values / gain).astype(np.int16), size)
-            channels[name] = checked_channel(name, raw, unit="V", sample_rate=RATE, gain=gain)
+    channels = {
+        name: replace(channel, raw=Repeated(channel.stored(), size), first=0, stop=size, start=0.0)
+        for name, channel in digitised(period).channels.items()
+        if name.rpartition("_")[2] in (*axes, name)
+    }
     return Recording(MappingProxyType(channels), period.attrs, None, period.device_toml)
 
 

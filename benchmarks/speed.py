@@ -38,6 +38,7 @@ from phantoms.waveforms import Sine
 from recon.mapping import Grid, accumulate, pixel_index
 from recon.slow_mapping import accumulate_slow
 from scanner import devices
+from scanner.channel import checked_channel
 from scanner.device import Amdm
 from scanner.recording import Recording
 
@@ -167,8 +168,11 @@ def digitised(recording: Recording) -> Recording:
     channels = {}
     for name, channel in recording.channels.items():
         values = channel.read()
-        step = float(np.abs(values).max()) / (1 << 15) * 1.01
-        channels[name] = replace(channel, raw=np.round(values / step).astype(np.int16), gain=step)
+        step = float(np.abs(values).max()) / 32767
+        stored = np.round(values / step).astype(np.int16)
+        channels[name] = checked_channel(
+            name, stored, unit=channel.unit, sample_rate=channel.sample_rate, start=channel.start, gain=step
+        )
     return replace(recording, channels=MappingProxyType(channels))
 
 

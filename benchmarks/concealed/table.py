@@ -27,7 +27,8 @@ ABOUT = f"""# Sealed recordings
 
 `make concealed` writes this page: recordings made by a truth generator that shares nothing with the diagnosis, each
 diagnosed by the command line, then held against its sealed key. An effect is visible from {CLEAR} σ on behind the
-nominal values, and clear if its nearest look-alike leaves as much of it. Every third recording is in coloured noise.
+nominal values, and clear if its nearest look-alike leaves as much of it. Of the recordings made, every third is in
+coloured noise.
 """
 
 Answer = Callable[["Run"], bool]

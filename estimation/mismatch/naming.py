@@ -252,7 +252,7 @@ def _raced(
         for model, x in running:
             best = min((fit.evidence for fit in fits if possible(fit)), default=bar - HOPELESS)
             fits.append(solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS))
-        fits.sort(key=lambda fit: fit.evidence if possible(fit) else np.inf)
+        fits.sort(key=lambda fit: (not possible(fit), fit.evidence))
         now = _level(fits[0])
         if now > LOST * max(level, 1.0) and splits and stop > FINEST * reached > 0.0:
             ahead.append(float(np.sqrt(reached * stop)))
@@ -266,9 +266,9 @@ def _raced(
         if now > EXPLAINED:  # of what explains little yet, being ahead is no merit
             kept = fits[: max(FINALISTS, len(kept))]
         # What leads with a sign that physics forbids goes on with the other: a ringing mode fits with both.
-        mirrored = [(fit.model, _mirrored(fit)) for fit in fits[1:] if not possible(fit) and fit.evidence < best]
-        kept = [fit for fit in kept if possible(fit) or fit.evidence >= best]
-        running = mirrored + [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
+        running = [(fit.model, _mirrored(fit)) for fit in fits if not possible(fit) and fit.evidence <= best]
+        kept = [fit for fit in kept if possible(fit) or fit.evidence > best]
+        running += [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
         reached, level = ahead.pop(), now
     return [fit for fit in fits if possible(fit)]
 

@@ -150,8 +150,8 @@ def _extended(
             return
         say(f"refit with {fits[0].model.candidates[-1].key}")
         comparison = Comparison(best.model.runs, measured_whiteners(fits[0].model, fits[0].x))
-        behind_by = max(CLOSE, NEARLY * (best.evidence - fits[0].evidence))
-        close = [solve(comparison, fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + behind_by][:6]
+        reach = max(CLOSE, NEARLY * (best.evidence - fits[0].evidence))
+        close = [solve(comparison, fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + reach][:6]
         close = sorted((fit for fit in close if possible(fit)), key=lambda fit: fit.evidence)
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
