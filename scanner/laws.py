@@ -16,11 +16,17 @@ def capacitance(theta, C0, Cb, theta0, theta_th):  # type: ignore[no-untyped-def
     return C0 * np.exp(-u * u) + Cb
 
 
+@njit(cache=True, error_model="numpy")
+def bell_slope(u, bell, C0, theta0):  # type: ignore[no-untyped-def]
+    """dC/dtheta [F/rad] for those who have bell = exp(-u^2) already."""
+    return -2.0 * u / theta0 * C0 * bell
+
+
 @njit(cache=True)
 def capacitance_slope(theta, C0, theta0, theta_th):  # type: ignore[no-untyped-def]
     """dC/dtheta [F/rad]."""
     u = (theta - theta_th) / theta0
-    return -2.0 * u / theta0 * C0 * np.exp(-u * u)
+    return bell_slope(u, np.exp(-u * u), C0, theta0)
 
 
 @njit(cache=True)
@@ -30,13 +36,13 @@ def capacitance_curvature(theta, C0, theta0, theta_th):  # type: ignore[no-untyp
     return (4.0 * u * u - 2.0) / (theta0 * theta0) * C0 * np.exp(-u * u)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def electrostatic_torque(slope, voltage):  # type: ignore[no-untyped-def]
     """Torque 1/2 C'(theta) V^2 [N m] (chen2020 eq 8); it pulls towards the largest capacitance."""
     return 0.5 * slope * voltage * voltage
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def angular_acceleration(theta, omega, torque, J, b, k):  # type: ignore[no-untyped-def]
     """J theta'' + b theta' + k theta = torque, solved for theta'' [rad/s2] (chen2020 eq 9)."""
     return (torque - b * omega - k * theta) / J

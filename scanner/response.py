@@ -140,14 +140,37 @@ def move(
         start: angle [rad] and rate [rad/s] at the first sample.
         other: angle of the other axis, shape (n, 3) [rad].
     """
-    from scanner.trajectory import Bell, Torque, integrate  # its kernels take half a second to load
+    return move_abreast([(axis, added, start)], inputs, other)[0]
 
-    axis = with_constants(axis, added)
-    voltage = pulling(axis, added, inputs)
-    torques = [Torque(each.term.torque, each.values, each.hidden) for each in added if each.term.torque is not None]
-    bells = [Bell(each.term.bell, each.values) for each in added if each.term.bell is not None]
-    angle, rate = integrate(axis, start, voltage, inputs.step, inputs.t0, torques, bells, other)
-    return Path(axis, tuple(added), inputs, angle, rate, samples(voltage))
+
+def move_abreast(
+    cases: Sequence[tuple[Axis, Sequence[Added], tuple[float, float]]], inputs: Inputs, other: Array | None = None
+) -> list[Path]:
+    """:func:`move` for (axis, terms, start) that differ in their numbers alone, and not in those of drive terms.
+
+    As many as the integrator has lanes take little longer than one.
+    """
+    from scanner.trajectory import Bell, Motion, Torque, side_by_side  # its kernels take half a second to load
+
+    voltage, motions = None, []
+    for nominal, added, start in cases:
+        axis = with_constants(nominal, added)
+        if voltage is None:
+            voltage = pulling(axis, added, inputs)
+        torques = [
+            Torque(each.term.torque, each.values, each.hidden if each.term.hidden else None)
+            for each in added
+            if each.term.torque is not None
+        ]
+        bells = [Bell(each.term.bell, each.values) for each in added if each.term.bell is not None]
+        motions.append(Motion(axis, start, torques, bells))
+    assert voltage is not None
+    pulled = samples(voltage)
+    moved = side_by_side(motions, voltage, inputs.step, inputs.t0, other)
+    return [
+        Path(motion.axis, tuple(added), inputs, angle, rate, pulled)
+        for motion, (_, added, _), (angle, rate) in zip(motions, cases, moved, strict=True)
+    ]
 
 
 def with_constants(axis: Axis, added: Iterable[Added]) -> Axis:

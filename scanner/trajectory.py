@@ -3,6 +3,9 @@
 A mechanics term hands over its torque, a capacitance term its extra bell, as compiled functions that the kernel calls
 through their addresses: a new term needs no new kernel, and one compilation serves all of them. Terms of the other
 stages act on whole arrays before or after the integration and never come here.
+
+A step waits for its own stages most of the time. Motions that differ in numbers alone, as a derivative by differences
+asks for, go side by side in the lanes of the processor's vectors: eight take little longer than one.
 """
 
 from __future__ import annotations
@@ -11,15 +14,17 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from math import factorial
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import NumbaExperimentalFeatureWarning, njit, types
+from numba import NumbaExperimentalFeatureWarning, carray, njit, types
 from numba.experimental.function_type import _get_wrapper_address
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from scanner.device import Axis
-from scanner.laws import angular_acceleration, capacitance_slope, electrostatic_torque
+from scanner.laws import angular_acceleration, bell_slope, electrostatic_torque
 
 Array = NDArray[np.float64]
 
@@ -53,85 +58,159 @@ def no_bell(theta, p, nominal):  # type: ignore[no-untyped-def]
     return 0.0, 0.0
 
 
+LANES = 8
+"""Motions side by side."""
+
 _LAWS = types.Tuple(
-    [types.UniTuple(types.FunctionType(TORQUE), SLOTS), _f8[:, ::1], types.int64,
-     types.UniTuple(types.FunctionType(BELL), SLOTS), _f8[:, ::1], types.int64, _vector, types.boolean]
+    [types.UniTuple(types.FunctionType(TORQUE), SLOTS), _f8[:, :, ::1], types.int64,
+     types.UniTuple(types.FunctionType(BELL), SLOTS), _f8[:, :, ::1], types.int64, _f8[:, ::1], _f8, types.int64]
 )  # fmt: skip
-"""Torques, their parameters and number; bells, theirs; nominal values; whether the drive is electrostatic."""
+"""Torques, their parameters by lane and slot, their number; bells, likewise; nominal values by lane; the share of the
+drive's voltage that pulls: 1 for an electrostatic drive, else 0; slots with hidden states."""
+
+_COMPILED: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+
+LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # in two parts, the first with room for k
+ROUNDER = 1.5 * 2.0**52  # added to a number, leaves it rounded to an integer, which then stands in the lowest bits
+ROUNDER_BITS = int(np.float64(ROUNDER).view(np.int64))
+C2, C3, C4, C5, C6, C7, C8, C9, C10, C11, C12, C13 = (1.0 / factorial(n) for n in range(2, 14))
+
+(THETA, OMEGA, MORE_TORQUE, MORE_SLOPE, A1, A2, A3, W2, W3, W4, MID,
+ J, B, K, C0, THETA0, THETA_TH, PUSH, ROWS) = range(19)  # fmt: skip
+"""Rows of the kernel's numbers, (ROWS, LANES): the motion; what its terms add; accelerations and rates of a step's
+stages and the angle at the next; the nominal values."""
+
+
+@njit(forceinline=True, **_COMPILED)
+def _exponential(x):  # type: ignore[no-untyped-def]
+    """exp(x) for x <= 0 to 3e-16 of itself, 1e-304 below -700: without a call, so that it goes on in all lanes."""
+    x = x if x > -700.0 else -700.0
+    rounded = x * (1.0 / (LN2_HIGH + LN2_LOW)) + ROUNDER
+    k = rounded - ROUNDER
+    r = (x - k * LN2_HIGH) - k * LN2_LOW
+    p = C6 + r * (C7 + r * (C8 + r * (C9 + r * (C10 + r * (C11 + r * (C12 + r * C13))))))
+    p = 1.0 + r * (1.0 + r * (C2 + r * (C3 + r * (C4 + r * (C5 + r * p)))))
+    power = np.int64((np.float64(rounded).view(np.int64) - ROUNDER_BITS + 1023) << 52)  # the bits of 2^k
+    return p * power.view(np.float64)
+
+
+@intrinsic
+def _pointer(context, address):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(_f8)(types.uintp), code
 
 
 @njit(inline="always")
-def _extra_slope(theta, laws):  # type: ignore[no-untyped-def]
-    """What the capacitance terms add to dC/dtheta."""
-    bells, p, n, nominal = laws[3], laws[4], laws[5], laws[6]
-    slope = 0.0
-    for i in range(n):
-        slope += bells[i](theta, p[i], nominal)[1]
-    return slope
+def _borrowed(array):  # type: ignore[no-untyped-def]
+    """The same numbers as an array whose owners nobody counts: that takes longer than what a law does with a row.
+
+    For what the kernel's caller keeps; what the kernel made itself would be gone.
+    """
+    return carray(_pointer(array.ctypes.data), array.shape)
 
 
-@njit(inline="always")
-def _extra_torque(t, theta, omega, other, volt, z, dz, laws):  # type: ignore[no-untyped-def]
-    """Torque of the mechanics terms; fills the rates ``dz`` of their hidden states."""
-    torques, p, n, nominal = laws[0], laws[1], laws[2], laws[6]
-    total = 0.0
-    for i in range(n):
-        torque, dz[i, 0], dz[i, 1] = torques[i](t, theta, omega, other, volt, z[i, 0], z[i, 1], p[i], nominal)
-        total += torque
-    return total
+@njit(forceinline=True, **_COMPILED)
+def _torque(law, i, t, theta, omega, other, volt, z, dz, p, nominal):  # type: ignore[no-untyped-def]
+    torque, dz[i, 0], dz[i, 1] = law(t, theta, omega, other, volt, z[i, 0], z[i, 1], p[i], nominal)
+    return torque
 
 
-@njit(inline="always")
-def _acceleration(t, theta, omega, other, volt, z, dz, laws, values):  # type: ignore[no-untyped-def]
-    J, b, k, C0, theta0, theta_th, torque_per_volt = values
-    torque = torque_per_volt * volt
-    if laws[7]:
-        slope = capacitance_slope(theta, C0, theta0, theta_th)
-        if laws[5] > 0:
-            slope += _extra_slope(theta, laws)
-        torque += electrostatic_torque(slope, volt)
-    if laws[2] > 0:
-        torque += _extra_torque(t, theta, omega, other, volt, z, dz, laws)
-    return angular_acceleration(theta, omega, torque, J, b, k)
+@njit(forceinline=True, **_COMPILED)
+def _terms(t, at, rate, other, volt, z, dz, laws, parameters, s):  # type: ignore[no-untyped-def]
+    """What terms add, lane by lane: ``MORE_TORQUE``, ``MORE_SLOPE``, and the rates ``dz`` of their hidden states."""
+    (first, second, third, fourth), n, bells = laws[0], laws[2], laws[3]  # by number they would be copied every time
+    for lane in range(z.shape[0]):
+        p, q, nominal = parameters[0][lane], parameters[1][lane], parameters[2][lane]
+        theta, omega, own, rates, torque, slope = s[at, lane], s[rate, lane], z[lane], dz[lane], 0.0, 0.0
+        if n > 0:
+            torque = _torque(first, 0, t, theta, omega, other, volt, own, rates, p, nominal)
+        if n > 1:
+            torque += _torque(second, 1, t, theta, omega, other, volt, own, rates, p, nominal)
+        if n > 2:
+            torque += _torque(third, 2, t, theta, omega, other, volt, own, rates, p, nominal)
+        if n > 3:
+            torque += _torque(fourth, 3, t, theta, omega, other, volt, own, rates, p, nominal)
+        for i in range(laws[5]):
+            slope += bells[i](theta, q[i], nominal)[1]
+        s[MORE_TORQUE, lane], s[MORE_SLOPE, lane] = torque, slope
 
 
-@njit(inline="always")
+@njit(forceinline=True, **_COMPILED)
+def _acceleration(s, lane, at, rate, volt, pull):  # type: ignore[no-untyped-def]
+    u = (s[at, lane] - s[THETA_TH, lane]) / s[THETA0, lane]
+    slope = bell_slope(u, _exponential(-u * u), s[C0, lane], s[THETA0, lane]) + s[MORE_SLOPE, lane]
+    torque = s[PUSH, lane] * volt + electrostatic_torque(slope, pull) + s[MORE_TORQUE, lane]
+    return angular_acceleration(s[at, lane], s[rate, lane], torque, s[J, lane], s[B, lane], s[K, lane])
+
+
+@njit(forceinline=True, **_COMPILED)
 def _advance(out, z, h, dz, n):  # type: ignore[no-untyped-def]
-    for j in range(n):
-        out[j, 0], out[j, 1] = z[j, 0] + h * dz[j, 0], z[j, 1] + h * dz[j, 1]
+    for lane in range(z.shape[0]):
+        for j in range(n):
+            out[lane, j, 0] = z[lane, j, 0] + h * dz[lane, j, 0]
+            out[lane, j, 1] = z[lane, j, 1] + h * dz[lane, j, 1]
 
 
 @njit(
-    types.void(_f8, _f8, _f8[:, ::1], _f8[:, ::1], _f8[:, ::1], _f8, _f8, _LAWS, _vector, _vector),
-    cache=True, nogil=True,
+    types.void(_f8[:, ::1], _f8[:, :, :, ::1], _f8[:, ::1], _f8[:, ::1], _f8, _f8, _LAWS, types.int64, _f8[:, ::1],
+               _f8[:, ::1]),
+    cache=True, nogil=True, **_COMPILED,
 )  # fmt: skip
-def _integrate(theta, omega, z, voltage, other, t, step, laws, angle, rate):  # type: ignore[no-untyped-def]
-    half, n, nominal = 0.5 * step, laws[2], laws[6]
-    # In registers: from an array they would be loaded anew at every stage, which takes longer than the stage itself.
-    values = (nominal[0], nominal[1], nominal[2], nominal[3], nominal[4], nominal[5], nominal[6])
-    z, mid = z.copy(), np.zeros_like(z)
-    d1, d2, d3, d4 = np.zeros_like(z), np.zeros_like(z), np.zeros_like(z), np.zeros_like(z)
-    angle[0], rate[0] = theta, omega
+def _integrate(start, hidden, voltage, other, t, step, laws, width, angle, rate):  # type: ignore[no-untyped-def]
+    """``hidden``: the states, the same in the middle of a step, and their rates at its four stages; the states must
+    stand at the start, and the caller keeps the whole. ``width``: lanes that are computed, those of ``start`` and some
+    more to fill vectors."""
+    half, used, some, n = 0.5 * step, start.shape[0], laws[2] + laws[5] > 0, laws[8]
+    parameters = _borrowed(laws[1]), _borrowed(laws[4]), _borrowed(laws[6])
+    z, mid, d1 = _borrowed(hidden[0]), _borrowed(hidden[1]), _borrowed(hidden[2])
+    d2, d3, d4 = _borrowed(hidden[3]), _borrowed(hidden[4]), _borrowed(hidden[5])
+    s = np.zeros((ROWS, LANES))
+    for lane in range(width):
+        own = min(lane, used - 1)
+        s[THETA, lane], s[OMEGA, lane] = start[own]
+        s[J:ROWS, lane] = laws[6][own]
+    angle[:, 0], rate[:, 0] = start[:, 0], start[:, 1]
     for i in range(voltage.shape[0]):
         v0, v1, v2 = voltage[i, 0], voltage[i, 1], voltage[i, 2]
+        p0, p1, p2 = laws[7] * v0, laws[7] * v1, laws[7] * v2
         o0, o1, o2 = other[i, 0], other[i, 1], other[i, 2]
-        a1 = _acceleration(t, theta, omega, o0, v0, z, d1, laws, values)
-        w2 = omega + half * a1
-        _advance(mid, z, half, d1, n)
-        a2 = _acceleration(t + half, theta + half * omega, w2, o1, v1, mid, d2, laws, values)
-        w3 = omega + half * a2
-        _advance(mid, z, half, d2, n)
-        a3 = _acceleration(t + half, theta + half * w2, w3, o1, v1, mid, d3, laws, values)
-        w4 = omega + step * a3
-        _advance(mid, z, step, d3, n)
-        a4 = _acceleration(t + step, theta + step * w3, w4, o2, v2, mid, d4, laws, values)
-        theta += step / 6.0 * (omega + 2.0 * w2 + 2.0 * w3 + w4)
-        omega += step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        for j in range(n):
-            for s in range(2):
-                z[j, s] += step / 6.0 * (d1[j, s] + 2.0 * d2[j, s] + 2.0 * d3[j, s] + d4[j, s])
+        if some:
+            _terms(t, THETA, OMEGA, o0, v0, z, d1, laws, parameters, s)
+            _advance(mid, z, half, d1, n)
+        for lane in range(width):
+            s[A1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, p0)
+            s[W2, lane] = s[OMEGA, lane] + half * s[A1, lane]
+            s[MID, lane] = s[THETA, lane] + half * s[OMEGA, lane]
+        if some:
+            _terms(t + half, MID, W2, o1, v1, mid, d2, laws, parameters, s)
+            _advance(mid, z, half, d2, n)
+        for lane in range(width):
+            s[A2, lane] = _acceleration(s, lane, MID, W2, v1, p1)
+            s[W3, lane] = s[OMEGA, lane] + half * s[A2, lane]
+            s[MID, lane] = s[THETA, lane] + half * s[W2, lane]
+        if some:
+            _terms(t + half, MID, W3, o1, v1, mid, d3, laws, parameters, s)
+            _advance(mid, z, step, d3, n)
+        for lane in range(width):
+            s[A3, lane] = _acceleration(s, lane, MID, W3, v1, p1)
+            s[W4, lane] = s[OMEGA, lane] + step * s[A3, lane]
+            s[MID, lane] = s[THETA, lane] + step * s[W3, lane]
+        if some:
+            _terms(t + step, MID, W4, o2, v2, mid, d4, laws, parameters, s)
+        for lane in range(width):
+            a4 = _acceleration(s, lane, MID, W4, v2, p2)
+            s[THETA, lane] += step / 6.0 * (s[OMEGA, lane] + 2.0 * s[W2, lane] + 2.0 * s[W3, lane] + s[W4, lane])
+            s[OMEGA, lane] += step / 6.0 * (s[A1, lane] + 2.0 * s[A2, lane] + 2.0 * s[A3, lane] + a4)
+        for lane in range(used):
+            angle[lane, i + 1], rate[lane, i + 1] = s[THETA, lane], s[OMEGA, lane]
+            for j in range(n):
+                for k in range(2):
+                    z[lane, j, k] += (
+                        step / 6.0 * (d1[lane, j, k] + 2.0 * d2[lane, j, k] + 2.0 * d3[lane, j, k] + d4[lane, j, k])
+                    )
         t += step
-        angle[i + 1], rate[i + 1] = theta, omega
 
 
 (_integration,) = (made.entry_point for made in _integrate.overloads.values())  # type: ignore[attr-defined]
@@ -147,11 +226,11 @@ def _fill_bell(law, angle, p, nominal, out):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class Torque:
-    """A mechanics term as the kernel takes it: compiled law, parameters, hidden states at the start."""
+    """A mechanics term as the kernel takes it: compiled law, parameters, hidden states at the start if it has any."""
 
     law: Callable[..., Any]
     parameters: Sequence[float]
-    hidden: tuple[float, float] = (0.0, 0.0)
+    hidden: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -176,6 +255,21 @@ def nominal_values(axis: Axis) -> Array:
     return np.array([mechanics.J, mechanics.b, mechanics.k, *bell, push], np.float64)
 
 
+class Motion(NamedTuple):
+    """One of the motions that go side by side.
+
+    Attributes:
+        axis: nominal values.
+        start: angle [rad] and rate [rad/s].
+        torques, bells: terms, at most ``SLOTS`` of each.
+    """
+
+    axis: Axis
+    start: tuple[float, float]
+    torques: Sequence[Torque] = ()
+    bells: Sequence[Bell] = ()
+
+
 def integrate(
     axis: Axis,
     start: tuple[float, float],
@@ -190,31 +284,48 @@ def integrate(
 
     Args:
         start: angle [rad] and rate [rad/s].
-        voltage: drive at the start, middle and end of every step, shape (n, 3) [V]; a jump between
-            two steps stays sharp.
-        step: [s].
-        t0: time of the start [s].
+        voltage, step, t0, other: as in :func:`side_by_side`.
         torques, bells: terms, at most ``SLOTS`` of each.
-        other: the other axis's angle, shape (n, 3) [rad].
 
     Returns:
         (angle [rad], rate [rad/s]), each of shape (n + 1,), the start included.
     """
-    n = len(voltage)
-    angle, rate = np.empty(n + 1), np.empty(n + 1)
-    hidden = np.zeros((SLOTS, 2))
-    for i, torque in enumerate(torques):
-        hidden[i] = torque.hidden
-    electrostatic = bool(axis.drive is None or axis.drive.kind == "electrostatic") and axis.capacitance is not None
+    return side_by_side([Motion(axis, start, torques, bells)], voltage, step, t0, other)[0]
+
+
+def side_by_side(
+    motions: Sequence[Motion], voltage: Array, step: float, t0: float = 0.0, other: Array | None = None
+) -> list[tuple[Array, Array]]:
+    """:func:`integrate` of at most ``LANES`` motions with the same laws, whose numbers may differ, under one drive.
+
+    Args:
+        voltage: drive at the start, middle and end of every step, shape (n, 3) [V]; a jump between
+            two steps stays sharp.
+        step: [s].
+        t0: time of the start [s].
+        other: the other axis's angle, shape (n, 3) [rad].
+    """
+    n, lanes, first = len(voltage), len(motions), motions[0]
+    angle, rate = np.empty((lanes, n + 1)), np.empty((lanes, n + 1))
+    hidden = np.zeros((6, lanes, SLOTS, 2))
+    for own, motion in zip(hidden[0], motions, strict=True):
+        for i, torque in enumerate(motion.torques):
+            own[i] = torque.hidden or 0.0
+    drive = first.axis.drive
+    electrostatic = (drive is None or drive.kind == "electrostatic") and first.axis.capacitance is not None
     laws = (
-        _filled([each.law for each in torques], no_torque), _table([each.parameters for each in torques]), len(torques),
-        _filled([each.law for each in bells], no_bell), _table([each.parameters for each in bells]), len(bells),
-        nominal_values(axis), electrostatic,
+        _filled([each.law for each in first.torques], no_torque),
+        _table([[each.parameters for each in motion.torques] for motion in motions]), len(first.torques),
+        _filled([each.law for each in first.bells], no_bell),
+        _table([[each.parameters for each in motion.bells] for motion in motions]), len(first.bells),
+        np.stack([nominal_values(motion.axis) for motion in motions]), float(electrostatic),
+        len(first.torques) if any(torque.hidden for torque in first.torques) else 0,
     )  # fmt: skip
     others = np.zeros((n, 3)) if other is None else _doubles(other)
-    theta, omega = float(start[0]), float(start[1])
-    _integration(theta, omega, hidden, _doubles(voltage), others, float(t0), float(step), laws, angle, rate)
-    return angle, rate
+    start = np.array([motion.start for motion in motions], np.float64)
+    width = 4 * -(-lanes // 4)
+    _integration(start, hidden, _doubles(voltage), others, float(t0), float(step), laws, width, angle, rate)
+    return [(a.copy(), r.copy()) for a, r in zip(angle, rate, strict=True)]  # who keeps one does not keep all
 
 
 def _doubles(values: Array) -> Array:
@@ -256,8 +367,10 @@ def _filled(laws: list[Callable[..., Any]], nothing: Callable[..., Any]) -> tupl
     return tuple(_address(law) for law in (*laws, *[nothing] * (SLOTS - len(laws))))
 
 
-def _table(rows: Sequence[Sequence[float]]) -> Array:
-    table = np.zeros((SLOTS, max([1, *map(len, rows)])))
-    for i, row in enumerate(rows):
-        table[i, : len(row)] = row
+def _table(parameters: Sequence[Sequence[Sequence[float]]]) -> Array:
+    """By lane and slot, shape (lanes, ``SLOTS``, most of any)."""
+    table = np.zeros((len(parameters), SLOTS, max([1, *(len(row) for rows in parameters for row in rows)])))
+    for own, rows in zip(table, parameters, strict=True):
+        for i, row in enumerate(rows):
+            own[i, : len(row)] = row
     return table

@@ -182,6 +182,18 @@ def test_the_nominal_fit_finds_the_values_within_their_errors() -> None:
     assert axis.quality == pytest.approx(40 / 1.05 * np.sqrt(1.004), rel=0.01)
 
 
+def test_what_is_made_ahead_is_what_is_asked_for() -> None:
+    run = experiment(recording(seed=9), DEVICE)
+    candidate = Candidate(catalogue()["second-mode"], "x", "sense")
+    ahead, model = (Model([run], DEVICE, [candidate]) for _ in range(2))
+    points = np.random.default_rng(0).normal(0.0, 0.3, (11, len(model.free)))
+    ahead.prepare(list(points), 0.5)
+    assert len(ahead._ready) == len(points)
+    for x in points:
+        np.testing.assert_array_equal(ahead.outputs(x, 0.5)[0][0], model.outputs(x, 0.5)[0][0])
+    assert not ahead._ready
+
+
 def test_half_the_step_changes_less_than_a_tenth_of_the_noise() -> None:
     made = recording(seed=10)
     values = []

@@ -11,7 +11,7 @@ from scanner.device import Axis, Capacitance, Drive, Mechanics, Position
 from scanner.errors import BadInput
 from scanner.response import Added, Inputs, added_terms, move, sense
 from scanner.terms import STAGES, Scales, catalogue, load_terms, section, shifted
-from scanner.trajectory import integrate
+from scanner.trajectory import LANES, Bell, Motion, Torque, _exponential, integrate, side_by_side
 
 F0 = 600.0
 W = 2 * np.pi * F0
@@ -187,6 +187,32 @@ def torque(t, theta, omega, other, volt, z0, z1, p, nominal):
 K7 = Parameter("k7", "N m", lambda s: s.k / s.amplitude**6)
 TERM = Term("septic-stiffness", "mechanics", "+ k7 θ⁷", (K7,), "mine", torque=torque)
 """
+
+
+def test_motions_side_by_side_are_those_that_each_makes_alone() -> None:
+    known = catalogue()
+    comb = Capacitance(C0=5e-12, Cb=1e-11, theta0=0.2, theta_th=0.01)
+    voltage = 20.0 + 10.0 * np.sin(2 * W * STEP * (np.arange(4000)[:, None] + [0.0, 0.5, 1.0]))
+    motions = []
+    for i in range(LANES - 1):
+        axis = replace(LINEAR, mechanics=Mechanics(1e-12, 1e-10, (1.0 + 1e-3 * i) * 1e-12 * W**2), capacitance=comb)
+        mode = Torque(known["second-mode"].torque, (0.01 * i, 1.3 * F0, 50.0), (0.01, 0.2))
+        cubic = Torque(known["cubic-stiffness"].torque, (1e-6 * i,))
+        bell = Bell(known["profile-shape"].bell, (0.1 * i,))
+        motions.append(Motion(replace(axis, drive=None), (0.1, 1.0 + i), [mode, cubic], [bell]))
+    together = side_by_side(motions, voltage, STEP, 0.1)
+    for (axis, start, torques, bells), (angle, rate) in zip(motions, together, strict=True):
+        alone = integrate(axis, start, voltage, STEP, 0.1, torques, bells)
+        np.testing.assert_array_equal(angle, alone[0])
+        np.testing.assert_array_equal(rate, alone[1])
+    assert np.ptp([angle[-1] for angle, _ in together]) > 1e-3
+
+
+def test_the_kernel_s_exponential_is_numpy_s() -> None:
+    x = -np.geomspace(1e-12, 690.0, 3000)
+    np.testing.assert_allclose([_exponential(each) for each in (*x, 0.0)], np.exp([*x, 0.0]), rtol=4e-16)
+    assert _exponential(-1e9) < 1e-300
+    assert _exponential(-np.inf) < 1e-300
 
 
 def test_a_user_s_own_term_file_moves_the_mirror(tmp_path) -> None:  # type: ignore[no-untyped-def]

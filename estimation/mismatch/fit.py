@@ -141,14 +141,18 @@ class Comparison:
         for i, column in additive.items():
             columns[:, i] = column
 
+        moved = {}
+        for i in set(range(x.size)) - set(additive):
+            moved[i] = x.copy()
+            moved[i][i] += steps[i]
+        model.prepare(list(moved.values()), stop, POOL.map)
+
         def fill(i: int) -> None:
-            moved = x.copy()
-            moved[i] += steps[i]
-            columns[:, i] = (self.residual(model, moved, stop) - base) / steps[i]
+            columns[:, i] = (self.residual(model, moved[i], stop) - base) / steps[i]
             size = np.linalg.norm(columns[:, i])
             steps[i] = np.clip(0.3 / size if size else 1e-2, 1e-7, 3e-2)
 
-        list(POOL.map(fill, [i for i in range(x.size) if i not in additive]))
+        list(POOL.map(fill, moved))
         return columns
 
 

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.experiment import Output, Run, readout_of
 from scanner.device import Amdm, Axis, Device, Readout
-from scanner.response import Added, Inputs, Path, added_terms, move, move_all, reference, sense, with_constants
+from scanner.response import (
+    Added,
+    Inputs,
+    Path,
+    added_terms,
+    move,
+    move_abreast,
+    move_all,
+    reference,
+    sense,
+    with_constants,
+)
 from scanner.terms import Parameter, Scales, Term
+from scanner.trajectory import LANES
 
 Array = NDArray[np.float64]
 
@@ -30,6 +43,9 @@ MAINS = (50.0, 60.0)
 """Mains frequencies [Hz]. Hum at their first ``HUM_MULTIPLES`` multiples is noise, not physics, as long as it stays
 below the noise's own deviation: its quadratures are free with a prior of ``HUM_SD`` of that. A stronger tone is
 interference."""
+
+MADE = 64
+"""Axes with nominal values of their own that a model remembers."""
 
 HUM_MULTIPLES = 3
 HUM_SD = 0.5
@@ -70,6 +86,25 @@ class Free:
     parameter: Parameter | None = None
 
 
+_Key = tuple[object, ...]
+
+
+class _Motion(NamedTuple):
+    """What a motion follows from, its drive aside; see ``move_abreast``."""
+
+    axis: Axis
+    added: tuple[Added, ...]
+    start: tuple[float, float]
+
+    def key(self, r: int, inputs: Inputs) -> _Key:
+        """Equal for equal motions: a readout's numbers do not count."""
+        axis, added, start = self
+        return (
+            r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
+            *[(each.term.effect, each.values, each.hidden) for each in added],
+        )  # fmt: skip
+
+
 class Model:
     """Simulated channels of one or more recordings against free numbers x.
 
@@ -93,7 +128,14 @@ class Model:
         self.basis = {
             (r, output.name): self._basis(r, output) for r, run in enumerate(self.runs) for output in run.outputs
         }
-        self._paths: dict[tuple[object, ...], Path] = {}
+        self._paths: dict[_Key, Path] = {}
+        self._ready: dict[_Key, Path] = {}
+        self._made: dict[_Key, Axis] = {}
+        self._nominal = {
+            axis: [(self._where[("nominal", axis, name, -1)], name, value, tolerance)
+                   for name, value, tolerance in nominal_parameters(device, axis)]
+            for axis in self.axes
+        }  # fmt: skip
         self._lock = Lock()
 
     def _free(self) -> list[Free]:
@@ -148,14 +190,22 @@ class Model:
 
     def nominal(self, axis: str, x: Array) -> Axis:
         """An axis with the nominal values that x gives it, a shared readout included."""
-        made = replace(self.device.axis(axis), readout=readout_of(self.device, axis))
-        tables: dict[str, dict[str, object]] = {}
-        for name, value, tolerance in nominal_parameters(self.device, axis):
-            factor = max(1.0 + tolerance * x[self._where[("nominal", axis, name, -1)]], 0.02)
-            stage, key = name.split(".")
-            new = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
-            tables.setdefault(stage, {})[key] = new
-        return replace(made, **{stage: replace(getattr(made, stage), **table) for stage, table in tables.items()})
+        parameters = self._nominal[axis]
+        factors = [max(1.0 + tolerance * x[i], 0.02) for i, _, _, tolerance in parameters]
+        key = (axis, *factors)
+        made = self._made.get(key)
+        if made is None:  # checking the numbers of a device takes as long as ten turns of the mirror
+            tables: dict[str, dict[str, object]] = {}
+            for (_, name, value, _), factor in zip(parameters, factors, strict=True):
+                stage, own = name.split(".")
+                new = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+                tables.setdefault(stage, {})[own] = new
+            bare = replace(self.device.axis(axis), readout=readout_of(self.device, axis))
+            made = replace(bare, **{stage: replace(getattr(bare, stage), **table) for stage, table in tables.items()})
+            if len(self._made) > MADE:
+                self._made.clear()
+            self._made[key] = made
+        return made
 
     def added(self, axis: str, r: int, x: Array) -> tuple[Added, ...]:
         """The candidates of an axis as the simulation takes them."""
@@ -218,18 +268,46 @@ class Model:
         angle, rate = (x[self._where[("start", name, each, r)]] for each in ("angle", "rate"))
         return scales.amplitude * angle, scales.amplitude * scales.rate * rate
 
+    def prepare(self, xs: Sequence[Array], stop: float, every: Callable[..., Iterable[object]] = map) -> None:
+        """Integrate side by side the motions that :meth:`outputs` at each of ``xs`` is going to ask for.
+
+        Args:
+            every: runs a function on all of a list.
+        """
+        groups: dict[tuple[int, str, tuple[object, ...]], dict[_Key, _Motion]] = {}
+        for x in xs:
+            for name in self.axes:
+                axis = self.nominal(name, x)
+                for r, run in enumerate(self.runs):
+                    if name in run.inputs:
+                        motion = _Motion(axis, _moving(self.added(name, r, x)), self.start(name, r, x))
+                        inputs = _cut(run.inputs[name], stop)
+                        key = motion.key(r, inputs)
+                        if key not in self._paths:
+                            drive = tuple(each.values for each in motion.added if each.term.voltage is not None)
+                            groups.setdefault((r, name, drive), {})[key] = motion
+
+        def moved(some: tuple[Inputs, list[tuple[_Key, _Motion]]]) -> None:
+            paths = move_abreast([motion for _, motion in some[1]], some[0])
+            with self._lock:
+                self._ready |= {key: path for (key, _), path in zip(some[1], paths, strict=True)}
+
+        abreast = []
+        for (r, name, _), group in groups.items():
+            inputs, asked = _cut(self.runs[r].inputs[name], stop), list(group.items())
+            parts = max(-(-len(asked) // LANES), 1 + (len(asked) > LANES // 2))  # something for a second processor
+            abreast += [(inputs, asked[i::parts]) for i in range(parts)]
+        list(every(moved, abreast))
+
     def _remembered(self, axis: Axis, added: tuple[Added, ...], inputs: Inputs,
                     start: tuple[float, float], r: int) -> Path:  # fmt: skip
         """The last few motions are kept: a changed readout needs no new integration."""
-        acting = [each for each in added if _moves(each.term)]
-        key = (
-            r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
-            *[(each.term.effect, each.values, each.hidden) for each in acting],
-        )  # fmt: skip
+        motion = _Motion(axis, _moving(added), start)
+        key = motion.key(r, inputs)
         with self._lock:
-            path = self._paths.pop(key, None)
+            path = self._ready.pop(key, None) or self._paths.pop(key, None)
         if path is None:
-            path = move(axis, acting, inputs, start)
+            (path,) = move_abreast([motion], inputs)
         with self._lock:  # at the end: the one used last is the last to go
             self._paths[key] = path
             if len(self._paths) > 8 * len(self.runs):
@@ -292,8 +370,9 @@ def _readout_keys(readout: Readout | None) -> tuple[str, ...]:
     ]
 
 
-def _moves(term: Term) -> bool:
-    return term.stage in ("drive", "mechanics", "capacitance")
+def _moving(added: Iterable[Added]) -> tuple[Added, ...]:
+    """Those that change the motion."""
+    return tuple(each for each in added if each.term.stage in ("drive", "mechanics", "capacitance"))
 
 
 def _cut(inputs: Inputs, stop: float) -> Inputs:

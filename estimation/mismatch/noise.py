@@ -69,8 +69,9 @@ class Whitener:
         At both ends of what is compared it goes on as its mirror image (a cosine transform): taken round in a circle,
         red noise would end in a step, whose half derivative reaches far into the recording and passes for a drift.
         """
-        low, high = self.guard[0], residual.size - self.guard[1]
-        mirrored = np.pad(residual[low:high], self.guard, "symmetric")
+        first, last = self.guard
+        seen = residual[first : residual.size - last]
+        mirrored = np.concatenate([seen[:first][::-1], seen, seen[seen.size - last :][::-1]])
         return np.asarray(idct(dct(mirrored, norm="ortho")[: self.samples] * self.weights, norm="ortho"))
 
     def excused(self, residual: Array) -> float:

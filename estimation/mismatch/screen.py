@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -14,6 +14,7 @@ from estimation.mismatch.model import Candidate, Model
 from scanner.device import Device
 from scanner.terms import Parameter, Term
 from scanner.terms.term import AMPLITUDES
+from scanner.trajectory import LANES
 
 Array = NDArray[np.float64]
 
@@ -110,24 +111,31 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
     best: Screened | None = None
     at = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == candidate.key]
     moving, hidden = amplitudes(model, candidate), states(model, candidate)
+    points = []
     for grid, seed in product(starts(candidate), candidate.term.seeds or ((0.0,) * len(candidate.term.hidden),)):
         x = model.embed(base.model, base.x)
         x[at] = grid
         x[hidden] = seed * (len(hidden) // max(len(seed), 1))
+        points.append(x)
+    for first in range(0, len(points), LANES):
+        some = points[first : first + LANES]
         if moving:
-            columns = _sensitivities(comparison, base, model, x, moving, hidden, rows, stop)
+            found = _sensitivities(comparison, base, model, some, moving, hidden, rows, stop)
+        else:  # nothing to follow from zero (a clip level, a mode that grows): what a finite size of it changes
+            model.prepare(some, stop)
+            found = [(comparison.residual(model, x, stop) - base.residual)[:, None] for x in some]
+        for x, columns in zip(some, found, strict=True):
             normal, gradient, response = known.system(columns[rows])
             gain, estimate = gain_of(normal, gradient)
-            estimate = np.clip(estimate, -LARGEST, LARGEST)
-            step = model.embed(base.model, known.spread(response @ estimate))
-            placed(step, model, candidate, estimate)
-        else:  # nothing to follow from zero (a clip level, a mode that grows): what a finite size of it changes
-            columns = (comparison.residual(model, x, stop) - base.residual)[:, None]
-            gain, share = gain_of(*known.system(columns[rows])[:2])
-            gain = gain if share[0] > 0.3 else 0.0
             step = np.zeros(x.size)
-        if best is None or gain > best.gain:
-            best = Screened(candidate, model, x, step, gain, columns)
+            if moving:
+                estimate = np.clip(estimate, -LARGEST, LARGEST)
+                step = model.embed(base.model, known.spread(response @ estimate))
+                placed(step, model, candidate, estimate)
+            elif estimate[0] <= 0.3:
+                gain = 0.0
+            if best is None or gain > best.gain:
+                best = Screened(candidate, model, x, step, gain, columns)
     assert best is not None
     return best
 
@@ -167,32 +175,41 @@ def stepped(comparison: Comparison, base: Fit, each: Screened, stop: float = 1.0
     return np.asarray(each.x + share * each.step)
 
 
-def _sensitivities(comparison: Comparison, base: Fit, model: Model, x: Array, moving: Sequence[int],
-                   hidden: Sequence[int], rows: NDArray[np.bool_], stop: float) -> Array:  # fmt: skip
-    """Derivatives of the whitened residual by the amplitudes ``moving`` and by the first of them times each of the
-    ``hidden`` states, shape (N, q + h)."""
-    columns = np.empty((base.residual.size, len(moving) + len(hidden)))
-    share = 1.0
-    for j, i in enumerate(moving):
-        delta = 1e-3
-        for _ in range(2):
-            moved = x.copy()
-            moved[i] += delta
-            columns[:, j] = (comparison.residual(model, moved, stop) - base.residual) / delta
-            size = np.linalg.norm(columns[rows, j])
-            if 0.05 < size * delta < 20.0:
-                break
-            delta = float(np.clip(1.0 / size if size else 1e-2, 1e-6, 0.1))
-        if j == 0:
-            share = moved[i]
-        if not np.linalg.norm(columns[rows, j]) < BURST:
-            columns[:, j] = 0.0
-    for j, i in enumerate(hidden, start=len(moving)):
-        moved = x.copy()
-        moved[[moving[0], i]] = share, 1.0
-        columns[:, j] = (comparison.residual(model, moved, stop) - base.residual) / share - columns[:, 0]
-        if not np.linalg.norm(columns[rows, j]) < BURST:
-            columns[:, j] = 0.0
+def _sensitivities(comparison: Comparison, base: Fit, model: Model, points: Sequence[Array], moving: Sequence[int],
+                   hidden: Sequence[int], rows: NDArray[np.bool_], stop: float) -> list[Array]:  # fmt: skip
+    """At every one of ``points`` the derivatives of the whitened residual by the amplitudes ``moving`` and by the first
+    of them times each of the ``hidden`` states, shape (N, q + h)."""
+    shape = base.residual.size, len(moving) + len(hidden)
+    columns, deltas = [np.empty(shape) for _ in points], np.full((len(points), len(moving)), 1e-3)
+
+    def differences(asked: dict[tuple[int, int], dict[int, float]]) -> Iterator[tuple[int, int, Array]]:
+        """Changes of the residual where single numbers of points are set to something else."""
+        changed = {}
+        for (p, j), numbers in asked.items():
+            x = changed[p, j] = points[p].copy()
+            x[list(numbers)] = list(numbers.values())
+        model.prepare(list(changed.values()), stop)
+        for (p, j), x in changed.items():
+            yield p, j, comparison.residual(model, x, stop) - base.residual
+
+    left = list(np.ndindex(deltas.shape))
+    for turn in range(2):
+        asked, left = left, []
+        for p, j, change in differences({(p, j): {moving[j]: points[p][moving[j]] + deltas[p, j]} for p, j in asked}):
+            columns[p][:, j] = change / deltas[p, j]
+            size = np.linalg.norm(columns[p][rows, j])
+            if turn == 0 and not 0.05 < size * deltas[p, j] < 20.0:
+                deltas[p, j] = np.clip(1.0 / size if size else 1e-2, 1e-6, 0.1)
+                left.append((p, j))
+    states_of = {
+        (p, j): {moving[0]: x[moving[0]] + deltas[p, 0], i: 1.0}
+        for p, x in enumerate(points)
+        for j, i in enumerate(hidden, start=len(moving))
+    }
+    for p, j, change in differences(states_of):
+        columns[p][:, j] = change / deltas[p, 0] - columns[p][:, 0]
+    for each in columns:
+        each[:, ~(np.linalg.norm(each[rows], axis=0) < BURST)] = 0.0
     return columns
 
 
