@@ -29,9 +29,9 @@ def distances_from(comparison: Comparison, fit: Fit, candidate: Candidate, rival
     own = np.array([f.kind == "term" and f.owner == candidate.key for f in fit.model.free])
     signal, rest = _signal(comparison, fit, candidate)[fit.rows], fit.jacobian[np.ix_(fit.rows, ~own)]
     found = []
-    for rival in rivals:
-        blocks = [block[fit.rows] for block in columns(comparison, fit, rival)]
-        size, apart = left_over(rest, fit.model.precision[~own], signal[:, None], blocks)
+    for blocks in columns(comparison, fit, rivals):
+        shown = [block[fit.rows] for block in blocks]
+        size, apart = left_over(rest, fit.model.precision[~own], signal[:, None], shown)
         found.append(float(min([size[0], *apart[0]])))
     return found
 

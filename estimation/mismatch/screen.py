@@ -100,18 +100,28 @@ def screen(
     Args:
         gone: terms of ``base`` in whose place it would stand: ``base`` follows the motion, they need not be right.
     """
+    return [max(found, key=lambda each: each.gain) for found in from_starts(comparison, base, candidates, stop, gone)]
+
+
+def from_starts(
+    comparison: Comparison,
+    base: Fit,
+    candidates: Iterable[Candidate],
+    stop: float = 1.0,
+    gone: Sequence[Candidate] = (),
+) -> list[list[Screened]]:
+    """As :func:`screen`, from every start of every candidate."""
     rows = base.rows & (comparison.time < stop)
     known = Projection(base, rows, gone)
-    return list(POOL.map(lambda each: _best_start(comparison, base, each, known, rows, stop), candidates))
+    return list(POOL.map(lambda each: _from_starts(comparison, base, each, known, rows, stop), candidates))
 
 
-def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: Projection, rows: NDArray[np.bool_],
-                stop: float) -> Screened:  # fmt: skip
+def _from_starts(comparison: Comparison, base: Fit, candidate: Candidate, known: Projection, rows: NDArray[np.bool_],
+                 stop: float) -> list[Screened]:  # fmt: skip
     model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
-    best: Screened | None = None
     at = [i for i, f in enumerate(model.free) if f.kind == "term" and f.owner == candidate.key]
     moving, hidden = amplitudes(model, candidate), states(model, candidate)
-    points = []
+    points, screened = [], []
     for grid, seed in product(starts(candidate), candidate.term.seeds or ((0.0,) * len(candidate.term.hidden),)):
         x = model.embed(base.model, base.x)
         x[at] = grid
@@ -134,10 +144,8 @@ def _best_start(comparison: Comparison, base: Fit, candidate: Candidate, known: 
                 placed(step, model, candidate, estimate)
             elif estimate[0] <= 0.3:
                 gain = 0.0
-            if best is None or gain > best.gain:
-                best = Screened(candidate, model, x, step, gain, columns)
-    assert best is not None
-    return best
+            screened.append(Screened(candidate, model, x, step, gain, columns))
+    return screened
 
 
 def placed(x: Array, model: Model, candidate: Candidate, estimate: Array) -> None:

@@ -16,7 +16,7 @@ from estimation.mismatch.experiment import Output
 from estimation.mismatch.fit import Comparison, Fit, made_fit
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.noise import Whitener, flat_psd, whitener
-from estimation.mismatch.screen import all_candidates, amplitudes, screen, starts
+from estimation.mismatch.screen import all_candidates, amplitudes, from_starts
 from scanner.errors import BadInput
 from scanner.terms import Term
 
@@ -51,7 +51,8 @@ def visibility(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> list[
     """
     taken = {each.key for each in fit.model.candidates}
     candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in taken]
-    found = [(candidate, block) for candidate in candidates for block in columns(comparison, fit, candidate)]
+    blocks = columns(comparison, fit, candidates)
+    found = [(candidate, block) for candidate, own in zip(candidates, blocks, strict=True) for block in own]
     if not found:
         return []
     sizes, apart = distances(fit, [block for _, block in found], comparison.rows)
@@ -69,24 +70,19 @@ def visibility(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> list[
     return sorted(shown, key=lambda each: -each.sigma)
 
 
-def columns(comparison: Comparison, fit: Fit, candidate: Candidate) -> list[Array]:
-    """Sensitivities to a candidate around ``fit``, shape (N, q), for each of its starts that shows anything.
+def columns(comparison: Comparison, fit: Fit, candidates: Sequence[Candidate]) -> list[list[Array]]:
+    """Sensitivities to every candidate around ``fit``, shape (N, q), for each of its starts that shows anything.
 
     What the unknown start of a hidden state could do is no sign of the effect and is taken out.
     """
-    alone = []
-    for start in starts(candidate):
-        place = iter(start)
-        parameters = tuple(
-            p if p.kind == "fixed" else replace(p, starts=(next(place),)) for p in candidate.term.parameters
-        )
-        alone.append(replace(candidate, term=replace(candidate.term, parameters=parameters)))
-    shown = []
-    for each in screen(comparison, fit, alone):
-        own, hidden = np.split(each.columns, [max(1, len(amplitudes(each.model, each.candidate)))], axis=1)
-        if np.any(own):
-            rows = comparison.rows
-            shown.append(own - hidden @ np.linalg.lstsq(hidden[rows], own[rows], rcond=None)[0])
+    rows, shown = comparison.rows, []
+    for screened in from_starts(comparison, fit, candidates):
+        blocks = []
+        for each in screened:
+            own, hidden = np.split(each.columns, [max(1, len(amplitudes(each.model, each.candidate)))], axis=1)
+            if np.any(own):
+                blocks.append(own - hidden @ np.linalg.lstsq(hidden[rows], own[rows], rcond=None)[0])
+        shown.append(blocks)
     return shown
 
 
