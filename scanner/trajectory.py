@@ -66,7 +66,7 @@ _LAWS = types.Tuple(
      types.UniTuple(types.FunctionType(BELL), SLOTS), _f8[:, :, ::1], types.int64, _f8[:, ::1], _f8, types.int64]
 )  # fmt: skip
 """Torques, their parameters by lane and slot, their number; bells, likewise; nominal values by lane; the share of the
-drive's voltage that pulls: 1 for an electrostatic drive, else 0; slots with hidden states."""
+drive's voltage that pulls: 1 for an electrostatic drive, else 0; hidden states."""
 
 _COMPILED: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
@@ -76,9 +76,12 @@ ROUNDER_BITS = int(np.float64(ROUNDER).view(np.int64))
 C2, C3, C4, C5, C6, C7, C8, C9, C10, C11, C12, C13 = (1.0 / factorial(n) for n in range(2, 14))
 
 (THETA, OMEGA, MORE_TORQUE, MORE_SLOPE, A1, A2, A3, W2, W3, W4, MID,
- J, B, K, C0, THETA0, THETA_TH, PUSH, ROWS) = range(19)  # fmt: skip
+ J, B, K, C0, THETA0, THETA_TH, PUSH) = range(18)  # fmt: skip
+Z, Z_MID, Z1, Z2, Z3, Z4 = (18 + 2 * SLOTS * i for i in range(6))
+ROWS = 18 + 12 * SLOTS
 """Rows of the kernel's numbers, (ROWS, LANES): the motion; what its terms add; accelerations and rates of a step's
-stages and the angle at the next; the nominal values."""
+stages and the angle at the next; the nominal values; the hidden states slot by slot, at the start of a step and at a
+stage, and their rates at the four stages."""
 
 
 @njit(forceinline=True, **_COMPILED)
@@ -112,28 +115,31 @@ def _borrowed(array):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True, **_COMPILED)
-def _torque(law, i, t, theta, omega, other, volt, z, dz, p, nominal):  # type: ignore[no-untyped-def]
-    torque, dz[i, 0], dz[i, 1] = law(t, theta, omega, other, volt, z[i, 0], z[i, 1], p[i], nominal)
+def _torque(law, i, t, at, rate, z, dz, other, volt, p, nominal, s, lane):  # type: ignore[no-untyped-def]
+    z0, z1, dz0, dz1 = z + 2 * i, z + 2 * i + 1, dz + 2 * i, dz + 2 * i + 1
+    torque, s[dz0, lane], s[dz1, lane] = law(
+        t, s[at, lane], s[rate, lane], other, volt, s[z0, lane], s[z1, lane], p[i], nominal
+    )
     return torque
 
 
 @njit(forceinline=True, **_COMPILED)
-def _terms(t, at, rate, other, volt, z, dz, laws, parameters, s):  # type: ignore[no-untyped-def]
+def _terms(t, at, rate, z, dz, other, volt, laws, parameters, s, used):  # type: ignore[no-untyped-def]
     """What terms add, lane by lane: ``MORE_TORQUE``, ``MORE_SLOPE``, and the rates ``dz`` of their hidden states."""
     (first, second, third, fourth), n, bells = laws[0], laws[2], laws[3]  # by number they would be copied every time
-    for lane in range(z.shape[0]):
+    for lane in range(used):
         p, q, nominal = parameters[0][lane], parameters[1][lane], parameters[2][lane]
-        theta, omega, own, rates, torque, slope = s[at, lane], s[rate, lane], z[lane], dz[lane], 0.0, 0.0
+        torque = slope = 0.0
         if n > 0:
-            torque = _torque(first, 0, t, theta, omega, other, volt, own, rates, p, nominal)
+            torque = _torque(first, 0, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
         if n > 1:
-            torque += _torque(second, 1, t, theta, omega, other, volt, own, rates, p, nominal)
+            torque += _torque(second, 1, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
         if n > 2:
-            torque += _torque(third, 2, t, theta, omega, other, volt, own, rates, p, nominal)
+            torque += _torque(third, 2, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
         if n > 3:
-            torque += _torque(fourth, 3, t, theta, omega, other, volt, own, rates, p, nominal)
+            torque += _torque(fourth, 3, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
         for i in range(laws[5]):
-            slope += bells[i](theta, q[i], nominal)[1]
+            slope += bells[i](s[at, lane], q[i], nominal)[1]
         s[MORE_TORQUE, lane], s[MORE_SLOPE, lane] = torque, slope
 
 
@@ -146,70 +152,65 @@ def _acceleration(s, lane, at, rate, volt, pull):  # type: ignore[no-untyped-def
 
 
 @njit(forceinline=True, **_COMPILED)
-def _advance(out, z, h, dz, n):  # type: ignore[no-untyped-def]
-    for lane in range(z.shape[0]):
-        for j in range(n):
-            out[lane, j, 0] = z[lane, j, 0] + h * dz[lane, j, 0]
-            out[lane, j, 1] = z[lane, j, 1] + h * dz[lane, j, 1]
+def _advance(dz, h, s, states, width):  # type: ignore[no-untyped-def]
+    for i in range(states):
+        for lane in range(width):
+            s[Z_MID + i, lane] = s[Z + i, lane] + h * s[dz + i, lane]
 
 
 @njit(
-    types.void(_f8[:, ::1], _f8[:, :, :, ::1], _f8[:, ::1], _f8[:, ::1], _f8, _f8, _LAWS, types.int64, _f8[:, ::1],
-               _f8[:, ::1]),
+    types.void(_f8[:, ::1], _f8[:, ::1], _f8[:, ::1], _f8, _f8, _LAWS, types.int64, _f8[:, ::1], _f8[:, ::1]),
     cache=True, nogil=True, **_COMPILED,
 )  # fmt: skip
-def _integrate(start, hidden, voltage, other, t, step, laws, width, angle, rate):  # type: ignore[no-untyped-def]
-    """``hidden``: the states, the same in the middle of a step, and their rates at its four stages; the states must
-    stand at the start, and the caller keeps the whole. ``width``: lanes that are computed, those of ``start`` and some
-    more to fill vectors."""
-    half, used, some, n = 0.5 * step, start.shape[0], laws[2] + laws[5] > 0, laws[8]
+def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # type: ignore[no-untyped-def]
+    """``start``: angle, rate, hidden states by lane. ``width``: lanes computed, more than used to fill vectors."""
+    half, used, some, states = 0.5 * step, start.shape[0], laws[2] + laws[5] > 0, laws[8]
     parameters = _borrowed(laws[1]), _borrowed(laws[4]), _borrowed(laws[6])
-    z, mid, d1 = _borrowed(hidden[0]), _borrowed(hidden[1]), _borrowed(hidden[2])
-    d2, d3, d4 = _borrowed(hidden[3]), _borrowed(hidden[4]), _borrowed(hidden[5])
     s = np.zeros((ROWS, LANES))
     for lane in range(width):
         own = min(lane, used - 1)
-        s[THETA, lane], s[OMEGA, lane] = start[own]
-        s[J:ROWS, lane] = laws[6][own]
+        s[THETA, lane], s[OMEGA, lane] = start[own, 0], start[own, 1]
+        s[Z : Z + 2 * SLOTS, lane] = start[own, 2:]
+        s[J : PUSH + 1, lane] = laws[6][own]
+    s[Z_MID : Z_MID + 2 * SLOTS] = s[Z : Z + 2 * SLOTS]
     angle[:, 0], rate[:, 0] = start[:, 0], start[:, 1]
     for i in range(voltage.shape[0]):
         v0, v1, v2 = voltage[i, 0], voltage[i, 1], voltage[i, 2]
         p0, p1, p2 = laws[7] * v0, laws[7] * v1, laws[7] * v2
         o0, o1, o2 = other[i, 0], other[i, 1], other[i, 2]
         if some:
-            _terms(t, THETA, OMEGA, o0, v0, z, d1, laws, parameters, s)
-            _advance(mid, z, half, d1, n)
+            _terms(t, THETA, OMEGA, Z, Z1, o0, v0, laws, parameters, s, used)
+            _advance(Z1, half, s, states, width)
         for lane in range(width):
             s[A1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, p0)
             s[W2, lane] = s[OMEGA, lane] + half * s[A1, lane]
             s[MID, lane] = s[THETA, lane] + half * s[OMEGA, lane]
         if some:
-            _terms(t + half, MID, W2, o1, v1, mid, d2, laws, parameters, s)
-            _advance(mid, z, half, d2, n)
+            _terms(t + half, MID, W2, Z_MID, Z2, o1, v1, laws, parameters, s, used)
+            _advance(Z2, half, s, states, width)
         for lane in range(width):
             s[A2, lane] = _acceleration(s, lane, MID, W2, v1, p1)
             s[W3, lane] = s[OMEGA, lane] + half * s[A2, lane]
             s[MID, lane] = s[THETA, lane] + half * s[W2, lane]
         if some:
-            _terms(t + half, MID, W3, o1, v1, mid, d3, laws, parameters, s)
-            _advance(mid, z, step, d3, n)
+            _terms(t + half, MID, W3, Z_MID, Z3, o1, v1, laws, parameters, s, used)
+            _advance(Z3, step, s, states, width)
         for lane in range(width):
             s[A3, lane] = _acceleration(s, lane, MID, W3, v1, p1)
             s[W4, lane] = s[OMEGA, lane] + step * s[A3, lane]
             s[MID, lane] = s[THETA, lane] + step * s[W3, lane]
         if some:
-            _terms(t + step, MID, W4, o2, v2, mid, d4, laws, parameters, s)
+            _terms(t + step, MID, W4, Z_MID, Z4, o2, v2, laws, parameters, s, used)
+            for k in range(states):
+                for lane in range(width):
+                    rates = s[Z1 + k, lane] + 2.0 * s[Z2 + k, lane] + 2.0 * s[Z3 + k, lane] + s[Z4 + k, lane]
+                    s[Z + k, lane] += step / 6.0 * rates
         for lane in range(width):
             a4 = _acceleration(s, lane, MID, W4, v2, p2)
             s[THETA, lane] += step / 6.0 * (s[OMEGA, lane] + 2.0 * s[W2, lane] + 2.0 * s[W3, lane] + s[W4, lane])
             s[OMEGA, lane] += step / 6.0 * (s[A1, lane] + 2.0 * s[A2, lane] + 2.0 * s[A3, lane] + a4)
         for lane in range(used):
             angle[lane, i + 1], rate[lane, i + 1] = s[THETA, lane], s[OMEGA, lane]
-            for j in range(n):
-                for k in range(2):
-                    z[lane, j, k] += (
-                        step / 6.0 * (d1[lane, j, k] + 2.0 * d2[lane, j, k] + 2.0 * d3[lane, j, k] + d4[lane, j, k])
-                    )
         t += step
 
 
@@ -307,10 +308,11 @@ def side_by_side(
     """
     n, lanes, first = len(voltage), len(motions), motions[0]
     angle, rate = np.empty((lanes, n + 1)), np.empty((lanes, n + 1))
-    hidden = np.zeros((6, lanes, SLOTS, 2))
-    for own, motion in zip(hidden[0], motions, strict=True):
+    start = np.zeros((lanes, 2 + 2 * SLOTS))
+    for own, motion in zip(start, motions, strict=True):
+        own[:2] = motion.start
         for i, torque in enumerate(motion.torques):
-            own[i] = torque.hidden or 0.0
+            own[2 + 2 * i : 4 + 2 * i] = torque.hidden or 0.0
     drive = first.axis.drive
     electrostatic = (drive is None or drive.kind == "electrostatic") and first.axis.capacitance is not None
     laws = (
@@ -319,12 +321,11 @@ def side_by_side(
         _filled([each.law for each in first.bells], no_bell),
         _table([[each.parameters for each in motion.bells] for motion in motions]), len(first.bells),
         np.stack([nominal_values(motion.axis) for motion in motions]), float(electrostatic),
-        len(first.torques) if any(torque.hidden for torque in first.torques) else 0,
+        2 * len(first.torques) if any(torque.hidden for torque in first.torques) else 0,
     )  # fmt: skip
     others = np.zeros((n, 3)) if other is None else _doubles(other)
-    start = np.array([motion.start for motion in motions], np.float64)
     width = 4 * -(-lanes // 4)
-    _integration(start, hidden, _doubles(voltage), others, float(t0), float(step), laws, width, angle, rate)
+    _integration(start, _doubles(voltage), others, float(t0), float(step), laws, width, angle, rate)
     return [(a.copy(), r.copy()) for a, r in zip(angle, rate, strict=True)]  # who keeps one does not keep all
 
 
