@@ -6,8 +6,8 @@ import errno
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import CancelledError, as_completed
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError, Executor, Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ def reconstruct_files(
         output.mkdir(exist_ok=True)
         folders = dict(zip(paths, _folders(paths, output.absolute()), strict=True))
         jobs = {
-            executor.submit(task(_one, path.absolute(), folder, options, mapping and mapping.absolute())): path
+            _submitted(executor, task(_one, path.absolute(), folder, options, mapping and mapping.absolute())): path
             for path, folder in folders.items()
         }
         rows: dict[Path, Row] = {}
@@ -94,7 +94,17 @@ def _one(path: Path, folder: Path, options: Options, mapping: Path | None) -> Ro
     return {"failed": None} | {key: summary[key] for key in KEPT}
 
 
-def _row(done: Any, path: Path) -> Row:
+def _submitted(executor: Executor, work: Callable[[], Row]) -> Future[Row]:
+    """The future of ``work``; one that failed if a worker was killed while others were still being submitted."""
+    try:
+        return executor.submit(work)
+    except BrokenProcessPool as error:
+        broken: Future[Row] = Future()
+        broken.set_exception(error)
+        return broken
+
+
+def _row(done: Future[Row], path: Path) -> Row:
     try:
         return done.result()
     except (BrokenProcessPool, CancelledError) as error:

@@ -5,6 +5,8 @@ import os
 import signal
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import h5py
@@ -72,6 +74,18 @@ def test_a_worker_that_is_killed_is_told_of(scans: list[Path], tmp_path: Path) -
     killer.start()
     summary = reconstruct_files(scans[:2], tmp_path / "all", OPTIONS, workers=1)
     killer.join()
+    assert summary["exit"] == 1
+    assert all("its worker was killed" in each["failed"] for each in summary["recordings"])
+
+
+def test_a_worker_that_is_killed_before_all_are_submitted_is_told_of(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise BrokenProcessPool("a child process terminated abruptly")
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", broken)
+    summary = reconstruct_files(scans[:2], tmp_path / "all", OPTIONS, workers=1)
     assert summary["exit"] == 1
     assert all("its worker was killed" in each["failed"] for each in summary["recordings"])
 
