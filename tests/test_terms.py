@@ -52,7 +52,7 @@ def test_a_mode_at_half_the_frequency_holds_the_swing_at_its_threshold(sign: flo
     """It grows where g A passes 2/Q2 (Nayfeh & Mook 5.3), and then takes all that the drive gives beyond."""
     k, quality, threshold = LINEAR.mechanics.k, 100.0, 0.1
     axis = replace(LINEAR, mechanics=Mechanics(1e-12, 1e-12 * W / quality, k))
-    values = sign * 2.0 / (40.0 * threshold), 0.5 * F0, 40.0, threshold
+    values = sign * 2.0 / (40.0 * threshold), 0.5 * F0, 40.0, 1e-3 / threshold**0.5
     time = STEP * (np.arange(100 * 800)[:, None] + [0.0, 0.5, 1.0])
     for driven, held in ((0.08, 0.08), (0.2, threshold)):
         inputs = Inputs(driven * k / quality / 1e-9 * np.cos(W * time), STEP)

@@ -29,6 +29,9 @@ STEPS_A_DRIVE = 28
 BAND = 16
 """Highest frequency compared, in multiples of the motion's."""
 
+STEADY = 0.5
+"""Share of what alternates in a drive that a tone and its overtones make up, from which it is taken to be steady."""
+
 EDGE = 16
 """Samples at either end of a thinned channel that its filter has touched."""
 
@@ -207,6 +210,15 @@ def strongest_line(values: Array, rate: float) -> float:
     return float(np.argmax(spectrum) * rate / part.size)
 
 
+def _keeps_to(line: float, values: Array, rate: float) -> bool:
+    """Whether what alternates is a tone and its overtones, not a sweep, many tones or noise."""
+    power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(values.size))) ** 2
+    first = line / rate * values.size
+    overtones = np.round(first * np.arange(1, int(power.size / first))).astype(int)
+    near = np.unique(np.add.outer(overtones, np.arange(-3, 4)).ravel())
+    return bool(power[near[near >= 0]].sum() > STEADY * power.sum())
+
+
 def _voltage(channels: list[Channel], rest: float, start: float, step: float, n: int) -> Array:
     """Sum of the channels at the start, middle and end of every step, shape (n, 3)."""
     total = np.full((n, 3), rest)
@@ -318,6 +330,8 @@ def _scales(device: Device, name: str, inputs: Inputs, outputs: tuple[Output, ..
     sensed = next((o for o in outputs if o.kind == "sense" and name in o.axes), outputs[0])
     follows = not parametric and 0.8 < strongest_line(sensed.data, 1 / sensed.step) / (line or np.inf) < 1.25
     rate = np.pi * line if parametric and line else 2 * np.pi * line if line else resonance
+    if line and not _keeps_to(line, voltage, 1 / inputs.step):
+        rate = resonance  # where it moves most
     if not (0.5 < rate / resonance < 2.0 or (follows and rate < resonance)):  # a stage far below its resonance follows
         rate = resonance
     measured = next((o.data for o in outputs if o.name == f"angle_{name}"), None)

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import Comparison, Fit, solve
+from estimation.mismatch.fit import Comparison, Fit, made_fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.screen import PROMISING, Screened, screen, stepped
+from estimation.mismatch.screen import PROMISING, Screened, from_starts, screen, stepped
 from estimation.mismatch.start import measured_whiteners
 
 Array = NDArray[np.float64]
@@ -56,6 +56,9 @@ TOGETHER, ALONE = 3, 12
 
 FINEST = 1.03
 """Least growth of a window."""
+
+NO_VERDICT = 60.0
+"""Lead in -2 log evidence that over a window, or between many, says nothing yet."""
 
 HOPELESS = 2000.0
 """A fit that is this far behind another's evidence after a few turns is not polished."""
@@ -174,6 +177,10 @@ def race(
     choosy = base.rows.sum() > MANY_SAMPLES
     named, _ = _apart(field)
     named = [each for i, each in enumerate(named) if not choosy or i < STARTERS or each.gain > 0.5 * field[0].gain]
+    growing = [each for each in candidates if each.term.seeds]
+    if reached and growing:
+        named = [each for each in named if not each.candidate.term.seeds]
+        named += _sown(comparison, nominal, followed, growing, brink)
     _, free = _apart(field[:STARTERS])
     later = [stop for stop in stops if stop > brink]
     tracks = list(_eased([reached, brink, *later])) if reached else [brink, *_eased([brink, *later])]
@@ -188,6 +195,25 @@ def race(
         return _raced(comparison, running, tracks, reached, TOGETHER)
 
     return _named_first(named, free, through)
+
+
+def _sown(
+    comparison: Comparison, nominal: Model, followed: Fit, growing: Sequence[Candidate], brink: float
+) -> Iterator[Screened]:
+    """Modes that grow from next to nothing, for which no first order holds: the best start for every size of coupling.
+
+    Around the nominal values that follow as yet: values bent to what a mode does over the window imitate it.
+    """
+    x = nominal.embed(followed.model, followed.x)
+    residual = comparison.residual(nominal, x, brink)
+    jacobian = comparison.jacobian(nominal, x, residual, np.full(x.size, 1e-4), brink)
+    rows = comparison.rows & (comparison.time < brink)
+    straying = made_fit(comparison, nominal, x, residual, jacobian, rows)
+    for starts in from_starts(comparison, straying, growing, brink):
+        size = starts[0].model.index("term", starts[0].candidate.key, starts[0].candidate.term.free[0].name)
+        for each in {start.x[size]: start for start in sorted(starts, key=lambda start: start.gain)}.values():
+            if each.gain > PROMISING:
+                yield each
 
 
 class Brink(NamedTuple):
@@ -260,8 +286,11 @@ def _raced(
             continue
         if fits[0].chi2 > bar:
             return []
+        if len(fits) > FINALISTS and fits[FINALISTS].evidence < fits[0].evidence + NO_VERDICT:
+            reached, level = ahead.pop(), now
+            continue  # nothing has shown: all go on as they came, a mode that will grow with what it grows from
         best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
-        margin = max(60.0, 0.5 * (worst - best))
+        margin = max(NO_VERDICT, 0.5 * (worst - best))
         kept = [fit for fit in fits if fit.evidence < best + margin]
         if now > EXPLAINED:  # of what explains little yet, being ahead is no merit
             kept = fits[: max(FINALISTS, len(kept))]
@@ -270,7 +299,8 @@ def _raced(
         kept = [fit for fit in kept if possible(fit) or fit.evidence > best]
         running += [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
         reached, level = ahead.pop(), now
-    return [fit for fit in fits if possible(fit)]
+    best_of = {fit.model.candidates[-1].key: fit for fit in reversed(fits) if possible(fit)}
+    return list(best_of.values())
 
 
 def _mirrored(fit: Fit) -> Array:

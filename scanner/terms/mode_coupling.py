@@ -8,27 +8,24 @@ from numba import njit
 from scanner.terms.term import Parameter, Term
 from scanner.trajectory import TORQUE
 
-PUSH = 1e-3
-"""Direct push on the mode, over A^(1/2): next to nothing, but what grows needs something to grow from."""
-
 
 @njit(TORQUE, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
     w2 = 2.0 * np.pi * p[1]
-    pushed = PUSH * theta / np.sqrt(p[3])
-    swing = w2 * w2 * (pushed - (1.0 + p[0] * theta) * z0) - w2 / p[2] * z1
+    swing = w2 * w2 * (p[3] * theta - (1.0 + p[0] * theta) * z0) - w2 / p[2] * z1
     return -0.5 * np.copysign(nominal[2], p[0]) * z0 * z0, z1, swing
 
 
 TERM = Term(
     effect="mode-coupling",
     stage="mechanics",
-    equation="J θ'' + b θ' + k (θ ± q²/2) = τ,  q'' + (ω2/Q2) q' + ω2² (1 + g θ) q = 0,  ± the sign of g",
+    equation="J θ'' + b θ' + k (θ ± q²/2) = τ,  q'' + (ω2/Q2) q' + ω2² (q + g θ q − s θ) = 0,  ± the sign of g",
     parameters=(
-        Parameter("g", "1/rad", lambda s: 0.08 / s.amplitude, starts=(1.0, -1.0)),
+        Parameter("g", "1/rad", lambda s: 0.08 / s.amplitude, starts=(1.0, -1.0, 2.0, -2.0)),
         Parameter("f2", "Hz", lambda s: s.rate / (4.0 * np.pi), kind="log", spread=0.01, starts=(-0.2, 0.0, 0.2)),
         Parameter("Q2", "1", lambda s: 80.0, kind="log", spread=0.5),
-        Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
+        # Next to nothing, but what grows needs something to grow from, and how much tells when it is there.
+        Parameter("s", "1/rad^0.5", lambda s: 1e-3 / s.amplitude**0.5, kind="log", spread=2.0),
     ),
     hidden=(lambda s: s.amplitude**0.5, lambda s: 0.5 * s.rate * s.amplitude**0.5),
     seeds=((1.0, 0.0), (0.0, 1.0), (0.2, 0.2), (0.04, 0.04), (0.008, 0.008), (0.0016, 0.0016)),

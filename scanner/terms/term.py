@@ -40,7 +40,7 @@ class Scales:
 
     Attributes:
         amplitude: of the motion [rad].
-        rate: its angular frequency [rad/s].
+        rate: its angular frequency, in a sweep that of the resonance [rad/s].
         J, b, k: nominal mechanics.
         duration: of the recording [s].
         voltage_mean, voltage_rms: of the drive: mean, and deviation from it [V].
