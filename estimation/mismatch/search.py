@@ -234,12 +234,14 @@ def _is_free(fit: Fit) -> bool:
 
 
 def needed_only(comparison: Comparison, fit: Fit) -> Fit:
-    """The fit without the terms that a later one has made superfluous.
+    """The fit without those of several terms that the others make superfluous.
 
-    A near relative may stand in for the true effect until that one is there to be chosen beside it.
+    A near relative may stand in for the true effect until that one is there to be chosen beside it. Hum is judged anew
+    with every term and without: in a short recording a drift and the wrong mains look like the right one.
     """
-    for each in fit.model.candidates[:-1]:
-        less = without(comparison, fit, each)
+    fit = with_hum(comparison, fit)
+    for each in fit.model.candidates if len(fit.model.candidates) > 1 else ():
+        less = with_hum(comparison, without(comparison, fit, each))
         if less.evidence - fit.evidence < LEAD_OVER_NOTHING:
             return needed_only(comparison, less)
     return fit
