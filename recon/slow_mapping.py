@@ -20,8 +20,7 @@ from scanner.errors import BadInput
 PLACES = 23  # bits of a place across the field: all that single precision has
 ROUNDED = 5.0  # roundings of half of the last bit in a place, in amplitudes: of phasors, factors and sums
 POWERS = 20.0  # the same for a harmonic, whose phasor is a power of the first one's
-DOUBLINGS = 7
-PART = 1 << DOUBLINGS  # samples whose phasors one table holds
+PART = 128  # samples whose phasors one table holds, a power of two
 TOGETHER = 32  # segments added up at a time: what adding takes of the first cache, tables have to be fetched back into
 NEAR = 1e-7  # rad a sample by which a turn may be off its table's
 RAMP = np.arange(PART, dtype=np.float32)
@@ -40,10 +39,12 @@ def _bits(pixels):  # type: ignore[no-untyped-def]
 def _tabulated(turn, re, im, table):  # type: ignore[no-untyped-def]
     """Phasors of PART samples that begin at 1, the same times the sample's number, and their third and fifth powers.
 
+    Returns the phasor after PART samples.
+
     ``table``: shape (8 PART,), real and imaginary parts in turn, in one array so that nothing has to be told apart
     before eight samples are taken together.
     """
-    doubled(turn, re, im)
+    far = doubled(turn, re, im)
     for i in range(PART):
         c, s = np.float32(re[i]), np.float32(im[i])
         c2, s2 = c * c - s * s, np.float32(2.0) * c * s
@@ -52,17 +53,18 @@ def _tabulated(turn, re, im, table):  # type: ignore[no-untyped-def]
         table[2 * PART + i], table[3 * PART + i] = RAMP[i] * c, RAMP[i] * s
         table[4 * PART + i], table[5 * PART + i] = c3, s3
         table[6 * PART + i], table[7 * PART + i] = c3 * c2 - s3 * s2, c3 * s2 + s3 * c2
+    return far
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _placed(axis, s, scale, pixels, kept, re, im, table, out):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
+def _placed(axis, s, scale, across, kept, re, im, table, out):  # type: ignore[no-untyped-def]
     """Places of segment ``s`` in units of 2^-bits pixels into ``out``, float32; False where they may be off by a unit.
 
-    As ``angle.segment_angles`` for harmonics 1, 3 and 5. ``axis``: arrays of ``Segments``. ``scale``: units by radian.
-    ``kept``: turn that ``table`` is made for, shape (1,); a turn next to it bends the first harmonic's ramp.
+    As ``angle.segment_angles`` for harmonics 1, 3 and 5. ``axis``: arrays of ``Segments``. ``scale``: units by radian,
+    ``across``: units in the field. ``kept``: turn that ``table`` is made for and its power after PART samples, shape
+    (2,); a turn next to it bends the first harmonic's ramp.
     """
     firsts, turns, lines, steps = axis
-    across = float(pixels << _bits(pixels))
     first, third, fifth, step = lines[s, 0], lines[s, 1], lines[s, 2], steps[s, 0].imag
     third, fifth = third + 0.5 * SEGMENT * steps[s, 1], fifth + 0.5 * SEGMENT * steps[s, 2]
     size, harmonics = abs(first.imag) + SEGMENT * abs(step), _size(third) + _size(fifth)
@@ -72,10 +74,8 @@ def _placed(axis, s, scale, pixels, kept, re, im, table, out):  # type: ignore[n
     slip = (turn * kept[0].conjugate()).imag
     if not abs(slip) < NEAR:
         kept[0], slip = turn, 0.0
-        _tabulated(turn, re, im, table)
-    far = turn
-    for _ in range(DOUBLINGS):
-        far *= far
+        kept[1] = _tabulated(turn, re, im, table)
+    far = kept[1] * (1.0 + 1j * PART * slip)
     middle, u = np.float32(0.5 * across), firsts[s]
     for at in range(0, SEGMENT, PART):
         u2 = u * u
@@ -85,11 +85,16 @@ def _placed(axis, s, scale, pixels, kept, re, im, table, out):  # type: ignore[n
         a1, b1, a3, b3 = np.float32(one.real), np.float32(one.imag), np.float32(three.real), np.float32(three.imag)
         a5, b5 = np.float32(five.real), np.float32(five.imag)
         ramp_a, ramp_b = np.float32(ramp.real), np.float32(ramp.imag)
-        for i in range(PART):
-            small = ramp_a * table[2 * PART + i] - ramp_b * table[3 * PART + i]
-            small += a3 * table[4 * PART + i] - b3 * table[5 * PART + i]
-            small += a5 * table[6 * PART + i] - b5 * table[7 * PART + i]
-            out[at + i] = middle + (a1 * table[i] - b1 * table[PART + i] + small)
+        for i in range(PART):  # one term after the other: each is a product and a sum in one instruction
+            place = ramp_a * table[2 * PART + i]
+            place -= ramp_b * table[3 * PART + i]
+            place += a3 * table[4 * PART + i]
+            place -= b3 * table[5 * PART + i]
+            place += a5 * table[6 * PART + i]
+            place -= b5 * table[7 * PART + i]
+            place += a1 * table[i]
+            place -= b1 * table[PART + i]
+            out[at + i] = middle + place
         u *= far
     return True
 
@@ -100,10 +105,10 @@ def _size(z):  # type: ignore[no-untyped-def]
     return abs(z.real) + abs(z.imag)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _found(x, y, values, width, height, index):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def _found(x, y, values, width, height, bits_x, bits_y, index):  # type: ignore[no-untyped-def]
     """As ``mapping.find_block``, from places; False where one is within a unit of a pixel's edge."""
-    bits_x, bits_y = np.int32(_bits(width)), np.int32(_bits(height))
+    bits_x, bits_y = np.int32(bits_x), np.int32(bits_y)
     one, two, stride, nearest = np.int32(1), np.int32(2), np.int32(width), np.int32(2)
     last_x, last_y = np.int32((width << bits_x) - 1), np.int32((height << bits_y) - 1)
     fraction_x, fraction_y = np.int32((1 << bits_x) - 1), np.int32((1 << bits_y) - 1)
@@ -121,19 +126,21 @@ def _found(x, y, values, width, height, index):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _accumulate(x, y, intensity, half_x, half_y, sums, counts, cells):  # type: ignore[no-untyped-def]
     height, width = counts.shape
-    scale_x, scale_y = 0.5 * (width << _bits(width)) / half_x, 0.5 * (height << _bits(height)) / half_y
+    bits_x, bits_y = _bits(width), _bits(height)
+    across_x, across_y = float(width << bits_x), float(height << bits_y)
+    scale_x, scale_y = 0.5 * across_x / half_x, 0.5 * across_y / half_y
     theta_x, theta_y, index = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(TOGETHER * SEGMENT, np.int32)
     re, im, part_re, part_im = np.empty(FINE), np.empty(FINE), np.empty(PART), np.empty(PART)
     place_x, place_y = np.empty(SEGMENT, np.float32), np.empty(SEGMENT, np.float32)
     table_x, table_y = np.empty(8 * PART, np.float32), np.empty(8 * PART, np.float32)
-    turn_x, turn_y = np.full(1, np.nan + 0j), np.full(1, np.nan + 0j)
+    turn_x, turn_y = np.full(2, np.nan + 0j), np.full(2, np.nan + 0j)
     odd = x[2].shape[1] == 3 and y[2].shape[1] == 3
     for some in range(0, x[0].size, TOGETHER):
         for s in range(some, min(some + TOGETHER, x[0].size)):
             values, own = intensity[s * SEGMENT : (s + 1) * SEGMENT], index[(s - some) * SEGMENT :]
-            told = odd and _placed(x, s, scale_x, width, turn_x, part_re, part_im, table_x, place_x)
-            told = told and _placed(y, s, scale_y, height, turn_y, part_re, part_im, table_y, place_y)
-            if not (told and _found(place_x, place_y, values, width, height, own)):
+            told = odd and _placed(x, s, scale_x, across_x, turn_x, part_re, part_im, table_x, place_x)
+            told = told and _placed(y, s, scale_y, across_y, turn_y, part_re, part_im, table_y, place_y)
+            if not (told and _found(place_x, place_y, values, width, height, bits_x, bits_y, own)):
                 segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, theta_x)
                 segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, theta_y)
                 find_block(theta_x, theta_y, values, half_x, half_y, width, height, own)
