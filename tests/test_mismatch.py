@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 from estimation.mismatch.diagnosis import diagnose
-from estimation.mismatch.experiment import between, experiment, thinned
+from estimation.mismatch.experiment import between, experiment, is_steady, strongest_line, thinned
 from estimation.mismatch.fit import Comparison, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.instead import instead
@@ -303,6 +304,26 @@ def test_a_tone_among_the_lines_of_a_multisine_is_seen() -> None:
         comparison = Comparison(told.runs, first_whiteners(told))
         line = strongest_foreign_line(solve(comparison, told, np.zeros(len(told.free)), turns=1))
         assert (line is not None and abs(line - 336.0) < 3.0) == seen
+
+
+@pytest.mark.parametrize("seconds", [0.005, 0.02, 0.3])  # 5e3 to 3e5 samples: more than a line is looked for in
+@pytest.mark.parametrize(
+    ("drive", "steady"),
+    [
+        (lambda t: np.sin(2 * np.pi * 27680.37 * t), True),
+        (lambda t: 20.0 * (np.sin(2 * np.pi * 27680.37 * t) > 0.0), True),
+        (lambda t: 20.0 * ((27680.37 * t) % 1.0 < 0.25), True),
+        (lambda t: np.sin(2 * np.pi * (27000.0 + 4000.0 * t / t[-1]) * t), False),
+        (lambda t: sum(np.cos(2 * np.pi * f * t + f) for f in np.linspace(22e3, 33e3, 23)), False),
+        (lambda t: np.random.default_rng(1).standard_normal(t.size), False),
+    ],
+    ids=["sine", "square", "pulses", "sweep", "multisine", "noise"],
+)
+def test_a_tone_is_told_from_a_sweep_however_long(
+    drive: Callable[[np.ndarray], np.ndarray], steady: bool, seconds: float
+) -> None:
+    values = drive(np.arange(0.0, seconds, 1e-6))
+    assert is_steady(strongest_line(values, 1e6), values, 1e6) == steady
 
 
 def test_a_jump_stays_sharp_and_a_sine_is_exact_between_samples() -> None:

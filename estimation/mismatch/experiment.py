@@ -9,6 +9,7 @@ from math import ceil, floor
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.mismatch.noise import periodogram
 from scanner.channel import Channel, check_signal
 from scanner.device import Amdm, Axis, Device, Position, Readout, Transimpedance
 from scanner.errors import BadInput, DeviceInvalid
@@ -31,6 +32,12 @@ BAND = 16
 
 STEADY = 0.5
 """Share of what alternates in a drive that a tone and its overtones make up, from which it is taken to be steady."""
+
+OVERTONES = 6
+"""Lines that a steady tone is known by; half of the power of pulses a twentieth of a period long lies in them."""
+
+SEEN = 1 << 17
+"""Samples from the start in which a drive's strongest line is looked for."""
 
 EDGE = 16
 """Samples at either end of a thinned channel that its filter has touched."""
@@ -203,20 +210,19 @@ def _grid(clock: Channel, start: float, end: float, axes: tuple[str, ...], devic
 
 def strongest_line(values: Array, rate: float) -> float:
     """Frequency of the strongest line [Hz], 0 where nothing alternates."""
-    part = values[: 1 << 17] - values[: 1 << 17].mean()
-    if part.std() < 1e-3 * (abs(values[: 1 << 17].mean()) + 1e-300):
+    part = values[:SEEN]
+    if part.std() < 1e-3 * (abs(part.mean()) + 1e-300):
         return 0.0
-    spectrum = np.abs(np.fft.rfft(part * np.hanning(part.size)))
-    return float(np.argmax(spectrum) * rate / part.size)
+    return float(np.argmax(periodogram(part - part.mean())) * rate / part.size)
 
 
-def _keeps_to(line: float, values: Array, rate: float) -> bool:
-    """Whether what alternates is a tone and its overtones, not a sweep, many tones or noise."""
-    power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(values.size))) ** 2
-    first = line / rate * values.size
-    overtones = np.round(first * np.arange(1, int(power.size / first))).astype(int)
-    near = np.unique(np.add.outer(overtones, np.arange(-3, 4)).ravel())
-    return bool(power[near[near >= 0]].sum() > STEADY * power.sum())
+def is_steady(line: float, values: Array, rate: float) -> bool:
+    """Whether what alternates is a tone at ``line`` [Hz] and its overtones, not a sweep, many tones or noise."""
+    part = values[:SEEN]
+    power, overtone = periodogram(part - part.mean()), np.arange(1, OVERTONES + 1)
+    far = np.abs(np.arange(power.size)[:, None] - overtone * line * part.size / rate)
+    near = np.any(far <= 2.0 + 0.5 * overtone, axis=1)  # the window is two wide, the line known to half a bin
+    return bool(power[near].sum() > STEADY * power.sum())
 
 
 def _voltage(channels: list[Channel], rest: float, start: float, step: float, n: int) -> Array:
@@ -330,7 +336,7 @@ def _scales(device: Device, name: str, inputs: Inputs, outputs: tuple[Output, ..
     sensed = next((o for o in outputs if o.kind == "sense" and name in o.axes), outputs[0])
     follows = not parametric and 0.8 < strongest_line(sensed.data, 1 / sensed.step) / (line or np.inf) < 1.25
     rate = np.pi * line if parametric and line else 2 * np.pi * line if line else resonance
-    if line and not _keeps_to(line, voltage, 1 / inputs.step):
+    if line and not is_steady(line, voltage, 1 / inputs.step):
         rate = resonance  # where it moves most
     if not (0.5 < rate / resonance < 2.0 or (follows and rate < resonance)):  # a stage far below its resonance follows
         rate = resonance

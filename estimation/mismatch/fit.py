@@ -89,6 +89,10 @@ class Comparison:
         self.rows, self.held = keep & ~held, keep & held
         self._whitened: dict[tuple[int, str, str, float], Array] = {}
 
+    def fitted(self, stop: float) -> Mask:
+        """Rows of a fit up to the fraction ``stop`` of the recordings: short of where the whitening feels that end."""
+        return self.rows & (self.time < 0.98 * stop) if stop < 1.0 else self.rows
+
     def residual(self, model: Model, x: Array, stop: float = 1.0) -> Array:
         """Whitened data minus model, shape (N,); beyond ``stop`` it is zero.
 
@@ -176,7 +180,7 @@ def solve(
         hopeless: stop when chi-square is still above and no longer comes down towards it.
     """
     steps = np.full(x.size, 1e-4) if steps is None else steps
-    rows = comparison.rows & (comparison.time < stop - (0.02 * stop if stop < 1.0 else -1.0))
+    rows = comparison.fitted(stop)
     precision = model.precision
     residual = comparison.residual(model, x, stop)
     value = residual[rows] @ residual[rows] + precision @ (x * x)
@@ -213,10 +217,18 @@ def solve(
             jacobian = comparison.jacobian(model, x, residual, steps, stop)
             if turn == turns or (turn > 4 and gain < 0.2 * (value - hopeless)):
                 break
-    return made_fit(comparison, model, x, residual, jacobian, rows)
+    return _made(comparison, model, x, residual, jacobian, rows)
 
 
-def made_fit(comparison: Comparison, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:
+def unmoved(comparison: Comparison, model: Model, x: Array, stop: float = 1.0) -> Fit:
+    """The model at ``x`` as it stands, for what is first order around it."""
+    residual, steps = comparison.residual(model, x, stop), np.full(x.size, 1e-4)
+    for _ in range(2):  # the second time with steps of the right size
+        jacobian = comparison.jacobian(model, x, residual, steps, stop)
+    return _made(comparison, model, x, residual, jacobian, comparison.fitted(stop))
+
+
+def _made(comparison: Comparison, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:
     """A fit with its evidence by Laplace's method: the priors' widths price every free number."""
     chi2, penalty = float(residual[rows] @ residual[rows]), float(model.precision @ (x * x))
     information = jacobian[rows].T @ jacobian[rows]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import Comparison, Fit, made_fit, solve
+from estimation.mismatch.fit import Comparison, Fit, solve, unmoved
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.screen import PROMISING, Screened, from_starts, screen, stepped
@@ -173,14 +173,13 @@ def race(
         early: fits of the nominal model over the windows ``stops``.
     """
     followed, reached, base, brink = _brink(comparison, nominal, early, stops)
-    field = sorted(screen(comparison, base, candidates, brink), key=lambda each: -each.gain)
+    growing = [each for each in candidates if reached and each.term.seeds]
+    others = [each for each in candidates if not (reached and each.term.seeds)]
+    field = sorted(screen(comparison, base, others, brink), key=lambda each: -each.gain)
     choosy = base.rows.sum() > MANY_SAMPLES
     named, _ = _apart(field)
     named = [each for i, each in enumerate(named) if not choosy or i < STARTERS or each.gain > 0.5 * field[0].gain]
-    growing = [each for each in candidates if each.term.seeds]
-    if reached and growing:
-        named = [each for each in named if not each.candidate.term.seeds]
-        named += _sown(comparison, nominal, followed, growing, brink)
+    named += _sown(comparison, nominal, followed, growing, brink)
     _, free = _apart(field[:STARTERS])
     later = [stop for stop in stops if stop > brink]
     tracks = list(_eased([reached, brink, *later])) if reached else [brink, *_eased([brink, *later])]
@@ -204,11 +203,7 @@ def _sown(
 
     Around the nominal values that follow as yet: values bent to what a mode does over the window imitate it.
     """
-    x = nominal.embed(followed.model, followed.x)
-    residual = comparison.residual(nominal, x, brink)
-    jacobian = comparison.jacobian(nominal, x, residual, np.full(x.size, 1e-4), brink)
-    rows = comparison.rows & (comparison.time < brink)
-    straying = made_fit(comparison, nominal, x, residual, jacobian, rows)
+    straying = unmoved(comparison, nominal, nominal.embed(followed.model, followed.x), brink)
     for starts in from_starts(comparison, straying, growing, brink):
         size = starts[0].model.index("term", starts[0].candidate.key, starts[0].candidate.term.free[0].name)
         for each in {start.x[size]: start for start in sorted(starts, key=lambda start: start.gain)}.values():
@@ -286,21 +281,31 @@ def _raced(
             continue
         if fits[0].chi2 > bar:
             return []
-        if len(fits) > FINALISTS and fits[FINALISTS].evidence < fits[0].evidence + NO_VERDICT:
-            reached, level = ahead.pop(), now
-            continue  # nothing has shown: all go on as they came, a mode that will grow with what it grows from
-        best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
-        margin = max(NO_VERDICT, 0.5 * (worst - best))
-        kept = [fit for fit in fits if fit.evidence < best + margin]
-        if now > EXPLAINED:  # of what explains little yet, being ahead is no merit
-            kept = fits[: max(FINALISTS, len(kept))]
-        # What leads with a sign that physics forbids goes on with the other: a ringing mode fits with both.
-        running = [(fit.model, _mirrored(fit)) for fit in fits if not possible(fit) and fit.evidence <= best]
-        kept = [fit for fit in kept if possible(fit) or fit.evidence > best]
-        running += [(fit.model, fit.x) for fit in (kept[:FINALISTS] if 4 * stop > stops[-1] else kept)]
         reached, level = ahead.pop(), now
+        if len(fits) <= FINALISTS or fits[FINALISTS].evidence > fits[0].evidence + NO_VERDICT:
+            running = _kept(fits, now > EXPLAINED, 4 * stop > stops[-1])
+        # else nothing has shown: all go on as they came, a mode that will grow with what it grows from
+    # the best alone of a candidate that ran from several starts
     best_of = {fit.model.candidates[-1].key: fit for fit in reversed(fits) if possible(fit)}
     return list(best_of.values())
+
+
+def _kept(fits: list[Fit], unexplained: bool, few: bool) -> list[tuple[Model, Array]]:
+    """Those of a race, the best first, that run on: by their evidence, or the first few.
+
+    Args:
+        unexplained: even the best explains little yet: being ahead is no merit.
+        few: at most ``FINALISTS``.
+    """
+    best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
+    margin = max(NO_VERDICT, 0.5 * (worst - best))
+    kept = [fit for fit in fits if fit.evidence < best + margin]
+    if unexplained:
+        kept = fits[: max(FINALISTS, len(kept))]
+    # What leads with a sign that physics forbids goes on with the other: a ringing mode fits with both.
+    mirrored = [(fit.model, _mirrored(fit)) for fit in fits if not possible(fit) and fit.evidence <= best]
+    kept = [fit for fit in kept if possible(fit) or fit.evidence > best]
+    return mirrored + [(fit.model, fit.x) for fit in (kept[:FINALISTS] if few else kept)]
 
 
 def _mirrored(fit: Fit) -> Array:

@@ -100,7 +100,7 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     comparison = Comparison(runs, _quietest(_by_hum(comparison, early[-1])))
     nominal = solve(comparison, model, early[-1].x)
     named = list(terms.values())
-    states = [_State(comparison, nominal, nominal, {})]
+    states = [_State(comparison, nominal, with_hum(comparison, nominal), {})]
     states += _extended(states[0], [*named, *FREE.values()], early, stops, say)
     found = states[-1]
     if _is_free(found.best) and found.nominal.held_chi2 > LARGE and found.best.held_chi2 > ADEQUATE:
@@ -133,7 +133,7 @@ def _extended(
     """The states that a search passes as it takes up ``terms``, one after the other."""
     comparison, nominal, best, rivals = state.comparison, state.nominal, state.best, dict(state.rivals)
     for _ in range(MOST_EFFECTS - len(best.model.candidates)):
-        best = with_line(comparison, with_hum(comparison, best))
+        best = with_line(comparison, best)
         taken = {each.key for each in best.model.candidates}
         adequate = bool(rivals) and best.held_chi2 < ADEQUATE
         pool = [each for each in terms if not (adequate and each.effect in FREE)]
@@ -240,7 +240,8 @@ def needed_only(comparison: Comparison, fit: Fit) -> Fit:
     with every term and without: in a short recording a drift and the wrong mains look like the right one.
     """
     fit = with_hum(comparison, fit)
-    for each in fit.model.candidates if len(fit.model.candidates) > 1 else ():
+    several = len(fit.model.candidates) > 1
+    for each in fit.model.candidates if several else ():
         less = with_hum(comparison, without(comparison, fit, each))
         if less.evidence - fit.evidence < LEAD_OVER_NOTHING:
             return needed_only(comparison, less)

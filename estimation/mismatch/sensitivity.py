@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.experiment import Output
-from estimation.mismatch.fit import Comparison, Fit, made_fit
+from estimation.mismatch.fit import Comparison, Fit, unmoved
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.noise import Whitener, flat_psd, whitener
 from estimation.mismatch.screen import all_candidates, amplitudes, from_starts
@@ -133,10 +133,7 @@ def linearised(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) 
     ]
     made = Model(runs, model.device, model.candidates, model.mains)
     comparison = Comparison(runs, whiteners)
-    residual, steps = comparison.residual(made, x), np.full(x.size, 1e-4)
-    for _ in range(2):  # the second time with steps of the right size
-        jacobian = comparison.jacobian(made, x, residual, steps)
-    return comparison, made_fit(comparison, made, x, residual, jacobian, comparison.rows)
+    return comparison, unmoved(comparison, made, x)
 
 
 def stated_whitener(output: Output) -> Whitener:
