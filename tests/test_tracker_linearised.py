@@ -1,12 +1,14 @@
 """The tracker's compiled filter and smoother against slow ones; what a linearisation serves for."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import noisy, prepared_of
+from worlds import blocks_of, noisy, prepared_of
 
-from estimation.tracker import track
+from benchmarks.clipped import transimpedance_world
+from estimation.tracker import signal, track
 from estimation.tracker.backward import kicks, run_smoother
 from estimation.tracker.linear import expected, predict, unmade
 from estimation.tracker.orbit import axis_law, turn_of
@@ -184,3 +186,17 @@ def test_a_trend_counts_as_what_it_makes_of_the_stiffness_over_a_block() -> None
     x = np.zeros(2 * STATES + 1)
     x[STATES + TREND] = 0.1
     assert change(x, np.zeros(x.size), 6e-4) == pytest.approx(6e-5)
+
+
+@pytest.mark.parametrize("share", [0.12, 0.15, 0.3])
+def test_the_sign_is_told_from_either_start_whatever_the_blocks(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signal, "DECAY_SHARE", share)
+    device, recording = transimpedance_world()
+    prepared = blocks_of(recording, device)
+    start = starting_belief(prepared, device)
+    turned = start.x.copy()
+    turned[PHASE] += np.pi
+    told = [signed(prepared, each) for each in (start, replace(start, x=turned))]
+    assert [sure for _, (sure,) in told] == ["known: the combs' offset theta_th"] * 2
+    apart = told[0][0].x[PHASE] - told[1][0].x[PHASE]
+    assert np.exp(1j * apart) == pytest.approx(1.0)

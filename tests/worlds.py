@@ -77,7 +77,11 @@ def noisy(seed: int, sd: float = 0.01386) -> Recording:
 @cache
 def prepared_of(seed: int) -> Prepared:
     """The blocks of ``noisy``."""
-    device, recording = devices.load("imaging"), noisy(seed)
+    return blocks_of(noisy(seed), devices.load("imaging"))
+
+
+def blocks_of(recording: Recording, device: Device) -> Prepared:
+    """The blocks of a recording's only sense signal."""
     (sense,) = senses(recording, device)
     references = {n: reference_of(recording, device, n, sense.channel, True) for n in sense.axes}
     return prepare(recording, device, sense, references)

@@ -28,6 +28,8 @@ UNKNOWN = (10.0, 3.0)  # the same at which nothing is known: without data an uns
 TRIES = 5
 RATES = 5  # of an axis, see set_rates
 NONLINEAR = 2e-3  # step of phase [rad], ln A or anything else, see change, after which a block is linearised anew
+STRAIGHT = 1e-5  # rad: what slow rates straight in the state may be off by over a step, see _parts
+MOST_PARTS = 16
 
 
 def padded(states: int) -> int:
@@ -230,17 +232,36 @@ def change(x, about, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _go(law, signal, k, a, h, walk, linear, x, P, taken):  # type: ignore[no-untyped-def]
+def _parts(rates, h):  # type: ignore[no-untyped-def]
+    """Parts of a step of ``h`` seconds over which the slow rates are straight enough in the state.
+
+    One but for what follows a switch: there phase and amplitude run to where the new drive holds them.
+    """
+    bent = (abs(rates[1]) + abs(rates[2])) * h * (abs(rates[0]) * h) ** 2 / 6.0
+    return int(np.ceil(min(np.sqrt(bent / STRAIGHT), MOST_PARTS))) if bent > STRAIGHT else 1
+
+
+@njit(cache=True, error_model="numpy")
+def _go(laws, signal, k, a, h, walk, linear, x, P, taken):  # type: ignore[no-untyped-def]
     """Axis ``a`` over ``h`` seconds of block k's drive, in place on the whole state and its covariance."""
-    at = a * STATES
+    at, law = a * STATES, law_of(laws[a])
     own, about, rates = x[at : at + STATES], linear.about[k, at : at + STATES], linear.rates[k, a]
     if not change(own, about, signal.step) < NONLINEAR:
         about = own.copy()
         rates = rates_of(law, own, signal.w[k, a], signal.force[k, a])
-    flow(rates, about, own, h, taken)
-    carried(P[at : at + STATES], taken, h)
-    carried(P.T[at : at + STATES], taken, h)
-    _walked(P[at : at + STATES, at : at + STATES], taken, h, walk)
+    parts = _parts(rates, h)
+    for i in range(parts):
+        further = taken if i == 0 else np.empty((2, DAMPING + 1))
+        if i > 0:
+            bound(laws, signal, x)
+            about = own.copy()
+            rates = rates_of(law, own, signal.w[k, a], signal.force[k, a])
+        flow(rates, about, own, h / parts, further)
+        carried(P[at : at + STATES], further, h / parts)
+        carried(P.T[at : at + STATES], further, h / parts)
+        _walked(P[at : at + STATES, at : at + STATES], further, h / parts, walk)
+        if i > 0:
+            _composed(taken, further, i * h / parts)
 
 
 @njit(cache=True, error_model="numpy")
@@ -252,7 +273,7 @@ def leave(laws, signal, k, x, P, walk, linear, taken):  # type: ignore[no-untype
     """
     for a in range(len(laws)):
         law, at, h = law_of(laws[a]), a * STATES, signal.step * signal.share[k, a]
-        _go(law, signal, k, a, h, walk[a], linear, x, P, taken[a])
+        _go(laws, signal, k, a, h, walk[a], linear, x, P, taken[a])
         # against the next block's reference, continued straight to where its drive begins
         psi = signal.psi[k, a] + h * signal.w[k, a]
         x[at + PHASE] += psi - (signal.psi[k + 1, a] - (signal.step - h) * signal.w[k + 1, a])
@@ -281,7 +302,7 @@ def arrive(laws, signal, k, x, P, walk, offset_walk, linear, taken):  # type: ig
     later = np.empty((2, DAMPING + 1))
     for a in range(len(laws)):
         h = signal.step * (1.0 - signal.share[k, a])
-        _go(law_of(laws[a]), signal, k + 1, a, h, walk[a], linear, x, P, later)
+        _go(laws, signal, k + 1, a, h, walk[a], linear, x, P, later)
         _composed(taken[a], later, signal.step - h)
     bound(laws, signal, x)
     offset = STATES * len(laws)

@@ -16,7 +16,7 @@ from estimation.tracker.censored import expanded_about
 from estimation.tracker.orbit import MOVED, law_of, turn_of
 from estimation.tracker.signal import Prepared, prepare
 from estimation.tracker.smoother import LOST, SIGNIFICANT
-from estimation.tracker.step import DAMPING, FLOOR, LOG, PHASE, RATES, STATES, STIFFNESS, Signal, flow, rates_of
+from estimation.tracker.step import DAMPING, FLOOR, LOG, PHASE, STATES, STIFFNESS, Signal, flow, rates_of
 from estimation.tracker.switches import EDGE
 from estimation.tracker.tuning import (
     START_WALK,
@@ -265,7 +265,7 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     """The start with each axis's sign as its odd harmonics tell it over the first blocks, and what told it.
 
     An even capacitance has no odd harmonics and leaves theta and -theta alike. Where there are some, they follow from
-    the even ones but for their sign.
+    the even ones but for their sign: with the wrong one the first blocks are far less likely.
     """
     axes = len(prepared.laws)
     if not is_capacitive(prepared.sense.readout):
@@ -274,21 +274,23 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
         return start, ["ambiguous"] * axes
     signal = window(prepared.signal, 0, PROBED)
     walk = densities(np.tile(START_WALK, (axes, 1)))
-    states = filtered(prepared, signal, linear.unmade(signal), start, walk).blocks.states
-    agreement, weight = np.zeros(axes), np.zeros(axes)
-    for k, state in enumerate(states):
-        unroot = signal.unroots[signal.geometry[k]]
-        fitted, variances = unroot @ signal.whitened[k], signal.noise_var[k] * (unroot**2).sum(axis=1)
-        told = linear.expected(prepared.rows, signal, k, state, np.empty((axes, RATES), np.complex128))[0][0]
-        for i, (a, order) in enumerate(signal.lines):
-            pair = slice(1 + 2 * i, 3 + 2 * i)
-            if order % 2 and (variances[pair] > 0.0).all():
-                agreement[a] += float(np.sum(fitted[pair] * told[pair] / variances[pair]))
-                weight[a] += float(np.sum(told[pair] ** 2 / variances[pair]))
-    known = np.abs(agreement) > SIGNIFICANT * np.sqrt(np.maximum(weight, 1.0))
-    x = start.x.copy()
-    x[PHASE::STATES][:axes] += np.where(known & (agreement < 0.0), np.pi, 0.0)
-    return replace(start, x=x), ["known: the combs' offset theta_th" if sure else "ambiguous" for sure in known]
+
+    def likelihood(belief: Belief) -> float:
+        with np.errstate(all="ignore"):  # the wrong sign may burst
+            found = filtered(prepared, signal, linear.unmade(signal), belief, walk).log_likelihood
+        return found if np.isfinite(found) else -np.inf
+
+    own, told = likelihood(start), []
+    for a in range(axes):
+        x = start.x.copy()
+        x[a * STATES + PHASE] += np.pi
+        turned = replace(start, x=x)
+        other = likelihood(turned)
+        sure = 2.0 * abs(other - own) > SIGNIFICANT**2
+        told.append("known: the combs' offset theta_th" if sure else "ambiguous")
+        if sure and other > own:
+            start, own = turned, other
+    return start, told
 
 
 def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, float, int], sign: str) -> AxisMotion:
