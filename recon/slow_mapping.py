@@ -20,10 +20,9 @@ from scanner.errors import BadInput
 PLACES = 23  # bits of a place across the field: all that single precision has
 ROUNDED = 5.0  # roundings of half of the last bit in a place, in amplitudes: of phasors, factors and sums
 POWERS = 20.0  # the same for a harmonic, whose phasor is a power of the first one's
-PART = 128  # samples whose phasors one table holds, a power of two
 TOGETHER = 32  # segments added up at a time: what adding takes of the first cache, tables have to be fetched back into
 NEAR = 1e-7  # rad a sample by which a turn may be off its table's
-RAMP = np.arange(PART, dtype=np.float32)
+RAMP = np.arange(SEGMENT, dtype=np.float32)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -37,65 +36,78 @@ def _bits(pixels):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _tabulated(turn, re, im, table):  # type: ignore[no-untyped-def]
-    """Phasors of PART samples that begin at 1, the same times the sample's number, and their third and fifth powers.
+    """Phasors of a segment that begin at 1, the same times the sample's number, and their third and fifth powers.
 
-    Returns the phasor after PART samples.
-
-    ``table``: shape (8 PART,), real and imaginary parts in turn, in one array so that nothing has to be told apart
+    ``table``: shape (8 SEGMENT,), real and imaginary parts in turn, in one array so that nothing has to be told apart
     before eight samples are taken together.
     """
-    far = doubled(turn, re, im)
-    for i in range(PART):
+    doubled(turn, re, im)
+    for i in range(SEGMENT):
         c, s = np.float32(re[i]), np.float32(im[i])
         c2, s2 = c * c - s * s, np.float32(2.0) * c * s
         c3, s3 = c * c2 - s * s2, c * s2 + s * c2
-        table[i], table[PART + i] = c, s
-        table[2 * PART + i], table[3 * PART + i] = RAMP[i] * c, RAMP[i] * s
-        table[4 * PART + i], table[5 * PART + i] = c3, s3
-        table[6 * PART + i], table[7 * PART + i] = c3 * c2 - s3 * s2, c3 * s2 + s3 * c2
-    return far
+        table[i], table[SEGMENT + i] = c, s
+        table[2 * SEGMENT + i], table[3 * SEGMENT + i] = RAMP[i] * c, RAMP[i] * s
+        table[4 * SEGMENT + i], table[5 * SEGMENT + i] = c3, s3
+        table[6 * SEGMENT + i], table[7 * SEGMENT + i] = c3 * c2 - s3 * s2, c3 * s2 + s3 * c2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _slip(turn, kept, re, im, table):  # type: ignore[no-untyped-def]
+    """By how much a turn is off ``kept``, shape (1,), which ``table`` is made for; where it is much, both change."""
+    slip = (turn * kept[0].conjugate()).imag
+    if abs(slip) < NEAR:
+        return slip
+    kept[0] = turn
+    _tabulated(turn, re, im, table)
+    return 0.0
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def _lines(axis, s):  # type: ignore[no-untyped-def]
+    """Of segment ``s`` exp(i u), the first harmonic and its change a sample, the third and fifth in the middle.
+
+    Numbers and no arrays: the references of an array that is handed on are counted, which took a third of the time.
+    """
+    first, step = axis[2][s, 0], axis[3][s, 0].imag
+    third = axis[2][s, 1] + 0.5 * SEGMENT * axis[3][s, 1]
+    fifth = axis[2][s, 2] + 0.5 * SEGMENT * axis[3][s, 2]
+    return axis[0][s], first, step, third, fifth
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
-def _placed(axis, s, scale, across, kept, re, im, table, out):  # type: ignore[no-untyped-def]
-    """Places of segment ``s`` in units of 2^-bits pixels into ``out``, float32; False where they may be off by a unit.
+def _placed(line, scale, across, slip, table, out):  # type: ignore[no-untyped-def]
+    """Places of a segment in units of 2^-bits pixels into ``out``, float32; False where they may be off by a unit.
 
-    As ``angle.segment_angles`` for harmonics 1, 3 and 5. ``axis``: arrays of ``Segments``. ``scale``: units by radian,
-    ``across``: units in the field. ``kept``: turn that ``table`` is made for and its power after PART samples, shape
-    (2,); a turn next to it bends the first harmonic's ramp.
+    As ``angle.segment_angles`` for harmonics 1, 3 and 5. ``line``: see ``_lines``. ``scale``: units by radian.
+    ``across``: units in the field. ``slip``: see ``_slip``; it bends the first harmonic's ramp.
     """
-    firsts, turns, lines, steps = axis
-    first, third, fifth, step = lines[s, 0], lines[s, 1], lines[s, 2], steps[s, 0].imag
-    third, fifth = third + 0.5 * SEGMENT * steps[s, 1], fifth + 0.5 * SEGMENT * steps[s, 2]
+    u, first, step, third, fifth = line
     size, harmonics = abs(first.imag) + SEGMENT * abs(step), _size(third) + _size(fifth)
     if not scale * (ROUNDED * size + POWERS * harmonics) + across < 1 << (PLACES + 2):  # or is not a number
         return False
-    turn = turns[s]
-    slip = (turn * kept[0].conjugate()).imag
-    if not abs(slip) < NEAR:
-        kept[0], slip = turn, 0.0
-        kept[1] = _tabulated(turn, re, im, table)
-    far = kept[1] * (1.0 + 1j * PART * slip)
-    middle, u = np.float32(0.5 * across), firsts[s]
-    for at in range(0, SEGMENT, PART):
-        u2 = u * u
-        one = 1j * scale * (first.imag + at * step) * u
-        three, five = scale * third * u2 * u, scale * fifth * u2 * u2 * u
-        ramp = 1j * (scale * step * u + slip * one)
-        a1, b1, a3, b3 = np.float32(one.real), np.float32(one.imag), np.float32(three.real), np.float32(three.imag)
-        a5, b5 = np.float32(five.real), np.float32(five.imag)
-        ramp_a, ramp_b = np.float32(ramp.real), np.float32(ramp.imag)
-        for i in range(PART):  # one term after the other: each is a product and a sum in one instruction
-            place = ramp_a * table[2 * PART + i]
-            place -= ramp_b * table[3 * PART + i]
-            place += a3 * table[4 * PART + i]
-            place -= b3 * table[5 * PART + i]
-            place += a5 * table[6 * PART + i]
-            place -= b5 * table[7 * PART + i]
-            place += a1 * table[i]
-            place -= b1 * table[PART + i]
-            out[at + i] = middle + place
-        u *= far
+    # in real numbers: a factor that is real or imaginary would be multiplied as a complex one
+    c, d = u.real, u.imag
+    c2, d2 = c * c - d * d, 2.0 * c * d
+    c3, d3 = c * c2 - d * d2, c * d2 + d * c2
+    c5, d5 = c3 * c2 - d3 * d2, c3 * d2 + d3 * c2
+    a1, b1, grows = -scale * first.imag * d, scale * first.imag * c, scale * step
+    ramp_a, ramp_b = np.float32(-grows * d - slip * b1), np.float32(grows * c + slip * a1)
+    a3 = np.float32(scale * (third.real * c3 - third.imag * d3))
+    b3 = np.float32(scale * (third.real * d3 + third.imag * c3))
+    a5 = np.float32(scale * (fifth.real * c5 - fifth.imag * d5))
+    b5 = np.float32(scale * (fifth.real * d5 + fifth.imag * c5))
+    a1, b1, middle = np.float32(a1), np.float32(b1), np.float32(0.5 * across)
+    for i in range(SEGMENT):  # one term after the other: each is a product and a sum in one instruction
+        place = ramp_a * table[2 * SEGMENT + i]
+        place -= ramp_b * table[3 * SEGMENT + i]
+        place += a3 * table[4 * SEGMENT + i]
+        place -= b3 * table[5 * SEGMENT + i]
+        place += a5 * table[6 * SEGMENT + i]
+        place -= b5 * table[7 * SEGMENT + i]
+        place += a1 * table[i]
+        place -= b1 * table[SEGMENT + i]
+        out[i] = middle + place
     return True
 
 
@@ -130,16 +142,18 @@ def _accumulate(x, y, intensity, half_x, half_y, sums, counts, cells):  # type: 
     across_x, across_y = float(width << bits_x), float(height << bits_y)
     scale_x, scale_y = 0.5 * across_x / half_x, 0.5 * across_y / half_y
     theta_x, theta_y, index = np.empty(SEGMENT), np.empty(SEGMENT), np.empty(TOGETHER * SEGMENT, np.int32)
-    re, im, part_re, part_im = np.empty(FINE), np.empty(FINE), np.empty(PART), np.empty(PART)
+    re, im, part_re, part_im = np.empty(FINE), np.empty(FINE), np.empty(SEGMENT), np.empty(SEGMENT)
     place_x, place_y = np.empty(SEGMENT, np.float32), np.empty(SEGMENT, np.float32)
-    table_x, table_y = np.empty(8 * PART, np.float32), np.empty(8 * PART, np.float32)
-    turn_x, turn_y = np.full(2, np.nan + 0j), np.full(2, np.nan + 0j)
+    table_x, table_y = np.empty(8 * SEGMENT, np.float32), np.empty(8 * SEGMENT, np.float32)
+    turn_x, turn_y = np.full(1, np.nan + 0j), np.full(1, np.nan + 0j)
     odd = x[2].shape[1] == 3 and y[2].shape[1] == 3
     for some in range(0, x[0].size, TOGETHER):
         for s in range(some, min(some + TOGETHER, x[0].size)):
             values, own = intensity[s * SEGMENT : (s + 1) * SEGMENT], index[(s - some) * SEGMENT :]
-            told = odd and _placed(x, s, scale_x, across_x, turn_x, part_re, part_im, table_x, place_x)
-            told = told and _placed(y, s, scale_y, across_y, turn_y, part_re, part_im, table_y, place_y)
+            slip_x = _slip(x[1][s], turn_x, part_re, part_im, table_x)
+            slip_y = _slip(y[1][s], turn_y, part_re, part_im, table_y)
+            told = odd and _placed(_lines(x, s), scale_x, across_x, slip_x, table_x, place_x)
+            told = told and _placed(_lines(y, s), scale_y, across_y, slip_y, table_y, place_y)
             if not (told and _found(place_x, place_y, values, width, height, bits_x, bits_y, own)):
                 segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, theta_x)
                 segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, theta_y)

@@ -59,15 +59,15 @@ def test_counts_and_sums_are_those_of_the_angles(case: str, dtype: type) -> None
 def test_single_precision_is_off_by_less_than_is_looked_at_again() -> None:
     x, _, grid = CASES["steady"]
     own = x.segments(0, SIZE)
-    table, place, room = np.empty(8 * slow_mapping.PART, np.float32), np.empty(256, np.float32), np.empty(256)
-    kept = np.full(2, np.nan + 0j)
+    table, place, room = np.empty(8 * 256, np.float32), np.empty(256, np.float32), np.empty((2, 256))
+    kept = np.full(1, np.nan + 0j)
     units = 1 << 14  # by pixel: 400 of them stay below 2^23
     across, worst = float(grid.width * units), 0.0
     for s in range(0, own.first.size, 7):
         axis = own.first, own.turn, own.lines, own.line_steps
         scale = 0.5 * across / grid.half_angle_x
-        parts = room[:128], room[128:]
-        assert slow_mapping._placed(axis, s, scale, across, kept, *parts, table, place)
+        slip = slow_mapping._slip(own.turn[s], kept, *room, table)
+        assert slow_mapping._placed(slow_mapping._lines(axis, s), scale, across, slip, table, place)
         exact = x.read(s * 256, s * 256 + 256)
         error = place[: exact.size] - scale * exact - 200 * units
         worst = max(worst, float(np.abs(error).max()))
