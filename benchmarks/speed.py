@@ -121,7 +121,7 @@ def mapping() -> dict[str, float]:
         "slow_float_samples": best(lambda: accumulate_slow(slow_x, slow_y, 0, values, grid), 15),
         "scatter_samples": best(lambda: scatter(index, intensity, cells), 15),
         "bincount": best(bincount, 3),
-        "binned": best(lambda: binned_statistic_2d(y, x, intensity, "sum", [edges, edges]), 1),
+        "binned": best(lambda: binned_statistic_2d(y, x, intensity, "sum", [edges, edges]), 3),
     }
     return {
         **{f"mapping.{key}_per_s": size / spent for key, spent in seconds.items() if key.endswith("samples")},
