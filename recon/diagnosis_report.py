@@ -258,7 +258,7 @@ def evidence_table(rounds: Sequence[Round]) -> list[list[str]]:
     rows = []
     for each in rounds:
         rows.append([each.candidate.key, "0", f"{each.before.evidence - each.after.evidence:.1f}"])
-        rows += [[other.key, f"{lead:.1f}", ""] for lead, other in each.leads]
+        rows += [[lead.candidate.key, f"{lead.behind:.1f}", ""] for lead in each.leads]
     return rows
 
 

@@ -26,7 +26,7 @@ def distances_from(comparison: Comparison, fit: Fit, candidate: Candidate, rival
 
     A rival that changes nothing leaves all of it.
     """
-    own = np.array([f.kind == "term" and f.owner == candidate.key for f in fit.model.free])
+    own = np.array([f.kind in ("term", "hidden") and f.owner == candidate.key for f in fit.model.free])
     signal, rest = _signal(comparison, fit, candidate)[fit.rows], fit.jacobian[np.ix_(fit.rows, ~own)]
     found = []
     for blocks in columns(comparison, fit, rivals):

@@ -162,17 +162,20 @@ def _finding(found: Search, each: Round) -> Finding:
     unknown = candidate.term.effect in FREE
     effect = _name(candidate)
     options = {effect: 1.0}
-    for lead, other in each.leads:
-        name = _name(other)
-        options[name] = max(options.get(name, 0.0), float(np.exp(-0.5 * np.clip(lead, 0.0, 1400.0))))
+    for lead in each.leads:
+        name = _name(lead.candidate)
+        options[name] = max(options.get(name, 0.0), float(np.exp(-0.5 * np.clip(lead.behind, 0.0, 1400.0))))
     nothing = float(np.exp(-0.5 * np.clip(each.before.evidence - each.after.evidence, 0.0, 1400.0)))
     total = sum(options.values()) + nothing
     distance = {} if unknown else _distances(found, each)
-    near = {_name(other): distance[other.key] for _, other in reversed(each.leads) if other.key in distance}
+    others = [lead.candidate for lead in each.leads]
+    near = {_name(other): distance[other.key] for other in reversed(others) if other.key in distance}
+    as_good = {_name(lead.candidate) for lead in each.leads if lead.worse < APART**2}
     rivals = tuple(
         Rival(name, weight / total, near.get(name))
         for name, weight in sorted(options.items(), key=lambda item: -item[1])
-        if name != effect and weight / total > 1e-4
+        # what fits as well, with more numbers, is improbable and yet not told apart
+        if name != effect and (weight / total > 1e-4 or name in as_good)
     )
     return Finding(
         axis=candidate.axis,
@@ -192,12 +195,18 @@ def _finding(found: Search, each: Round) -> Finding:
 
 
 def _distances(found: Search, each: Round) -> dict[str, float]:
-    """How far each named rival stands from what was found, by key [sigma]."""
+    """How far each named rival stands from what was found, by key [sigma].
+
+    By first order at the rival's usual shape, or by what its own best fit leaves, where that found a nearer one.
+    """
     taken = {other.key for other in found.final.model.candidates}
-    rivals = [other for _, other in each.leads if other.term.effect not in FREE and other.key not in taken]
-    return dict(
-        zip((r.key for r in rivals), distances_from(found.comparison, found.final, each.candidate, rivals), strict=True)
-    )
+    leads = [lead for lead in each.leads if lead.candidate.term.effect not in FREE and lead.candidate.key not in taken]
+    rivals = [lead.candidate for lead in leads]
+    first_order = distances_from(found.comparison, found.final, each.candidate, rivals)
+    return {
+        lead.candidate.key: min(distance, float(np.sqrt(max(lead.worse, 0.0))))
+        for lead, distance in zip(leads, first_order, strict=True)
+    }
 
 
 def _advice(found: Search, each: Round, distance: Mapping[str, float]) -> str | None:
@@ -206,8 +215,8 @@ def _advice(found: Search, each: Round, distance: Mapping[str, float]) -> str | 
     effect = candidate.term.effect
     close = {
         other.key: other
-        for lead, other in each.leads
-        if other.term.effect != effect and (lead < LEAD_OVER_NEXT or distance.get(other.key, np.inf) < APART)
+        for behind, other, _ in each.leads
+        if other.term.effect != effect and (behind < LEAD_OVER_NEXT or distance.get(other.key, np.inf) < APART)
     }
     said = []
     nearest = min(close, key=lambda key: distance.get(key, np.inf), default=None)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,22 @@ Array = NDArray[np.float64]
 TRIED = 4
 """Singles, and pairs, that are fitted."""
 
-Leads = tuple[tuple[float, Candidate], ...]
-"""Rivals of a term, each with its distance behind in -2 log evidence."""
+
+class Lead(NamedTuple):
+    """A rival of a term.
+
+    Attributes:
+        behind: its distance behind in -2 log evidence.
+        candidate: what it is.
+        worse: by how much its fit is worse, whatever the price of its numbers.
+    """
+
+    behind: float
+    candidate: Candidate
+    worse: float
+
+
+Leads = tuple[Lead, ...]
 
 SWAPS = 4
 """Exchanges of one term for another before they count as settled."""
@@ -101,7 +116,10 @@ def _start(fit: Fit, gone: Candidate, added: Sequence[Screened], estimate: Array
 
 def behind(best: Fit, others: Sequence[Fit]) -> Leads:
     """The newest terms of ``others``, each with its distance behind ``best``."""
-    return tuple((fit.evidence - best.evidence, fit.model.candidates[-1]) for fit in others)
+    least = best.chi2 + best.penalty
+    return tuple(
+        Lead(fit.evidence - best.evidence, fit.model.candidates[-1], fit.chi2 + fit.penalty - least) for fit in others
+    )
 
 
 def settled(comparison: Comparison, fit: Fit, pool: Sequence[Candidate], newest: int) -> Settled:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimation.mismatch.experiment import Run
 from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
-from estimation.mismatch.instead import Leads, behind, instead, settled
+from estimation.mismatch.instead import Lead, Leads, behind, instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import MAINS, Candidate, Model
 from estimation.mismatch.naming import LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
@@ -56,7 +56,7 @@ class Round:
     Attributes:
         candidate: what was added.
         before, after: fits without and with it, all else that was found in both, under the same noise.
-        leads: its rivals when it was found, each with its distance behind in -2 log evidence.
+        leads: its rivals when it was found.
     """
 
     candidate: Candidate
@@ -155,20 +155,22 @@ def _extended(
         close = sorted((fit for fit in close if possible(fit)), key=lambda fit: fit.evidence)
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
-        close = [fit for fit in close if convincing(comparison, before, fit)]
-        if not close:
+        found = next((fit for fit in close if convincing(comparison, before, fit)), None)
+        if found is None:
             yield _State(comparison, nominal, before, rivals)
             return
         named = [each for each in candidates if each.term.effect not in FREE]
-        found, leads = close[0], {close[0].model.candidates[-1].key: behind(close[0], close[1:])}
+        leads = _behind_newest(found, before, close)
         if _is_free(found):
             say("named terms in the free correction's place")
             comparison, before, found = _by_name(comparison, before, found, named)
+            close = []  # of another noise, if names were found
         if not _is_free(found) and found.chi2 < ASTRAY * found.rows.sum():
             # The first to be taken may have imitated all: where much is left, its place is open too.
             kept = len(best.model.candidates) if found.held_chi2 <= TRACKED else 0
             final = settled(comparison, found, named, len(found.model.candidates) - kept)
-            leads = {key: _merged(own, leads.get(key, ())) for key, own in final.leads.items()}
+            earlier = _behind_newest(final.fit, before, close)
+            leads = {key: _merged(own, earlier.get(key, ())) for key, own in final.leads.items()}
             found = final.fit
         rivals |= leads
         best = needed_only(comparison, found)
@@ -216,17 +218,26 @@ def _unnamed(state: _State) -> _State:
     if not others:
         return state
     found = needed_only(comparison, others[0])
-    leads = {found.model.candidates[-1].key: ((fit.evidence - others[0].evidence, weightiest),)}
+    worse = fit.chi2 + fit.penalty - others[0].chi2 - others[0].penalty
+    leads = {found.model.candidates[-1].key: (Lead(fit.evidence - others[0].evidence, weightiest, worse),)}
     return replace(state, best=found, rivals={**state.rivals, **leads})
+
+
+def _behind_newest(found: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, Leads]:
+    """Of those tried, the rivals of the one term that ``found`` has and ``before`` has not."""
+    old = {each.key for each in before.model.candidates}
+    new = [each.key for each in found.model.candidates if each.key not in old]
+    less_likely = [fit for fit in tried if fit.evidence > found.evidence and fit.model.candidates[-1].key not in new]
+    return {new[0]: behind(found, less_likely)} if len(new) == 1 else {}
 
 
 def _merged(*parts: Leads) -> Leads:
     """All rivals, each with its smallest distance, the nearest first."""
-    nearest: dict[str, tuple[float, Candidate]] = {}
-    for lead, candidate in (each for part in parts for each in part):
-        if candidate.key not in nearest or lead < nearest[candidate.key][0]:
-            nearest[candidate.key] = (lead, candidate)
-    return tuple(sorted(nearest.values(), key=lambda each: each[0]))
+    nearest: dict[str, Lead] = {}
+    for lead in (each for part in parts for each in part):
+        if lead.candidate.key not in nearest or lead.behind < nearest[lead.candidate.key].behind:
+            nearest[lead.candidate.key] = lead
+    return tuple(sorted(nearest.values(), key=lambda each: each.behind))
 
 
 def _is_free(fit: Fit) -> bool:

@@ -21,7 +21,7 @@ TERM = Term(
     stage="mechanics",
     equation="J θ'' + b θ' + k (θ ± q²/2) = τ,  q'' + (ω2/Q2) q' + ω2² (q + g θ q − s θ) = 0,  ± the sign of g",
     parameters=(
-        Parameter("g", "1/rad", lambda s: 0.08 / s.amplitude, starts=(1.0, -1.0, 2.0, -2.0)),
+        Parameter("g", "1/rad", lambda s: 0.08 / s.amplitude, starts=(0.4, -0.4, 1.0, -1.0, 2.0, -2.0)),
         Parameter("f2", "Hz", lambda s: s.rate / (4.0 * np.pi), kind="log", spread=0.01, starts=(-0.2, 0.0, 0.2)),
         Parameter("Q2", "1", lambda s: 80.0, kind="log", spread=0.5),
         # Next to nothing, but what grows needs something to grow from, and how much tells when it is there.
