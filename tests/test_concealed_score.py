@@ -41,6 +41,13 @@ def rate_of(name, *runs):
     return summary(runs)["rates"][name]
 
 
+def test_a_stage_must_be_right_where_no_look_alike_of_another_comes_near():
+    rivals = {"viscoelastic": 1.0, "drive-lag": 2.0}, {"viscoelastic": 1.0, "drive-lag": 7.0}
+    runs = [run(key(effects=[secret() | {"rivals": each}]), said(finding("drive-lag", "drive"))) for each in rivals]
+    assert rate_of("right stage, visible", *runs)["of"] == 2
+    assert rate_of("right stage, look-alikes of other stages clear", *runs) == share(0, 1)
+
+
 def test_false_alarms_are_counted_by_the_noises_colour():
     quiet, alarm = said(), said(finding())
     runs = [run(key("none"), quiet), run(key("none"), alarm), run(key("none", coloured=True), quiet)]

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.concealed.effects import CATALOGUE
+
 if TYPE_CHECKING:
     from benchmarks.concealed.score import Run
 
@@ -22,6 +24,8 @@ ALSO_CALLED = {
 """Names that a diagnosis may give to a key's parameter."""
 SIGN_FREE = {"k2", "theta_c"}
 """An even capacitance cannot know these signs; an angle channel can."""
+
+STAGES = {effect.name: effect.stage for effect in CATALOGUE}
 
 ABOUT = f"""# Sealed recordings
 
@@ -55,6 +59,16 @@ def visible(run: Run) -> bool:
 def clear(run: Run) -> bool:
     """Whether every hidden effect is far enough from its look-alikes to be named singly."""
     return visible(run) and all(effect.get("distance", np.inf) >= CLEAR for effect in run.key["effects"])
+
+
+def stage_clear(run: Run) -> bool:
+    """Whether of every hidden effect's nearest look-alikes those of another stage leave as much as a name needs."""
+    return visible(run) and all(
+        distance >= CLEAR
+        for effect in run.key["effects"]
+        for name, distance in effect.get("rivals", {}).items()
+        if STAGES[name] != effect["stage"]
+    )
 
 
 def right_name(run: Run) -> bool:
@@ -129,6 +143,7 @@ def summary(runs: Sequence[Run]) -> dict[str, Any]:
             "right name, one effect, any": rate(one, right_name),
             "named class holds the truth, visible": rate(filter(visible, one), right_class),
             "right stage, visible": rate(filter(visible, one), right_stage),
+            "right stage, look-alikes of other stages clear": rate(filter(stage_clear, one), right_stage),
             "both named, two effects, clear": rate(filter(clear, two), both_named),
             "both named, two effects, any": rate(two, both_named),
             "unknown and right stage, unlisted, clear": rate(filter(clear, unlisted), unknown_in_place),
