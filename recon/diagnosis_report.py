@@ -63,7 +63,12 @@ def _finding_section(finding: Finding, index: int, found: Search | None) -> Sect
     if finding.advice:
         text += f" To tell it from its rivals: {finding.advice}."
     rows = [[p.name, f"{p.value:.5g}", f"{p.ci95[0]:.5g} … {p.ci95[1]:.5g}", p.unit] for p in finding.parameters] + [
-        [f"rival: {r.effect}", f"{r.probability:.2%}", "" if r.distance is None else f"{r.distance:.1f} σ away", ""]
+        [
+            f"rival: {r.effect}",
+            f"{r.probability:.2%}" if r.probability > 1e-4 else "fits as well, with more numbers",
+            "" if r.distance is None else f"{r.distance:.1f} σ away",
+            "",
+        ]
         for r in finding.rivals
     ]
     figures = [_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []
