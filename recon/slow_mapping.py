@@ -150,10 +150,12 @@ def _accumulate(x, y, intensity, half_x, half_y, sums, counts, cells):  # type: 
     for some in range(0, x[0].size, TOGETHER):
         for s in range(some, min(some + TOGETHER, x[0].size)):
             values, own = intensity[s * SEGMENT : (s + 1) * SEGMENT], index[(s - some) * SEGMENT :]
-            slip_x = _slip(x[1][s], turn_x, part_re, part_im, table_x)
-            slip_y = _slip(y[1][s], turn_y, part_re, part_im, table_y)
-            told = odd and _placed(_lines(x, s), scale_x, across_x, slip_x, table_x, place_x)
-            told = told and _placed(_lines(y, s), scale_y, across_y, slip_y, table_y, place_y)
+            told = odd
+            if told:
+                slip_x = _slip(x[1][s], turn_x, part_re, part_im, table_x)
+                slip_y = _slip(y[1][s], turn_y, part_re, part_im, table_y)
+                told = _placed(_lines(x, s), scale_x, across_x, slip_x, table_x, place_x)
+                told = told and _placed(_lines(y, s), scale_y, across_y, slip_y, table_y, place_y)
             if not (told and _found(place_x, place_y, values, width, height, bits_x, bits_y, own)):
                 segment_angles(x[0][s], x[1][s], x[2][s], x[3][s], re, im, theta_x)
                 segment_angles(y[0][s], y[1][s], y[2][s], y[3][s], re, im, theta_y)

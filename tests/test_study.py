@@ -1,6 +1,7 @@
 """Blur studies: every cell once, none twice, none lost, and numbers that a single reconstruction gives too."""
 
 import csv
+import fcntl
 import json
 import os
 import signal
@@ -172,7 +173,6 @@ def group_lives(group: int) -> bool:
 
 
 def test_two_runs_do_not_share_a_folder(done: Path, capsys: pytest.CaptureFixture) -> None:
-    fcntl = pytest.importorskip("fcntl")
     with (done / "cells.jsonl").open("ab") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert main(["blur-study", str(done / "study.toml"), "-o", str(done)]) == 2

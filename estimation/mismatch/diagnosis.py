@@ -168,9 +168,9 @@ def _finding(found: Search, each: Round) -> Finding:
     nothing = float(np.exp(-0.5 * np.clip(each.before.evidence - each.after.evidence, 0.0, 1400.0)))
     total = sum(options.values()) + nothing
     distance = {} if unknown else _distances(found, each)
-    others = [lead.candidate for lead in each.leads]
-    near = {_name(other): distance[other.key] for other in reversed(others) if other.key in distance}
-    as_good = {_name(lead.candidate) for lead in each.leads if lead.worse < APART**2}
+    named = [lead for lead in each.leads if lead.candidate.key in distance]
+    near = {_name(lead.candidate): distance[lead.candidate.key] for lead in reversed(named)}
+    as_good = {_name(lead.candidate) for lead in named if lead.worse < APART**2}
     rivals = tuple(
         Rival(name, weight / total, near.get(name))
         for name, weight in sorted(options.items(), key=lambda item: -item[1])
@@ -214,9 +214,10 @@ def _advice(found: Search, each: Round, distance: Mapping[str, float]) -> str | 
     candidate = each.candidate
     effect = candidate.term.effect
     close = {
-        other.key: other
-        for behind, other, _ in each.leads
-        if other.term.effect != effect and (behind < LEAD_OVER_NEXT or distance.get(other.key, np.inf) < APART)
+        lead.candidate.key: lead.candidate
+        for lead in each.leads
+        if lead.candidate.term.effect != effect
+        and (lead.behind < LEAD_OVER_NEXT or distance.get(lead.candidate.key, np.inf) < APART)
     }
     said = []
     nearest = min(close, key=lambda key: distance.get(key, np.inf), default=None)
