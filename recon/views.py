@@ -24,6 +24,7 @@ UNVISITED = "#20405f"  # pixels the beam never reached; no grey of a picture
 MARK = "#e08a1e"  # pixels that a stretch of trouble touched
 FILL_FOR_THE_EYE = 2  # pixels
 NARROW = 4.6  # in: on a phone's screen its letters can be read still
+SHOWN = 2000  # stretches of a curve: more than a screen has columns
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}
 COLOURS = ("#2f6fb0", "#c8553d", "#3d8f5f", "#8a5fb0", "#b08a2f")
 
@@ -108,6 +109,18 @@ def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.0, 3.
         return drawing, drawing.subplots(rows, columns, squeeze=False)
 
 
+def thinned(time: Array, values: Array) -> tuple[Array, Array]:
+    """A curve as it is, or where it has more than SHOWN points the least and the largest of each of as many stretches.
+
+    A page on a long recording stays as light as one on a short one, and no outlier is lost.
+    """
+    if time.size <= SHOWN:
+        return time, values
+    edges = np.linspace(0, time.size, SHOWN, endpoint=False).astype(np.int64)
+    ends = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
+    return np.repeat(time[edges], 2), np.stack(ends, axis=1).ravel()
+
+
 def phase_figure(
     motions: Mapping[str, AxisMotion],
     bound: float,
@@ -125,11 +138,13 @@ def phase_figure(
     drawing, axes = figure(2 if lower else 1, 1, (NARROW, 4.4 if lower else 2.4))
     top = axes[0, 0]
     for (name, axis), colour in zip(motions.items(), COLOURS, strict=False):
-        t, phase = 1e3 * axis.time, np.degrees(axis.phase)
+        phase = np.degrees(axis.phase)
         phase = phase - 180.0 * np.round((phase[0] - np.degrees(next(iter(motions.values())).phase[0])) / 180.0)
         sd = np.degrees(axis.phase_sd)
-        top.fill_between(t, phase - 2 * sd, phase + 2 * sd, color=colour, alpha=0.2, lw=0)
-        top.plot(t, phase, color=colour, lw=1.2, label=name)
+        t, low = thinned(axis.time, phase - 2 * sd)
+        top.fill_between(1e3 * t, low, thinned(axis.time, phase + 2 * sd)[1], color=colour, alpha=0.2, lw=0)
+        t, phase = thinned(axis.time, phase)
+        top.plot(1e3 * t, phase, color=colour, lw=1.2, label=name)
     top.set(ylabel=f"phase of {name_of_axis} [°]")
     top.legend(**LEGEND, ncols=2)
     if lower:
@@ -137,7 +152,8 @@ def phase_figure(
         largest = np.degrees(bound)
         bottom.axhspan(-largest, largest, color="#3d8f5f", alpha=0.15, lw=0, label="±p/m")
         for (name, error), colour in zip(errors.items(), COLOURS, strict=False):
-            bottom.plot(1e3 * error.time, np.degrees(error.phase), color=colour, lw=1.0, label=f"{name}: true error")
+            t, phase = thinned(error.time, np.degrees(error.phase))
+            bottom.plot(1e3 * t, phase, color=colour, lw=1.0, label=f"{name}: true error")
         told = [each for each in seen if np.isfinite(each[2])]
         if told:
             t, value, sd = (np.array(column) for column in zip(*told, strict=True))

@@ -19,7 +19,7 @@ from recon.report import Section, by_hand, reconstruction_report, render
 from recon.summary import summarise
 from recon.sweeps import NONE, sweeps
 from recon.trouble import Trouble, samples, unknown
-from recon.views import marked
+from recon.views import SHOWN, marked, thinned
 
 SCRIPT = Path(recon.sweeps.__file__).parent / "templates" / "sweeps.js"
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -246,3 +246,14 @@ def test_several_detectors_are_averaged(result: Reconstruction, data: dict) -> N
     codes, own = (unpacked(each["intensity"], np.uint8).astype(int) for each in (several, data))
     assert np.abs(codes - own).max() <= 1
     assert several["limits"] == pytest.approx(data["limits"], abs=0.1)
+
+
+def test_a_long_curve_keeps_its_outliers_and_few_points() -> None:
+    time, values = np.arange(1_000_003.0), np.sin(np.arange(1_000_003) / 1e4)
+    values[123_456] = 7.0
+    at, shown = thinned(time, values)
+    assert at.size == shown.size == 2 * SHOWN
+    assert (shown.max(), shown.min()) == (7.0, values.min())
+    assert at[np.argmax(shown)] == pytest.approx(123_456, abs=1_000_003 / SHOWN)
+    assert (np.diff(at) >= 0.0).all()
+    assert np.array_equal(thinned(time[:SHOWN], values[:SHOWN])[1], values[:SHOWN])
