@@ -6,32 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_tracker import RATE
 from worlds import DRIVES, own_electrodes, with_sense
 
+from benchmarks.switches import instant_errors
 from estimation.reference import Reference
 from estimation.tracker import track
 from estimation.tracker.switches import pieces, shares, with_switches
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Constant, Sequence, Waveform
 from scanner.device import Amdm
-from scanner.motion import AxisMotion
-
-
-def instant_errors(axis: AxisMotion, angle: np.ndarray) -> np.ndarray:
-    """Phase error at each block's middle, modulo pi [rad]: the truth from two cycles about it, free to change."""
-    reference = axis.angle.motion.reference  # type: ignore[attr-defined]
-    out = []
-    for time, phase in zip(axis.time, axis.phase + reference.phase(axis.time), strict=True):
-        middle, half = round(time * RATE), round(RATE / reference.frequency)
-        s = np.arange(middle - half, middle + half + 1) / RATE - time
-        turn, window = 2 * np.pi * reference.frequency * s, np.cos(0.5 * np.pi * s * RATE / (half + 1)) ** 2
-        rows = [np.ones(s.size), *(g(n * turn) for n in (1, 3) for g in (np.sin, np.cos))]
-        table = np.array([*rows, rows[1] * turn, rows[2] * turn])
-        fit = np.linalg.solve((table * window) @ table.T, (table * window) @ angle[middle - half : middle + half + 1])
-        out.append(phase - np.angle(fit[1] + 1j * fit[2]))
-    return (np.array(out) + np.pi / 2) % np.pi - np.pi / 2
-
 
 STOPS = Sequence(((DRIVES["x"], 0.01), (Constant(0.0), 0.004), (DRIVES["x"], 0.016)))
 STEPS = Sequence(((DRIVES["x"], 0.0123), (replace(DRIVES["x"], frequency=DRIVES["x"].frequency + 25.0), 0.0177)))
