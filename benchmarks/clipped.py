@@ -17,7 +17,7 @@ from benchmarks.tracker_bound import DRIVES, device_with, wandering
 from estimation.signals import reference_of, senses
 from estimation.tracker import track
 from estimation.tracker.bound import UNBOUNDED, phase_bound
-from estimation.tracker.signal import prepare
+from estimation.tracker.signal import laid_out, prepare
 from estimation.tracker.step import PHASE
 from estimation.tracker.track import follow, signed, starting_belief
 from estimation.tracker.tuning import densities
@@ -83,7 +83,7 @@ def between_rails(noises: int) -> dict[str, dict[str, float]]:
     signal = quiet["sense_x"].read()
     (sense,) = senses(quiet, device)
     reference = reference_of(quiet, device, "x", sense.channel, True)
-    known = prepare(quiet, device, sense, {"x": reference})
+    known = prepare(laid_out(quiet, device, sense, {"x": reference}))
     start, _ = signed(known, starting_belief(known, device))
     states = follow(known, start, WALK[None])[0].states
     true = states[:, PHASE] + known.signal.psi[:, 0] - reference.phase(known.time)

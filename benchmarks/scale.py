@@ -1,6 +1,6 @@
 """What a reconstruction costs against its length, its pixels and its axes, and 10 s of 5 MS/s from the disk.
 
-python -m benchmarks.scale [disk|live|length|pixels|axes|longest ...]
+python -m benchmarks.scale [disk|disk_long|live|length|pixels|axes|longest ...]
 
 A scan without drift repeats itself every 0.1 s, so one simulated period makes a recording of any length. The same
 noise comes back with it, which costs a tracker neither more nor less. Each case runs in a process of its own, whose
@@ -156,16 +156,24 @@ def axes(folder: Path) -> Results:
 
 def disk(folder: Path) -> Results:
     """10 s of two axes from the disk by the command itself; a tenth of it before, to compile."""
-    done: Results = {}
+    from_disk(folder, 1.0)
+    return named("disk", from_disk(folder, 10.0))
+
+
+def disk_long(folder: Path) -> Results:
+    """100 s likewise: 4 GB, and as many for the angles that the command leaves."""
+    return named("disk_long", from_disk(folder, 100.0))
+
+
+def from_disk(folder: Path, seconds: float) -> Results:
+    path = folder / "recording.h5"
     with Recording.open(written(one_period(), folder)) as period:
-        for seconds in (1, 10):
-            path = folder / f"{seconds}.h5"
-            repeated(period, round(seconds * RATE)).write(path)
-            began, before = time.perf_counter(), processor_s()
-            command = [sys.executable, "-m", "recon", "reconstruct", str(path), "-o", str(folder / "out")]
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-            done = {"disk.seconds": time.perf_counter() - began, "disk.cpu_s": processor_s() - before}
-    return done | {"disk.peak_mb": peak_mb(resource.RUSAGE_CHILDREN)}
+        repeated(period, round(seconds * RATE)).write(path)
+    began, before = time.perf_counter(), processor_s()
+    command = [sys.executable, "-m", "recon", "reconstruct", str(path), "-o", str(folder / "out")]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    used = {"seconds": time.perf_counter() - began, "cpu_s": processor_s() - before}
+    return used | {"peak_mb": peak_mb(resource.RUSAGE_CHILDREN)}
 
 
 def live(folder: Path) -> Results:
@@ -217,7 +225,7 @@ def written(recording: Recording, folder: Path) -> Path:
 
 def main(wanted: list[str]) -> None:
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    for part in (disk, live, length, pixels, axes, longest):
+    for part in (disk, disk_long, live, length, pixels, axes, longest):
         if not wanted or part.__name__ in wanted:
             print(f"{part.__name__} ...", file=sys.stderr)
             with tempfile.TemporaryDirectory() as folder:

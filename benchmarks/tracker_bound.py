@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimation.estimate import estimate
 from estimation.signals import reference_of, senses
 from estimation.tracker.bound import phase_bound
-from estimation.tracker.signal import prepare
+from estimation.tracker.signal import laid_out, prepare
 from estimation.tracker.step import PHASE, STATES
 from estimation.tracker.track import averaged, follow, signed, starting_belief
 from estimation.tracker.tuning import likely_walks, stretches, tuned_walk
@@ -77,7 +77,7 @@ def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
         quiet, _ = simulate(device, Plan(DRIVES, DURATION, drift=drift))
         for sense in senses(quiet, device):
             references = {name: reference_of(quiet, device, name, sense.channel, True) for name in sense.axes}
-            known = prepare(quiet, device, sense, references)
+            known = prepare(laid_out(quiet, device, sense, references))
             start, _ = signed(known, starting_belief(known, device))
             truth = follow(known, start, np.tile([1e-6, 10.0, 1e-6], (1, len(sense.axes), 1)))[0].states
             walk = np.tile([0.0, TREND_DENSITY, 0.0, 0.0], (len(sense.axes), 1))
@@ -87,7 +87,7 @@ def ratios(shared: bool, paths: int) -> dict[str, dict[str, dict[str, float]]]:
                 for _ in range(NOISES):
                     noisy = with_noise(quiet, snr, rng, device)
                     (own,) = (s for s in senses(noisy, device) if s.channel.name == sense.channel.name)
-                    prepared = prepare(noisy, device, own, references)
+                    prepared = prepare(laid_out(noisy, device, own, references))
                     begin, _ = signed(prepared, starting_belief(prepared, device))
                     parts = stretches(prepared.signal)
                     likely = likely_walks(prepared, begin, parts, tuned_walk(prepared, begin, parts))

@@ -76,19 +76,17 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> Reference:
             channel=drive.name,
             hint="record for longer",
         )
-    times, phasors = [], []
+    looks: list[tuple[Array, Array, Array]] = []
     chunk = block * max(1, _CHUNK // block)
     for first in range(0, drive.size - block + 1, chunk):
         values = drive.stored(first, min(first + chunk, drive.size))
         start = drive.start + first / drive.sample_rate
         t, z = block_phasors(values, drive.sample_rate, start, f, block, drive.gain)
-        times.append(t)
-        phasors.append(z)
-    time, z = np.concatenate(times), np.concatenate(phasors)
-    size = np.nan_to_num(np.abs(z))
+        looks.append((t, np.angle(z * np.exp(-2j * np.pi * f * t)), np.nan_to_num(np.abs(z))))
+    time, phase, size = (np.concatenate(parts) for parts in zip(*looks, strict=True))
     on = size > _QUIET * size.max()
-    time, z = (time[on], z[on]) if on.sum() >= 2 else (time, z)
-    slow = unwrapped(np.angle(z * np.exp(-2j * np.pi * f * time)))
+    time, phase = (time[on], phase[on]) if on.sum() >= 2 else (time, phase)
+    slow = unwrapped(phase)
     share = 0.5 if kind == "half-drive" else 1.0
     return Reference(kind, share * f, time, share * slow)
 

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from estimation.signals import reference_of, senses
-from estimation.tracker.signal import Prepared, prepare
+from estimation.tracker.signal import Prepared, laid_out, prepare
 from phantoms.experiment import Experiment, run
 from phantoms.forward import Plan, quantised, simulate
 from phantoms.waveforms import Sine
@@ -84,4 +84,4 @@ def blocks_of(recording: Recording, device: Device) -> Prepared:
     """The blocks of a recording's only sense signal."""
     (sense,) = senses(recording, device)
     references = {n: reference_of(recording, device, n, sense.channel, True) for n in sense.axes}
-    return prepare(recording, device, sense, references)
+    return prepare(laid_out(recording, device, sense, references))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -19,6 +20,7 @@ from scanner.motion import AngleTrack
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+Lines = NDArray[np.complexfloating[Any, Any]]
 
 SEGMENT = 256  # samples over which the phase runs straight
 FINE = 64  # phasors turned together, a power of two that divides SEGMENT
@@ -43,7 +45,7 @@ class SlowMotion:
     phase_rate: Array
     log: Array
     log_rate: Array
-    lines: Complex
+    lines: Lines
 
     def at(self, time: Array) -> tuple[Array, Complex]:
         """Phase u [rad] and lines [rad] at ``time``, shapes (n,) and (n, lines)."""
@@ -232,7 +234,7 @@ class SlowAngle(AngleTrack):
         return SlowAngle(motion, self.sample_rate, self.start, self.size)
 
 
-def _turned(lines: Complex) -> Complex:
+def _turned(lines: Lines) -> Lines:
     """Lines that make -theta with u + pi: even harmonics change sign, odd ones do not."""
     out = lines.copy()
     if lines.shape[1] != 3:

@@ -102,8 +102,8 @@ def expanded_about(prepared: Prepared, states: Array) -> Prepared:
     offset, sd = offsets(length, channel.sample_rate), float(np.sqrt(prepared.noise_var))
     rates = np.empty((len(prepared.rows), RATES), np.complex128)
     found, tuned, table = [], np.full(signal.tuned.shape[1], np.nan), np.empty(0)
-    for k, piece, rails in zip(*clipped, strict=True):
-        values = channel.read(k * length, (k + 1) * length)
+    for k, start, piece, rails in zip(*clipped, strict=True):
+        values = channel.read(start, start + length)
         used = np.isfinite(values)
         used[: piece[0]] = used[piece[1] :] = False
         if (signal.tuned[k] != tuned).any():

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.signals import Sense, drive_voltage, intensity_clock, reference_of
+from estimation.tracker.course import axis_motion, course
 from estimation.tracker.orbit import axis_law, law_of, turn_of
 from estimation.tracker.signal import NEVER_CLIPPED, Driven, Prepared, driven_blocks
 from estimation.tracker.step import DAMPING, LOG, PHASE, STATES, STIFFNESS, TREND, Signal
@@ -21,7 +22,6 @@ from estimation.tracker.track import (
     STIFFNESS_SPREAD,
     TREND_SD,
     PhaseSeen,
-    axis_motion,
     follow,
     with_phases,
 )
@@ -70,7 +70,8 @@ def drive_only(recording: Recording, device: Device, seen: Mapping[str, PhaseSee
         best = int(np.argmax([each.log_likelihood for each in tracks]))
         drive = prepared.sense.channel
         sign = "ambiguous" if prepared.laws[0].pull else "known: the drive"
-        axes[name] = axis_motion(prepared, tracks[best], 0, intensity_clock(recording, drive), sign)
+        along = course(prepared, tracks[best].states, tracks[best].sds, 0)
+        axes[name] = axis_motion(prepared.references[name], along, intensity_clock(recording, drive), sign)
         trends[name] = float(TRENDS[best])
     return Motion(axes, "picture", {"stiffness_trend_walk": trends})
 

@@ -1,8 +1,12 @@
-"""One sense channel made ready for the smoother: references, drives, readout and projections, block by block."""
+"""One sense channel made ready for the smoother: references, drives, readout and projections, block by block.
+
+What drives the axes is told for all blocks at once (``laid_out``), the samples section by section (``prepare``): of
+those a long recording has more than memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -41,16 +45,18 @@ class Clipped(NamedTuple):
     """Blocks with samples beyond a rail.
 
     Attributes:
-        block: which they are, shape (n,). pieces: first and last but one sample that each may use, shape (n, 2).
+        block: which they are, shape (n,). start: the channel's sample that each begins with, shape (n,).
+        pieces: first and last but one sample that each may use, shape (n, 2).
         rails: between which samples were measured, infinite for none, shape (n, 2) [V].
     """
 
     block: Index
+    start: Index
     pieces: Index
     rails: Array
 
 
-NEVER_CLIPPED = Clipped(np.zeros(0, np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2)))
+NEVER_CLIPPED = Clipped(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2)))
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,8 @@ class Prepared:
         time: of the blocks' middles, shape (blocks,) [s].
         signal: for the smoother.
         clean: fraction of the samples that were used.
-        clipped: blocks in which the signal left its rails. noise_var: of a sample in most blocks [V^2].
+        clipped: blocks in which the signal left its rails.
+        noise_var: of a sample in most blocks, NaN where there is none [V^2].
     """
 
     sense: Sense
@@ -81,14 +88,41 @@ class Prepared:
         return np.array(self.laws, dtype=np.float64)
 
 
-def prepare(recording: Recording, device: Device, sense: Sense, references: Mapping[str, Reference]) -> Prepared:
-    """Demodulate one sense channel and the drives that belong to it.
+@dataclass(frozen=True)
+class Layout:
+    """Blocks of a sense channel in time, and what drives its axes there; nothing of its samples yet.
+
+    Attributes:
+        sense: the channel. axes: of the device that it listens to. laws: theirs.
+        references: with bends and jumps where a drive switched. switches: when they did, shape (switches,) [s].
+        starts: first sample of every block, shape (blocks,). length: of a block. time: of the middles, (blocks,) [s].
+        lines: (axis, order) of each line that is listened to, shape (lines, 2).
+        psi, w, force, share: as in ``step.Signal``, shape (blocks, axes, ...).
+    """
+
+    sense: Sense
+    axes: tuple[Axis, ...]
+    laws: tuple[AxisLaw, ...]
+    references: Mapping[str, Reference]
+    switches: Array
+    starts: Index
+    length: int
+    time: Array
+    lines: Index
+    psi: Array
+    w: Array
+    force: Complex
+    share: Array
+
+
+def laid_out(recording: Recording, device: Device, sense: Sense, references: Mapping[str, Reference]) -> Layout:
+    """Blocks for one sense channel, and the drives that belong to it demodulated in them.
 
     Raises:
-        BadInput: the channel is too short, or none of its samples can be used.
+        BadInput: the channel is too short, or a drive does not cover it.
         DeviceInvalid: the device lacks a value.
     """
-    channel, axes = sense.channel, [device.axis(name) for name in sense.axes]
+    channel, axes = sense.channel, tuple(device.axis(name) for name in sense.axes)
     length = _block_length(axes, [references[name].frequency for name in sense.axes], channel.sample_rate)
     count = channel.size // length
     if count < 3:
@@ -99,9 +133,9 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
             hint="record for longer",
         )
     starts = np.arange(count) * length
-    width = length / channel.sample_rate
     time: Array = channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate)
     laws = tuple(axis_law(axis, sense.readout) for axis in axes)
+    width = length / channel.sample_rate
     driven = [
         driven_blocks(drive_voltage(recording, name, gaps_ok=True), references[name], time, width, law)
         for name, law in zip(sense.axes, laws, strict=True)
@@ -110,26 +144,44 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
         np.ascontiguousarray(np.stack([getattr(own, name) for own in driven], axis=1))
         for name in ("psi", "w", "force", "share")
     )
-    lines = _lines(axes, sense, w, channel.sample_rate)
-    settling = 0
-    if isinstance(sense.readout, Amdm) and sense.readout.lpf_hz:
-        settling = int(SETTLING / (2 * np.pi * min(sense.readout.lpf_hz)) * channel.sample_rate)
-    projections = project(channel, starts, length, lines, w, settling)
-    switches = np.concatenate([own.switches for own in driven])
-    cut = pieces(starts, length, channel.sample_rate, channel.start, switches)
-    if switches.size:
-        projections = project_pieces(projections, channel, starts, cut, lines, w)
-    if not projections.counts.any():
-        raise BadInput("holds no sample that can be used", file=channel.file, channel=channel.name)
-    passed, passed_by_w = _passed(sense, lines, w)
-    white, roots, unroots = whitened(projections.sums, projections.grams, projections.geometry)
-    noise, usual = _noise(projections, channel, starts, cut, lines, w, sense.readout.noise_sd)
-    signal = Signal(
+    return Layout(
+        sense=sense,
+        axes=axes,
+        laws=laws,
+        references={name: own.reference for name, own in zip(sense.axes, driven, strict=True)},
+        switches=np.concatenate([own.switches for own in driven]),
+        starts=starts,
+        length=length,
+        time=time,
+        lines=_lines(axes, sense, w, channel.sample_rate),
         psi=psi,
         w=w,
         force=force,
         share=share,
-        step=width,
+    )
+
+
+def prepare(layout: Layout, first: int = 0, stop: int | None = None) -> Prepared:
+    """Demodulate the blocks ``first`` up to ``stop`` of a sense channel."""
+    sense, channel, lines, length = layout.sense, layout.sense.channel, layout.lines, layout.length
+    own = slice(first, stop)
+    starts, w = layout.starts[own], layout.w[own]
+    settling = 0
+    if isinstance(sense.readout, Amdm) and sense.readout.lpf_hz:
+        settling = int(SETTLING / (2 * np.pi * min(sense.readout.lpf_hz)) * channel.sample_rate)
+    projections = project(channel, starts, length, lines, w, settling)
+    cut = pieces(starts, length, channel.sample_rate, channel.start, layout.switches)
+    if layout.switches.size:
+        projections = project_pieces(projections, channel, starts, cut, lines, w)
+    passed, passed_by_w = _passed(sense, lines, w)
+    white, roots, unroots = whitened(projections.sums, projections.grams, projections.geometry)
+    noise, usual = _noise(projections, channel, starts, cut, lines, w, sense.readout.noise_sd)
+    signal = Signal(
+        psi=layout.psi[own],
+        w=w,
+        force=layout.force[own],
+        share=layout.share[own],
+        step=length / channel.sample_rate,
         lines=lines,
         passed=np.ascontiguousarray(passed),
         passed_by_w=np.ascontiguousarray(passed_by_w),
@@ -141,14 +193,14 @@ def prepare(recording: Recording, device: Device, sense: Sense, references: Mapp
         unroots=unroots,
         geometry=projections.geometry,
         noise_var=noise,
-        known=np.zeros(psi.shape),
-        known_var=np.full(psi.shape, np.inf),
-        ladder=np.stack([_ladder(axis, sense) for axis in axes]),
+        known=np.zeros(w.shape),
+        known_var=np.full(w.shape, np.inf),
+        ladder=np.stack([_ladder(axis, sense) for axis in layout.axes]),
         main=2 if is_capacitive(sense.readout) else 1,
     )
-    references = {name: own.reference for name, own in zip(sense.axes, driven, strict=True)}
-    clean = float((projections.counts - projections.beyond).sum()) / (count * length)
-    return Prepared(sense, references, laws, time, signal, clean, _clipped(projections, starts, cut, settling), usual)
+    clean = float((projections.counts - projections.beyond).sum()) / (starts.size * length)
+    clipped = _clipped(projections, starts, cut, settling)
+    return Prepared(sense, layout.references, layout.laws, layout.time[own], signal, clean, clipped, usual)
 
 
 def _clipped(projections: Projections, starts: Index, cut: Index, settling: int) -> Clipped:
@@ -156,16 +208,16 @@ def _clipped(projections: Projections, starts: Index, cut: Index, settling: int)
     block = np.flatnonzero(np.isfinite(projections.rails).any(axis=1))
     pieces = cut[block].copy()
     pieces[:, 0] = np.maximum(pieces[:, 0], settling - starts[block])
-    return Clipped(block, pieces, projections.rails[block])
+    return Clipped(block, starts[block], pieces, projections.rails[block])
 
 
-def _block_length(axes: list[Axis], frequencies: list[float], rate: float) -> int:
+def _block_length(axes: Sequence[Axis], frequencies: list[float], rate: float) -> int:
     width = SLOWEST_CYCLES / min(frequencies)
     decays = [axis.quality / (np.pi * axis.resonance) for axis in axes if axis.mechanics is not None]
     return max(64, round(max([width, DECAY_SHARE * min(decays)] if decays else [width]) * rate))
 
 
-def _lines(axes: list[Axis], sense: Sense, w: Array, rate: float) -> Index:
+def _lines(axes: Sequence[Axis], sense: Sense, w: Array, rate: float) -> Index:
     found = []
     for i, axis in enumerate(axes):
         if is_capacitive(sense.readout):
@@ -261,6 +313,8 @@ def _noise(
     Lines that slip or decay within a block leave much of themselves about a steady fit, and are no disturbance: blocks
     that seem to hold one are fitted with lines beside each line as well, which make it free to change.
     """
+    if not projections.counts.any():  # a gap as long as all of it
+        return np.ones(starts.size), np.nan
     own = residual_variance(projections)
     own[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator tells no volts
     samples = np.maximum(projections.counts, 1)

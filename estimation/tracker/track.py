@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.signals import Sense, intensity_clock, is_capacitive, reference_of, senses
-from estimation.tracker import backward, linear, smoother
-from estimation.tracker.angle import SlowAngle, SlowMotion
+from estimation.tracker import backward, linear
 from estimation.tracker.censored import expanded_about
-from estimation.tracker.orbit import MOVED, law_of, turn_of
-from estimation.tracker.signal import Prepared, prepare
+from estimation.tracker.course import Course, axis_motion, course, joined
+from estimation.tracker.signal import Layout, Prepared, laid_out, prepare
 from estimation.tracker.smoother import LOST, SIGNIFICANT
-from estimation.tracker.step import DAMPING, FLOOR, LOG, PHASE, STATES, STIFFNESS, Signal, flow, rates_of
-from estimation.tracker.switches import EDGE
+from estimation.tracker.step import FLOOR, LOG, PHASE, STATES, Signal
 from estimation.tracker.tuning import (
     START_WALK,
     Belief,
@@ -41,6 +39,7 @@ DAMPING_SPREAD = 0.05
 TREND_SD = 0.3  # of the stiffness [1/s]: 0.3 % within 10 ms
 POSITION_GAIN_SD = 1e-4  # relative: what a position sensor says is what the angle is
 OFFSET_SD = 1.0  # of the readout [V]
+SECTION = 16384  # blocks whose samples are brought together at a time, some 10 s
 WINDOW, LAG = 4096, 512  # blocks smoothed at a time, and how far a window looks ahead of what it gives
 LISTENED = 64  # blocks that may be taken together to find a motion in noise
 EXPANSIONS, STAYS = 30, 0.05  # of clipped blocks about a track, at most; its change at which it stays [sd]
@@ -67,6 +66,7 @@ class Track:
         log_likelihood: of the projections, up to a constant.
         chi2: mean squared normalised innovation; 1 where model and noise are right.
         live: whether the motion of each axis was found.
+        onward: what is known before the block behind the last one, if there is one.
     """
 
     states: Array
@@ -74,6 +74,7 @@ class Track:
     log_likelihood: float
     chi2: float
     live: NDArray[np.bool_]
+    onward: Belief
 
 
 def track(
@@ -100,30 +101,82 @@ def track(
     for sense in senses(recording, device, gaps_ok=True):
         even = is_capacitive(sense.readout)
         references = {name: reference_of(recording, device, name, sense.channel, even) for name in sense.axes}
-        prepared = prepare(recording, device, sense, references)
-        start, signs = signed(prepared, starting_belief(prepared, device))
-        # by the signal alone: it would bend the motion to each of a few phases seen
-        walk = _walk_of(before, sense)
-        prepared = uncensored(prepared, start, walk, causal)
-        parts = stretches(prepared.signal)
-        walk = tuned_walk(prepared, start, parts, walk)
-        if prepared.clipped.block.size:
-            prepared = uncensored(prepared, start, walk, causal)
-            parts = stretches(prepared.signal)
-        helped = with_phases(prepared, seen or {})
-        found = averaged(helped, start, likely_walks(prepared, start, parts, walk), causal)
-        for i, name in enumerate(sense.axes):
-            if not found.live[i]:
+        layout = laid_out(recording, device, sense, references)
+        signs, belief, walk = [""] * len(sense.axes), None, _walk_of(before, sense)
+        courses: list[list[Course]] = [[] for _ in sense.axes]
+        live = np.zeros(len(sense.axes), bool)
+        told: list[tuple[float, ...]] = []
+        for first, stop in sections(layout.share):
+            section = tuned(prepare(layout, first, stop + LAG), device, belief, walk, causal)
+            prepared, walk, signs = section.prepared, section.walk, signs if told else section.signs
+            helped = with_phases(prepared, seen or {})
+            found = averaged(helped, section.belief, section.likely, causal, stop - first)
+            for a, own in enumerate(courses):
+                own.append(course(prepared, found.states, found.sds, a))
+            belief, live = found.onward, live | found.live
+            told.append((stop - first, prepared.clean, prepared.noise_var, found.chi2, found.log_likelihood))
+        facts = np.array(told)
+        if np.isnan(facts[:, 2]).all():
+            raise BadInput("holds no sample that can be used", file=sense.channel.file, channel=sense.channel.name)
+        clock = intensity_clock(recording, sense.channel)
+        for a, name in enumerate(sense.axes):
+            if not live[a]:
                 raise BadInput(
                     f"shows no motion of axis {name} near {references[name].frequency:.6g} Hz",
                     file=sense.channel.file,
                     channel=sense.channel.name,
                     hint="the resonance did not start; check drive voltage and frequency",
                 )
-        clock = intensity_clock(recording, sense.channel)
-        axes |= {name: axis_motion(prepared, found, i, clock, signs[i]) for i, name in enumerate(sense.axes)}
-        info[sense.channel.name] = _facts(prepared, found, walk)
+            axes[name] = axis_motion(layout.references[name], joined(courses[a]), clock, signs[a])
+        info[sense.channel.name] = _facts(layout, facts, walk)
     return Motion(axes, "tracker-causal" if causal else "tracker", info)
+
+
+def sections(share: Array) -> Iterator[tuple[int, int]]:
+    """First block and the one behind the last of parts that are tracked one after the other.
+
+    None ends between two blocks of which the drive switched. ``share`` is that of ``step.Signal``, (blocks, axes).
+    """
+    first, blocks = 0, len(share)
+    steady = (share == 0.5).all(axis=1)
+    while first < blocks:
+        stop = min(first + SECTION, blocks)
+        while not steady[stop - 1]:
+            stop += 1
+        yield first, stop
+        first = stop
+
+
+class Tuned(NamedTuple):
+    """A section ready to be tracked.
+
+    Attributes:
+        prepared: with what clipped samples tell. belief: before its first block. signs: as in ``signed``.
+        walk: process noise, shape (axes, 3). likely: what it may be as well.
+    """
+
+    prepared: Prepared
+    belief: Belief
+    signs: list[str]
+    walk: Array
+    likely: Likely
+
+
+def tuned(prepared: Prepared, device: Device, belief: Belief | None, walk: Array, causal: bool) -> Tuned:
+    """Process noise of a section by its own blocks, from ``walk`` on.
+
+    Args:
+        belief: of the section before, None for the first.
+    """
+    start, signs = signed(prepared, starting_belief(prepared, device))
+    # by the signal alone: it would bend the motion to each of a few phases seen
+    prepared = uncensored(prepared, belief or start, walk, causal)
+    parts = stretches(prepared.signal)
+    walk = tuned_walk(prepared, start, parts, walk)
+    if prepared.clipped.block.size:
+        prepared = uncensored(prepared, belief or start, walk, causal)
+        parts = stretches(prepared.signal)
+    return Tuned(prepared, belief or start, signs, walk, likely_walks(prepared, start, parts, walk))
 
 
 def with_phases(prepared: Prepared, seen: Mapping[str, PhaseSeen]) -> Prepared:
@@ -194,17 +247,20 @@ def _listen(signal: Signal, a: int, x: Array) -> bool:
     return False
 
 
-def follow(prepared: Prepared, start: Belief, walks: Array, causal: bool = False) -> list[Track]:
-    """The track of all blocks under each of the ``walks``, shape (walks, axes, 3).
+def follow(
+    prepared: Prepared, start: Belief, walks: Array, causal: bool = False, stop: int | None = None
+) -> list[Track]:
+    """The track of all blocks, or those before ``stop``, under each of the ``walks``, shape (walks, axes, 3).
 
     It goes window by window, so that memory does not grow with the covariances of all blocks.
     """
-    blocks, n = len(prepared.time), start.x.size
-    states, sds = np.empty((2, len(walks), blocks, n))
+    blocks = len(prepared.time)
+    stop, n = min(stop or blocks, blocks), start.x.size
+    states, sds = np.empty((2, len(walks), stop, n))
     live = np.tile(start.live, (len(walks), 1))
     totals, beliefs, first = np.zeros((len(walks), 3)), [start] * len(walks), 0
-    while first < blocks:
-        done = min(first + WINDOW, blocks)
+    while first < stop:
+        done = min(first + WINDOW, stop)
         inner, part = done - first, window(prepared.signal, first, min(done + LAG, blocks))
         own = linear.unmade(part)  # about the first track: the others are near it
         for i, values in enumerate(walks):
@@ -222,8 +278,10 @@ def follow(prepared: Prepared, start: Belief, walks: Array, causal: bool = False
             sds[i, first:done] = np.sqrt(np.maximum(variances, 0.0))
         first = done
     return [
-        Track(xs, each, total, chi2 / max(count, 1.0), found)
-        for xs, each, (total, chi2, count), found in zip(states, sds, totals.tolist(), live, strict=True)
+        Track(xs, each, total, chi2 / max(count, 1.0), found, onward)
+        for xs, each, (total, chi2, count), found, onward in zip(
+            states, sds, totals.tolist(), live, beliefs, strict=True
+        )
     ]
 
 
@@ -239,13 +297,13 @@ def uncensored(prepared: Prepared, start: Belief, walk: Array, causal: bool) -> 
     return prepared
 
 
-def averaged(prepared: Prepared, start: Belief, likely: Likely, causal: bool = False) -> Track:
+def averaged(prepared: Prepared, start: Belief, likely: Likely, causal: bool = False, stop: int | None = None) -> Track:
     """The track averaged over the process noise that may be, its deviations with what that leaves uncertain.
 
     Where noise leaves the drift's law uncertain, the track for the most probable law is as good as any, but its
     covariance takes that law for known: intervals of 95 % would hold the truth in 91 % (docs/bound.md).
     """
-    tracks = follow(prepared, start, likely.walks, causal)
+    tracks = follow(prepared, start, likely.walks, causal, stop)
     centre = tracks[len(tracks) // 2]
     states, sds = centre.states.copy(), centre.sds.copy()
     for a in range(len(prepared.laws)):
@@ -293,36 +351,6 @@ def signed(prepared: Prepared, start: Belief) -> tuple[Belief, list[str]]:
     return start, told
 
 
-def axis_motion(prepared: Prepared, found: Track, i: int, clock: tuple[float, float, int], sign: str) -> AxisMotion:
-    signal, at = prepared.signal, i * STATES
-    rates = np.empty(len(prepared.time), np.complex128)
-    moved = np.empty((len(prepared.time), MOVED + 1), np.complex128)
-    own, w, force = found.states[:, at : at + STATES], signal.w[:, i], signal.force[:, i]
-    smoother.turns(law_of(prepared.rows[i]), w, force, own, rates, moved)
-    log = own[:, LOG]
-    reference = prepared.references[prepared.sense.axes[i]]
-    # a block sees the reference averaged over itself, which is not its value in the middle when the drive sweeps
-    phase = own[:, PHASE] + signal.psi[:, i] - reference.phase(prepared.time)
-    knots: list[NDArray[Any]] = [prepared.time, phase, rates, log, moved]
-    for k in np.flatnonzero(signal.share[:, i] != 0.5)[::-1]:
-        knots = [np.insert(a, k + 1, b, axis=0) for a, b in zip(knots, _at_switch(prepared, found, i, k), strict=True)]
-    lines = knots[4] / np.exp(knots[3])[:, None]
-    lines[:, 1] = -1j
-    if prepared.laws[i].theta_th == 0.0 and prepared.laws[i].pull:
-        lines = np.ascontiguousarray(lines[:, 1::2])
-    slow = SlowMotion(reference, knots[0], knots[1], knots[2].imag.copy(), knots[3], knots[2].real.copy(), lines)
-    return AxisMotion(
-        time=prepared.time,
-        phase=phase,
-        amplitude=np.exp(log),
-        frequency=(w + rates.imag) / (2 * np.pi),
-        phase_sd=found.sds[:, at + PHASE],
-        angle=SlowAngle(slow, *clock),
-        reference=reference.kind,
-        sign=sign,
-    )
-
-
 def _walk_of(motion: Motion | None, sense: Sense) -> Array:
     """The process noise that a track tells of one channel, shape (axes, 3); the tuning's start where it tells none."""
     facts = {} if motion is None else motion.info.get(sense.channel.name, {})
@@ -332,34 +360,22 @@ def _walk_of(motion: Motion | None, sense: Sense) -> Array:
     return np.array([list(told[axis].values()) for axis in sense.axes])
 
 
-def _at_switch(prepared: Prepared, found: Track, i: int, k: int) -> tuple[NDArray[Any], ...]:
-    """Time, phase, rate, ln A and own harmonics of axis ``i`` just before and after the switch behind block ``k``."""
-    signal, law = prepared.signal, law_of(prepared.rows[i])
-    reference = prepared.references[prepared.sense.axes[i]]
-    share = signal.share[k, i] * signal.step
-    time = prepared.time[k] + share
-    sides = []
-    for j, h, side in ((k, share, -EDGE), (k + 1, share - signal.step, EDGE)):
-        w, force = signal.w[j, i], signal.force[j, i]
-        x = found.states[j, i * STATES : (i + 1) * STATES].copy()
-        flow(rates_of(law, x, w, force), x.copy(), x, h, np.empty((2, DAMPING + 1)))
-        stiff, damp = law.k * (1.0 + x[STIFFNESS]), law.b * (1.0 + x[DAMPING])
-        turn = turn_of(law, np.exp(x[LOG]), x[PHASE], w, stiff, damp, force)
-        phase = x[PHASE] + signal.psi[j, i] + w * h - reference.phase(np.array([time + side]))[0]
-        sides.append((time, phase, turn.rate, x[LOG], turn.moved))
-    return tuple(np.array(values) for values in zip(*sides, strict=True))
+def _facts(layout: Layout, told: Array, walk: Array) -> dict[str, object]:
+    """What is worth reporting of one channel.
 
-
-def _facts(prepared: Prepared, found: Track, walk: Array) -> dict[str, object]:
+    Args:
+        told: blocks, share of samples used, noise variance, chi2 and log-likelihood of every section.
+        walk: of the last section.
+    """
+    blocks, used, noise_var, chi2, log_likelihood = told.T
     names = ("white_phase", "stiffness_trend", "damping")
     return {
-        "block_s": prepared.signal.step,
-        "used": prepared.clean,
-        "noise_sd": float(np.sqrt(np.median(prepared.signal.noise_var))),
-        "mean_squared_innovation": found.chi2,
-        "log_likelihood": found.log_likelihood,
+        "block_s": layout.length / layout.sense.channel.sample_rate,
+        "used": float(np.average(used, weights=blocks)),
+        "noise_sd": float(np.sqrt(np.nanmedian(noise_var))),
+        "mean_squared_innovation": float(np.average(chi2, weights=blocks)),
+        "log_likelihood": float(log_likelihood.sum()),
         "walk": {
-            axis: dict(zip(names, row.tolist(), strict=True))
-            for axis, row in zip(prepared.sense.axes, walk, strict=True)
+            axis: dict(zip(names, row.tolist(), strict=True)) for axis, row in zip(layout.sense.axes, walk, strict=True)
         },
     }
