@@ -283,7 +283,7 @@ def test_two_effects_are_found_around_a_free_correction() -> None:
     model = Model([run], DEVICE, [free], nominal.mains)
     stood_in = solve(comparison, model, model.embed(early.model, early.x), turns=20)
     pool = [c for c in all_candidates(DEVICE, nominal, catalogue().values()) if not c.channel.startswith("angle")]
-    best = instead(comparison, stood_in, free, pool, pairs=True)[0]
+    best = instead(comparison, stood_in, [free], pool, pairs=True)[0]
     assert {each.term.effect for each in best.model.candidates} == {"cubic-stiffness", "gain-drift"}
     assert best.evidence < stood_in.evidence - 100.0
 

@@ -60,17 +60,17 @@ class Settled:
 
 
 def instead(
-    comparison: Comparison, fit: Fit, gone: Candidate, pool: Sequence[Candidate], pairs: bool = False
+    comparison: Comparison, fit: Fit, gone: Sequence[Candidate], pool: Sequence[Candidate], pairs: bool = False
 ) -> list[Fit]:
     """Fits with other terms of ``pool`` in the place of ``gone``, best first; with ``pairs``, two of them as well."""
     taken = {each.key for each in fit.model.candidates}
-    seen = screen(comparison, fit, [each for each in pool if each.key not in taken], gone=(gone,))
+    seen = screen(comparison, fit, [each for each in pool if each.key not in taken], gone=gone)
     seen = [each for each in seen if np.any(each.columns)]
     if not seen:
         return []
     ends = np.cumsum([0, *(each.columns.shape[1] for each in seen)])
     columns = np.column_stack([s.columns[fit.rows] for s in seen])
-    normal, gradient, _ = Projection(fit, fit.rows, (gone,)).system(columns)
+    normal, gradient, _ = Projection(fit, fit.rows, gone).system(columns)
 
     def promise(group: tuple[int, ...]) -> tuple[float, Array]:
         at = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in group])
@@ -82,7 +82,7 @@ def instead(
         promised = [(*promise(group), group) for group in combinations(range(len(seen)), size)]
         promised.sort(key=lambda each: -each[0])
         for place, (_, estimate, group) in enumerate(promised):
-            if place < TRIED or (size == 1 and _alike(seen[group[0]].candidate, gone)):
+            if place < TRIED or (size == 1 and any(_alike(seen[group[0]].candidate, each) for each in gone)):
                 model, x = _start(fit, gone, [seen[i] for i in group], estimate)
                 # Around a free correction the way is far; around a named fit, what is not soon as good never will be.
                 turns = 20 if pairs else 8
@@ -95,12 +95,12 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     return other.term.effect in one.term.lookalikes or one.term.effect in other.term.lookalikes
 
 
-def _start(fit: Fit, gone: Candidate, added: Sequence[Screened], estimate: Array) -> tuple[Model, Array]:
+def _start(fit: Fit, gone: Sequence[Candidate], added: Sequence[Screened], estimate: Array) -> tuple[Model, Array]:
     """The model with ``added`` in the place of ``gone``, and where to start its fit.
 
     All else starts as it was: what stood in ``gone`` is large, and no first order tells how far the others would go.
     """
-    kept = [each for each in fit.model.candidates if each is not gone]
+    kept = [each for each in fit.model.candidates if each not in gone]
     model = Model(fit.model.runs, fit.model.device, [*kept, *(s.candidate for s in added)], fit.model.mains)
     x = model.embed(fit.model, fit.x)
     first = 0
@@ -129,7 +129,7 @@ def settled(comparison: Comparison, fit: Fit, pool: Sequence[Candidate], newest:
         leads = {}
         better = None
         for each in fit.model.candidates[len(fit.model.candidates) - newest :]:
-            others = instead(comparison, fit, each, pool)
+            others = instead(comparison, fit, (each,), pool)
             if others and others[0].evidence < fit.evidence - 0.1:
                 better = others[0]
                 break

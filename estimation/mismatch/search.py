@@ -108,7 +108,7 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
         enough = several.best.held_chi2 - 1.0 < NEXT_TO_NOTHING * (several.nominal.held_chi2 - 1.0)
         if enough and solve(found.comparison, several.best.model, several.best.x).evidence < found.best.evidence:
             found = several
-    elif found.best.model.candidates and not _is_free(found.best) and found.best.held_chi2 > INADEQUATE:
+    if found.best.model.candidates and not _is_free(found.best):
         found = _unnamed(found)
     rounds = tuple(
         _round(found.comparison, found.nominal, found.best, each, found.rivals.get(each.key, ()))
@@ -196,7 +196,7 @@ def _by_name(comparison: Comparison, before: Fit, free: Fit, named: Sequence[Can
     Returns:
         comparison, the fit before, the fit with the terms or, where none will do, with the free correction.
     """
-    others = instead(comparison, free, free.model.candidates[-1], named, pairs=True)
+    others = instead(comparison, free, free.model.candidates[-1:], named, pairs=True)
     others = [fit for fit in others if fit.evidence < free.evidence and convincing(comparison, before, fit)]
     if not others:
         return comparison, before, free
@@ -210,17 +210,26 @@ def _by_name(comparison: Comparison, before: Fit, free: Fit, named: Sequence[Can
 
 
 def _unnamed(state: _State) -> _State:
-    """A free correction in the place of the weightiest term, if that explains more; the term becomes its rival."""
+    """A free correction in the place of named terms that leave too much, if it explains more; they become its rivals.
+
+    In the place of the weightiest, or of all that stand in one stage: they may be the first terms of the series of one
+    law that has no name. While the motion was not followed, that law could not be fitted; around them it can.
+    """
     comparison, fit = state.comparison, state.best
-    weightiest = max(fit.model.candidates, key=lambda each: without(comparison, fit, each).evidence)
+    terms = fit.model.candidates
+    gone = max(([each for each in terms if each.term.stage == one.term.stage] for one in terms), key=len)
+    if fit.held_chi2 < (ADEQUATE if len(gone) > 1 else INADEQUATE):
+        return state
+    if len(gone) == 1:
+        gone = [max(terms, key=lambda each: without(comparison, fit, each).evidence)]
     free = all_candidates(fit.model.device, fit.model, FREE.values())
-    others = [each for each in instead(comparison, fit, weightiest, free) if each.evidence < fit.evidence]
+    others = [each for each in instead(comparison, fit, gone, free) if each.evidence < fit.evidence]
     if not others:
         return state
     found = needed_only(comparison, others[0])
     worse = fit.chi2 + fit.penalty - others[0].chi2 - others[0].penalty
-    leads = {found.model.candidates[-1].key: (Lead(fit.evidence - others[0].evidence, weightiest, worse),)}
-    return replace(state, best=found, rivals={**state.rivals, **leads})
+    leads = tuple(Lead(fit.evidence - others[0].evidence, each, worse) for each in gone)
+    return replace(state, best=found, rivals={**state.rivals, found.model.candidates[-1].key: leads})
 
 
 def _behind_newest(found: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, Leads]:
