@@ -34,6 +34,10 @@ OFFSETS, GAINS, DELAYS = 6, 28, 20
 """Cosines over the recording's length of a readout's offset and gain, and of a delay: a few where the spectrum is full
 of other things, up to a dozen cycles where nothing else stands."""
 
+PLAYS = (0.125, 0.25, 0.5, 1.0)
+"""Half-widths, over the signal's deviation, of the plays in a readout: weighed against each other they make up any
+memory without rate (Prandtl-Ishlinskii)."""
+
 STEEPEST = 2.0
 """Slope of the drive, over its deviation and rate, from which a law of it says no more: edges are steep without end."""
 
@@ -52,6 +56,17 @@ def _cosines(turn, sizes):  # type: ignore[no-untyped-def]
         total += sizes[i] * wave
         before, wave = wave, 2.0 * first * wave - before
     return total
+
+
+@njit(cache=True)
+def play(signal, width):  # type: ignore[no-untyped-def]
+    """What follows ``signal`` (n,) with a play of half-width ``width``, at rest at the first sample."""
+    out = np.empty_like(signal)
+    held = signal[0]
+    for i in range(signal.size):
+        held = min(max(held, signal[i] - width), signal[i] + width)
+        out[i] = held
+    return out
 
 
 @njit(TORQUE, cache=True)
@@ -107,11 +122,15 @@ def _readout(signal: Array, p: Sequence[float], view: View) -> Array:
     turn, size, rate, amplitude = np.pi * view.time / p[0], p[1], p[2], p[3]
     u = (signal - signal.mean()) / size
     slope = np.gradient(signal, view.step) / rate
-    offset, gain = waves(turn, [0.0, *p[12 : 12 + OFFSETS]]), waves(turn, [0.0, *p[12 + OFFSETS :]])
+    gains = 12 + OFFSETS
+    memories = gains + GAINS
+    offset, gain = waves(turn, [0.0, *p[12:gains]]), waves(turn, [0.0, *p[gains:memories]])
+    behind = sum(part * (play(signal, width * size) - signal) for part, width in zip(p[memories:], PLAYS, strict=True))
     x, v = view.theta / amplitude, view.rate / (amplitude * rate)
     way = v / np.sqrt(x * x + v * v + 1e-6)
     by_rate = v * (p[7] + p[8] * x) + way * (p[9] + way * way * (p[10] + way * way * p[11]))
-    return signal * (1.0 + by_rate) + size * (u * (gain + u * (p[4] + p[5] * u)) + offset) + p[6] * slope
+    bent = u * (gain + u * (p[4] + p[5] * u)) + offset
+    return signal * (1.0 + by_rate) + size * bent + p[6] * slope + behind
 
 
 def _timing(signal: Array, p: Sequence[float], view: View) -> Array:
@@ -176,7 +195,7 @@ FREE: dict[str, Term] = {
             SOURCE, voltage=_drive, applies=lambda axis, scales: scales.voltage_rms > 0,
         ),
         Term(
-            "free-readout", "readout", "y + δy(y, y', θ', t)",
+            "free-readout", "readout", "y + δy(y, y', θ', t) + Σ m_h P_h[y]",
             (
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 Parameter("size", "V", lambda s: s.sense_rms, kind="fixed"),
@@ -186,6 +205,7 @@ FREE: dict[str, Term] = {
                 *(Parameter(f"w{i}", "1", lambda s: 0.02) for i in range(5)),
                 *(Parameter(f"o{i}", "1", lambda s: 0.04) for i in range(1, OFFSETS + 1)),
                 *(Parameter(f"g{i}", "1", lambda s: 0.04) for i in range(1, GAINS + 1)),
+                *(Parameter(f"m{i}", "1", lambda s: 0.04) for i in range(len(PLAYS))),
             ),
             SOURCE, output=_readout,
         ),

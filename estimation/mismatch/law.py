@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Fit
-from estimation.mismatch.free import DEGREE, KNOTS
+from estimation.mismatch.free import DEGREE, KNOTS, PLAYS, play
 from scanner.terms import Scales
 
 Array = NDArray[np.float64]
@@ -23,7 +23,10 @@ VARIABLES = {
     "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
     "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
     "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),
-    "free-readout": ("δy/s", f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), s: the signal's rms, {LENGTH}"),
+    "free-readout": (
+        "δy/s",
+        f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), P_h: play of half-width h, s: the signal's rms, {LENGTH}",
+    ),
     "free-timing": ("delay/s", f"r² = x² + y², {STATE}, {LENGTH}"),
     "free-optics": ("δθ/A", "x = θ/A"),
 }
@@ -34,6 +37,7 @@ POLYNOMIALS = {
     "free-drive": {"v0": "u", "v1": "v", "v2": "u²", "v3": "u³", "v4": "u v", "v5": "v³"},
     "free-readout": {
         "y0": "u²", "y1": "u³", "y2": "w", "w0": "u y", "w1": "u x y", "w2": "u r", "w3": "u r³", "w4": "u r⁵",
+        **{f"m{i}": f"(P_{width}[u] − u)" for i, width in enumerate(PLAYS)},
     },
     "free-timing": {"r2": "r²", "r4": "r⁴"},
 }  # fmt: skip
@@ -132,9 +136,12 @@ def _sections(effect: str, s: Scales) -> list[Section]:
         case "free-readout":
             x, v = np.cos(np.pi * u), -np.sin(np.pi * u)
             by_rate = {"w0": v, "w1": v * x, "w2": v, "w3": v**3, "w4": v**5}
+            swing = np.sqrt(2.0) * np.tile(x, 2)  # the second time round is the loop that a steady swing goes
+            loops = {f"m{i}": (play(swing, width) - swing)[x.size :] for i, width in enumerate(PLAYS)}
             return [
                 Section({"y0": u**2, "y1": u**3}, "signal error / rms", "1", u, "signal / rms"),
                 Section(by_rate, "gain error at full swing", "1", np.pi * u, "phase of the swing (rad)"),
+                Section(loops, "signal error / rms", "1", np.pi * u, "phase of the swing (rad)"),
                 Section(waves("g"), "gain error", "1", time, "time (s)"),
                 Section(waves("o"), "offset / rms", "1", time, "time (s)"),
             ]
