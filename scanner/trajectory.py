@@ -5,7 +5,8 @@ through their addresses: a new term needs no new kernel, and one compilation ser
 stages act on whole arrays before or after the integration and never come here.
 
 A step waits for its own stages most of the time. Motions that differ in numbers alone, as a derivative by differences
-asks for, go side by side in the lanes of the processor's vectors: eight take little longer than one.
+asks for, go side by side in the lanes of the processor's vectors: eight take little longer than one. A term's law is
+written for one motion; what the kernel calls is the same law in all lanes, for a call takes longer than most laws.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import NumbaExperimentalFeatureWarning, carray, njit, types
 from numba.experimental.function_type import _get_wrapper_address
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 from numpy.typing import NDArray
 
 from scanner.device import Axis
@@ -47,24 +48,20 @@ NOMINAL = ("J", "b", "k", "C0", "theta0", "theta_th", "torque_per_volt")
 SLOTS = 4
 """Mechanics terms at a time, and capacitance terms at a time."""
 
+LANES, BYTES = 8, 8
+"""Motions side by side; of a double."""
 
-@njit(TORQUE, cache=True)
-def no_torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    return 0.0, 0.0, 0.0
+_ABREAST = types.void(types.int64, _f8, _f8, _f8, *[types.int64] * 8)
+"""(s, t, other, volt, at, rate, z, dz, p, most, own, used): one slot's law in the lanes that are used, added to
+``MORE_TORQUE`` or ``MORE_SLOPE`` of s. s, p and own are addresses, which cost less to hand over than arrays: of the
+kernel's numbers (``ROWS``), of the slot's first lane in a table of parameters (``_LAWS``) that has room for ``most`` in
+a slot, and of the nominal values."""
 
-
-@njit(BELL, cache=True)
-def no_bell(theta, p, nominal):  # type: ignore[no-untyped-def]
-    return 0.0, 0.0
-
-
-LANES = 8
-"""Motions side by side."""
+_SLOTS_OF = types.UniTuple(types.FunctionType(_ABREAST), SLOTS)
 
 _LAWS = types.Tuple(
-    [types.UniTuple(types.FunctionType(TORQUE), SLOTS), _f8[:, :, ::1], types.int64,
-     types.UniTuple(types.FunctionType(BELL), SLOTS), _f8[:, :, ::1], types.int64, _f8[:, ::1], _f8, types.int64]
-)  # fmt: skip
+    [_SLOTS_OF, _f8[:, :, ::1], types.int64, _SLOTS_OF, _f8[:, :, ::1], types.int64, _f8[:, ::1], _f8, types.int64]
+)
 """Torques, their parameters by lane and slot, their number; bells, likewise; nominal values by lane; the share of the
 drive's voltage that pulls: 1 for an electrostatic drive, else 0; hidden states."""
 
@@ -102,45 +99,85 @@ def _pointer(context, address):  # type: ignore[no-untyped-def]
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
-    return types.CPointer(_f8)(types.uintp), code
+    return types.CPointer(_f8)(types.int64), code
 
 
 @njit(inline="always")
-def _borrowed(array):  # type: ignore[no-untyped-def]
-    """The same numbers as an array whose owners nobody counts: that takes longer than what a law does with a row.
+def _place(array):  # type: ignore[no-untyped-def]
+    return np.int64(array.ctypes.data)
 
-    For what the kernel's caller keeps; what the kernel made itself would be gone.
+
+class _Address(types.WrapperAddressProtocol):
+    """A compiled function by its address: to ask numba for it at every call would take longer than an integration."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self._signature = function.nopython_signatures[0]  # type: ignore[attr-defined]
+        self._address = _get_wrapper_address(function, self._signature)
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+    def signature(self) -> Any:
+        return self._signature
+
+
+_address = cache(_Address)
+
+
+@njit(_ABREAST, cache=True)
+def _nothing(s, t, other, volt, at, rate, z, dz, p, most, own, used):  # type: ignore[no-untyped-def]
+    pass
+
+
+@cache
+def _abreast(law: Callable[..., Any]) -> _Address:
+    """A law, compiled with ``TORQUE`` or ``BELL``, in all lanes.
+
+    numba keeps it on disk by what it closes over: the law's name, and ``stamp``, what the law says.
     """
-    return carray(_pointer(array.ctypes.data), array.shape)
+    one, code = register_jitable(law.py_func), law.py_func.__code__  # type: ignore[attr-defined]
+    stamp = repr((code.co_code, code.co_consts, code.co_names))
+
+    def torque(s, t, other, volt, at, rate, z, dz, p, most, own, used):  # type: ignore[no-untyped-def]
+        stamp  # noqa: B018
+        s, own = carray(_pointer(s), (ROWS, LANES)), carray(_pointer(own), (LANES, len(NOMINAL)))
+        for lane in range(used):
+            values = carray(_pointer(p + lane * SLOTS * most * BYTES), (most,))
+            more, s[dz, lane], s[dz + 1, lane] = one(
+                t, s[at, lane], s[rate, lane], other, volt, s[z, lane], s[z + 1, lane], values, own[lane]
+            )
+            s[MORE_TORQUE, lane] += more
+
+    def bell(s, t, other, volt, at, rate, z, dz, p, most, own, used):  # type: ignore[no-untyped-def]
+        stamp  # noqa: B018
+        s, own = carray(_pointer(s), (ROWS, LANES)), carray(_pointer(own), (LANES, len(NOMINAL)))
+        for lane in range(used):
+            values = carray(_pointer(p + lane * SLOTS * most * BYTES), (most,))
+            s[MORE_SLOPE, lane] += one(s[at, lane], values, own[lane])[1]
+
+    every = torque if law.nopython_signatures[0] == TORQUE else bell  # type: ignore[attr-defined]
+    return _Address(njit(_ABREAST, cache=True, nogil=True, **_COMPILED)(every))
 
 
 @njit(forceinline=True, **_COMPILED)
-def _torque(law, i, t, at, rate, z, dz, other, volt, p, nominal, s, lane):  # type: ignore[no-untyped-def]
-    z0, z1, dz0, dz1 = z + 2 * i, z + 2 * i + 1, dz + 2 * i, dz + 2 * i + 1
-    torque, s[dz0, lane], s[dz1, lane] = law(
-        t, s[at, lane], s[rate, lane], other, volt, s[z0, lane], s[z1, lane], p[i], nominal
-    )
-    return torque
-
-
-@njit(forceinline=True, **_COMPILED)
-def _terms(t, at, rate, z, dz, other, volt, laws, parameters, s, used):  # type: ignore[no-untyped-def]
-    """What terms add, lane by lane: ``MORE_TORQUE``, ``MORE_SLOPE``, and the rates ``dz`` of their hidden states."""
+def _terms(t, at, rate, z, dz, other, volt, laws, s, used):  # type: ignore[no-untyped-def]
+    """What terms add, in all lanes: ``MORE_TORQUE``, ``MORE_SLOPE``, and the rates ``dz`` of their hidden states."""
     (first, second, third, fourth), n, bells = laws[0], laws[2], laws[3]  # by number they would be copied every time
-    for lane in range(used):
-        p, q, nominal = parameters[0][lane], parameters[1][lane], parameters[2][lane]
-        torque = slope = 0.0
-        if n > 0:
-            torque = _torque(first, 0, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
-        if n > 1:
-            torque += _torque(second, 1, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
-        if n > 2:
-            torque += _torque(third, 2, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
-        if n > 3:
-            torque += _torque(fourth, 3, t, at, rate, z, dz, other, volt, p, nominal, s, lane)
-        for i in range(laws[5]):
-            slope += bells[i](s[at, lane], q[i], nominal)[1]
-        s[MORE_TORQUE, lane], s[MORE_SLOPE, lane] = torque, slope
+    here, own = _place(s), _place(laws[6])
+    s[MORE_TORQUE], s[MORE_SLOPE] = 0.0, 0.0
+    p, most = _place(laws[1]), laws[1].shape[2]
+    slot = most * BYTES
+    if n > 0:
+        first(here, t, other, volt, at, rate, z, dz, p, most, own, used)
+    if n > 1:
+        second(here, t, other, volt, at, rate, z + 2, dz + 2, p + slot, most, own, used)
+    if n > 2:
+        third(here, t, other, volt, at, rate, z + 4, dz + 4, p + 2 * slot, most, own, used)
+    if n > 3:
+        fourth(here, t, other, volt, at, rate, z + 6, dz + 6, p + 3 * slot, most, own, used)
+    p, most = _place(laws[4]), laws[4].shape[2]
+    for i in range(laws[5]):
+        bells[i](here, t, other, volt, at, rate, z, dz, p + i * most * BYTES, most, own, used)
 
 
 @njit(forceinline=True, **_COMPILED)
@@ -165,7 +202,6 @@ def _advance(dz, h, s, states, width):  # type: ignore[no-untyped-def]
 def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # type: ignore[no-untyped-def]
     """``start``: angle, rate, hidden states by lane. ``width``: lanes computed, more than used to fill vectors."""
     half, used, some, states = 0.5 * step, start.shape[0], laws[2] + laws[5] > 0, laws[8]
-    parameters = _borrowed(laws[1]), _borrowed(laws[4]), _borrowed(laws[6])
     s = np.zeros((ROWS, LANES))
     for lane in range(width):
         own = min(lane, used - 1)
@@ -179,28 +215,28 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
         p0, p1, p2 = laws[7] * v0, laws[7] * v1, laws[7] * v2
         o0, o1, o2 = other[i, 0], other[i, 1], other[i, 2]
         if some:
-            _terms(t, THETA, OMEGA, Z, Z1, o0, v0, laws, parameters, s, used)
+            _terms(t, THETA, OMEGA, Z, Z1, o0, v0, laws, s, used)
             _advance(Z1, half, s, states, width)
         for lane in range(width):
             s[A1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, p0)
             s[W2, lane] = s[OMEGA, lane] + half * s[A1, lane]
             s[MID, lane] = s[THETA, lane] + half * s[OMEGA, lane]
         if some:
-            _terms(t + half, MID, W2, Z_MID, Z2, o1, v1, laws, parameters, s, used)
+            _terms(t + half, MID, W2, Z_MID, Z2, o1, v1, laws, s, used)
             _advance(Z2, half, s, states, width)
         for lane in range(width):
             s[A2, lane] = _acceleration(s, lane, MID, W2, v1, p1)
             s[W3, lane] = s[OMEGA, lane] + half * s[A2, lane]
             s[MID, lane] = s[THETA, lane] + half * s[W2, lane]
         if some:
-            _terms(t + half, MID, W3, Z_MID, Z3, o1, v1, laws, parameters, s, used)
+            _terms(t + half, MID, W3, Z_MID, Z3, o1, v1, laws, s, used)
             _advance(Z3, step, s, states, width)
         for lane in range(width):
             s[A3, lane] = _acceleration(s, lane, MID, W3, v1, p1)
             s[W4, lane] = s[OMEGA, lane] + step * s[A3, lane]
             s[MID, lane] = s[THETA, lane] + step * s[W3, lane]
         if some:
-            _terms(t + step, MID, W4, Z_MID, Z4, o2, v2, laws, parameters, s, used)
+            _terms(t + step, MID, W4, Z_MID, Z4, o2, v2, laws, s, used)
             for k in range(states):
                 for lane in range(width):
                     rates = s[Z1 + k, lane] + 2.0 * s[Z2 + k, lane] + 2.0 * s[Z3 + k, lane] + s[Z4 + k, lane]
@@ -316,9 +352,9 @@ def side_by_side(
     drive = first.axis.drive
     electrostatic = (drive is None or drive.kind == "electrostatic") and first.axis.capacitance is not None
     laws = (
-        _filled([each.law for each in first.torques], no_torque),
+        _filled([each.law for each in first.torques]),
         _table([[each.parameters for each in motion.torques] for motion in motions]), len(first.torques),
-        _filled([each.law for each in first.bells], no_bell),
+        _filled([each.law for each in first.bells]),
         _table([[each.parameters for each in motion.bells] for motion in motions]), len(first.bells),
         np.stack([nominal_values(motion.axis) for motion in motions]), float(electrostatic),
         2 * len(first.torques) if any(torque.hidden for torque in first.torques) else 0,
@@ -343,29 +379,10 @@ def halves(voltage: Array) -> Array:
     return np.append(voltage[:, :2].ravel(), voltage[-1, 2])
 
 
-class _Address(types.WrapperAddressProtocol):
-    """A compiled law by its address: asking numba for it anew at every call would cost more than the integration."""
-
-    def __init__(self, law: Callable[..., Any]):
-        self._signature = law.nopython_signatures[0]  # type: ignore[attr-defined]
-        self._address = _get_wrapper_address(law, self._signature)
-
-    def __wrapper_address__(self) -> int:
-        return self._address
-
-    def signature(self) -> Any:
-        return self._signature
-
-
-@cache
-def _address(law: Callable[..., Any]) -> _Address:
-    return _Address(law)
-
-
-def _filled(laws: list[Callable[..., Any]], nothing: Callable[..., Any]) -> tuple[_Address, ...]:
+def _filled(laws: list[Callable[..., Any]]) -> tuple[_Address, ...]:
     if len(laws) > SLOTS:
         raise ValueError(f"{len(laws)} terms of one stage, the trajectory has room for {SLOTS}")
-    return tuple(_address(law) for law in (*laws, *[nothing] * (SLOTS - len(laws))))
+    return tuple(map(_abreast, laws)) + (_address(_nothing),) * (SLOTS - len(laws))
 
 
 def _table(parameters: Sequence[Sequence[Sequence[float]]]) -> Array:
