@@ -60,6 +60,9 @@ FINEST = 1.03
 NO_VERDICT = 60.0
 """Lead in -2 log evidence that over a window, or between many, says nothing yet."""
 
+QUIET = 0.95
+"""Reduced chi-square that noise alone, as it was measured, does not stay below."""
+
 HOPELESS = 2000.0
 """A fit that is this far behind another's evidence after a few turns is not polished."""
 
@@ -116,17 +119,17 @@ def _apart(screened: Sequence[Screened]) -> tuple[list[Screened], list[Screened]
 
 
 def _named_first(
-    named: list[Screened], free: list[Screened], fitted: Callable[[list[Screened], float], list[Fit]]
+    named: list[Screened], free: list[Screened], fitted: Callable[[list[Screened], Fit | None], list[Fit]]
 ) -> list[Fit]:
     """Fits of named terms, and of free corrections too unless they find nothing beside the best name; best first.
 
     Args:
-        fitted: told which, and the evidence that is there to be beaten.
+        fitted: told which, and the fit that is there to be beaten.
     """
-    fits = fitted(named, np.inf)
+    fits = fitted(named, None)
     best = min(fits, key=lambda fit: fit.evidence, default=None)
     if free and not (best is not None and _explains(best, [each.candidate for each in free])):
-        fits += fitted(free, np.inf if best is None else best.evidence)
+        fits += fitted(free, best)
     return sorted(fits, key=lambda fit: fit.evidence)
 
 
@@ -184,14 +187,18 @@ def race(
     later = [stop for stop in stops if stop > brink]
     tracks = list(_eased([reached, brink, *later])) if reached else [brink, *_eased([brink, *later])]
 
-    def through(part: list[Screened], bar: float) -> list[Fit]:
+    def through(part: list[Screened], rival: Fit | None) -> list[Fit]:
         running = [
             (each.model, _unspoilt(each, followed) if reached else stepped(comparison, base, each, brink))
             for each in part
         ]
-        if any(each.candidate.term.effect in FREE for each in part):  # few, and none is a measure of another
-            return [fit for one in running for fit in _raced(comparison, [one], tracks, reached, ALONE, bar)]
-        return _raced(comparison, running, tracks, reached, TOGETHER)
+        if not any(each.candidate.term.effect in FREE for each in part):
+            return _raced(comparison, running, tracks, reached, TOGETHER)
+        fits: list[Fit] = []
+        for one in running:  # few, and where one has lost the motion another may follow
+            fits += _raced(comparison, [one], tracks, reached, ALONE, rival)
+            rival = min([*fits, *([rival] if rival else [])], key=lambda fit: fit.evidence, default=None)
+        return fits
 
     return _named_first(named, free, through)
 
@@ -252,7 +259,7 @@ def _raced(
     stops: Sequence[float],
     reached: float,
     splits: int,
-    bar: float = np.inf,
+    rival: Fit | None = None,
 ) -> list[Fit]:
     """Possible fits of those that keep up through the growing windows ``stops``.
 
@@ -262,9 +269,9 @@ def _raced(
     Args:
         reached: window up to which they start as good fits, 0 for none.
         splits: windows that may be put in between.
-        bar: evidence over the whole that a part must not be worse than.
+        rival: fit of the whole that is there to be beaten.
     """
-    ahead, level = list(stops)[::-1], 1.0
+    ahead, level, bar = list(stops)[::-1], 1.0, np.inf if rival is None else rival.evidence
     fits: list[Fit] = []
     while running and ahead:
         stop = ahead[-1]
@@ -279,7 +286,7 @@ def _raced(
             ahead.append(float(np.sqrt(reached * stop)))
             splits -= 1
             continue
-        if fits[0].chi2 > bar:
+        if fits[0].chi2 > bar or (stop >= stops[:EASE][-1] and _beaten(comparison, fits[0], rival)):
             return []
         reached, level = ahead.pop(), now
         if len(fits) <= FINALISTS or fits[FINALISTS].evidence > fits[0].evidence + NO_VERDICT:
@@ -288,6 +295,15 @@ def _raced(
     # the best alone of a candidate that ran from several starts
     best_of = {fit.model.candidates[-1].key: fit for fit in reversed(fits) if possible(fit)}
     return list(best_of.values())
+
+
+def _beaten(comparison: Comparison, fit: Fit, rival: Fit | None) -> bool:
+    """Whether a fit over a window misses more there than ``rival`` in all, were there but noise to come."""
+    if rival is None:
+        return False
+    unseen = comparison.rows & ~fit.rows
+    rest = min(float(np.sum(rival.residual[unseen] ** 2)), QUIET * int(unseen.sum()))
+    return fit.chi2 + rest > rival.evidence + HOPELESS
 
 
 def _kept(fits: list[Fit], unexplained: bool, few: bool) -> list[tuple[Model, Array]]:
@@ -299,7 +315,8 @@ def _kept(fits: list[Fit], unexplained: bool, few: bool) -> list[tuple[Model, Ar
     """
     best, worst = fits[0].evidence, max(fit.evidence for fit in fits)
     margin = max(NO_VERDICT, 0.5 * (worst - best))
-    kept = [fit for fit in fits if fit.evidence < best + margin]
+    # who explains as well stays, whatever it costs: over a short window nominal values bend to any law
+    kept = [fit for fit in fits if fit.evidence < best + margin or _level(fit) < EXPLAINED]
     if unexplained:
         kept = fits[: max(FINALISTS, len(kept))]
     # What leads with a sign that physics forbids goes on with the other: a ringing mode fits with both.
