@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import resource
 import subprocess
 import sys
 import tempfile
@@ -109,18 +108,13 @@ def costs(period: Path, size: int, axes: str = "xy", pixels: int = 400) -> Resul
                 began = time.process_time()
                 mapped(motion, recording["intensity"], grid, [])
                 done["map_s"] = time.process_time() - began
-    return done | {"peak_mb": peak_mb(resource.RUSAGE_SELF)}
+    return done | {"peak_mb": peak_mb()}
 
 
-def processor_s() -> float:
-    """Of all children that have ended [s]: what a busy machine does not lengthen."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-def peak_mb(who: int) -> float:
-    """Peak resident memory of this process, or of its children."""
-    return resource.getrusage(who).ru_maxrss / 1024
+def peak_mb() -> float:
+    """Peak resident memory of this process alone: what getrusage tells has the process in it that started this one."""
+    (peak,) = (line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)
+    return int(peak) / 1024
 
 
 def apart(function: Callable[..., Results], *arguments: Any) -> Results:
@@ -169,11 +163,18 @@ def from_disk(folder: Path, seconds: float) -> Results:
     path = folder / "recording.h5"
     with Recording.open(written(one_period(), folder)) as period:
         repeated(period, round(seconds * RATE)).write(path)
-    began, before = time.perf_counter(), processor_s()
-    command = [sys.executable, "-m", "recon", "reconstruct", str(path), "-o", str(folder / "out")]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    used = {"seconds": time.perf_counter() - began, "cpu_s": processor_s() - before}
-    return used | {"peak_mb": peak_mb(resource.RUSAGE_CHILDREN)}
+    began = time.perf_counter()
+    command = [sys.executable, "-m", "benchmarks.scale", "once", str(path), str(folder / "out")]
+    used = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+    return {"seconds": time.perf_counter() - began, **used}
+
+
+def once(path: str, out: str) -> None:
+    """The command on one recording, then what it took as JSON."""
+    from recon.cli import main as command
+
+    command(["reconstruct", path, "-o", out])
+    print(json.dumps({"cpu_s": time.process_time(), "peak_mb": peak_mb()}))
 
 
 def live(folder: Path) -> Results:
@@ -237,4 +238,4 @@ def main(wanted: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    once(*sys.argv[2:]) if sys.argv[1:2] == ["once"] else main(sys.argv[1:])
