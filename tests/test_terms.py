@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -187,6 +188,19 @@ def torque(t, theta, omega, other, volt, z0, z1, p, nominal):
 K7 = Parameter("k7", "N m", lambda s: s.k / s.amplitude**6)
 TERM = Term("septic-stiffness", "mechanics", "+ k7 θ⁷", (K7,), "mine", torque=torque)
 """
+
+
+def test_a_law_that_was_changed_is_compiled_anew(tmp_path: Path) -> None:
+    """numba keeps on disk what it made of a law, by its name."""
+    for power, effect in ((3, "cubic-stiffness"), (5, "quintic-stiffness"), (3, "cubic-stiffness")):
+        path = tmp_path / "mine.py"
+        path.write_text(USER_TERM.replace("theta**7", f"theta**{power}"))
+        (mine,) = (term for name, term in load_terms(path).items() if name == "septic-stiffness")
+        made = [
+            integrate(LINEAR, (0.1, 0.0), np.zeros((500, 3)), STEP, torques=[Torque(term.torque, (1e-6,))])[0]
+            for term in (mine, catalogue()[effect])
+        ]
+        np.testing.assert_allclose(*made, rtol=1e-12, atol=1e-15)
 
 
 def test_motions_side_by_side_are_those_that_each_makes_alone() -> None:
