@@ -8,6 +8,7 @@ from test_mismatch import DEVICE, RATE, N, recording
 from estimation.mismatch.diagnosis import diagnose
 from estimation.mismatch.experiment import experiment
 from estimation.mismatch.fit import Comparison, solve
+from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.search import _State, _unnamed
 from estimation.mismatch.start import first_whiteners, grown, started, windows
@@ -64,3 +65,20 @@ def test_three_laws_of_one_stage_give_way_to_the_one_that_they_begin() -> None:
     assert [each.term.effect for each in told.best.model.candidates] == ["free-mechanics"]
     assert [lead.candidate for lead in told.rivals["x.free-mechanics"]] == powers
     assert told.best.held_chi2 < named.held_chi2
+
+
+def test_two_names_for_one_law_of_the_timing_give_way_to_the_numbers_that_it_needs() -> None:
+    run = experiment(recording(late=2e-6, seed=6), DEVICE)
+    nominal = Model([run], DEVICE)
+    comparison = Comparison([run], first_whiteners(nominal))
+    stops = windows(nominal)
+    early = grown(comparison, nominal, started(comparison, nominal, stops[0]).x, stops)[-1]
+    pair = [Candidate(catalogue()[name], "x", "sense") for name in ("channel-delay", "clock-skew")]
+    model = Model([run], DEVICE, pair, nominal.mains)
+    named = solve(comparison, model, model.embed(early.model, early.x))
+    told = _unnamed(_State(comparison, early, named, {})).best
+    (candidate,) = told.model.candidates
+    assert candidate.term.effect == "free-timing"
+    assert "r2" in {each.name for each in candidate.term.free}
+    assert len(candidate.term.free) < 5 < len(FREE["free-timing"].free)
+    assert told.held_chi2 < named.held_chi2

@@ -229,9 +229,13 @@ def unmoved(comparison: Comparison, model: Model, x: Array, stop: float = 1.0) -
 
 
 def _made(comparison: Comparison, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:
-    """A fit with its evidence by Laplace's method: the priors' widths price every free number."""
+    """A fit with its evidence by Laplace's method."""
     chi2, penalty = float(residual[rows] @ residual[rows]), float(model.precision @ (x * x))
-    information = jacobian[rows].T @ jacobian[rows]
-    scaled = information / np.sqrt(np.outer(model.precision, model.precision))
-    price = float(np.linalg.slogdet(np.eye(x.size) + scaled)[1])
-    return Fit(model, x, chi2, penalty, residual, jacobian, rows, comparison.held, chi2 + penalty + price)
+    evidence = laplace(chi2 + penalty, jacobian[rows].T @ jacobian[rows], model.precision)
+    return Fit(model, x, chi2, penalty, residual, jacobian, rows, comparison.held, evidence)
+
+
+def laplace(misfit: float, information: Array, precision: Array) -> float:
+    """-2 log evidence of a misfit, priors included: ``information`` prices the numbers against their priors' widths."""
+    scaled = information / np.sqrt(np.outer(precision, precision))
+    return misfit + float(np.linalg.slogdet(np.eye(len(precision)) + scaled)[1])

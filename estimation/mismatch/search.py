@@ -14,9 +14,10 @@ from estimation.mismatch.free import FREE
 from estimation.mismatch.instead import Lead, Leads, behind, instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import MAINS, Candidate, Model
-from estimation.mismatch.naming import LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
+from estimation.mismatch.naming import LEAD_OVER_NEXT, LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
 from estimation.mismatch.noise import Whitener
 from estimation.mismatch.screen import all_candidates
+from estimation.mismatch.sparse import sparse
 from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
 from scanner.device import Device
 from scanner.terms import Term
@@ -43,6 +44,9 @@ INADEQUATE = 1.3
 
 ASTRAY = 100.0
 """Reduced chi-square from which a fit has lost the motion: first order around it says nothing of a further effect."""
+
+LIKELY = 3
+"""Free corrections in the place of named terms, of which the numbers needed are told."""
 
 CLOSE, NEARLY = 80.0, 0.1
 """Rivals within this of the best in -2 log evidence, or within this share of what the best gained, are refitted when
@@ -210,25 +214,28 @@ def _by_name(comparison: Comparison, before: Fit, free: Fit, named: Sequence[Can
 
 
 def _unnamed(state: _State) -> _State:
-    """A free correction in the place of named terms that leave too much, if it explains more; they become its rivals.
+    """A free correction in the place of named terms, if it explains more with the numbers it needs; they are rivals.
 
-    In the place of the weightiest, or of all that stand in one stage: they may be the first terms of the series of one
-    law that has no name. While the motion was not followed, that law could not be fitted; around them it can.
+    In the place of all that stand in one stage: they may be the first terms of the series of one law that has no name.
+    While the motion was not followed, that law could not be fitted; around them it can. Or, where too much is left, in
+    the place of the weightiest.
     """
     comparison, fit = state.comparison, state.best
     terms = fit.model.candidates
     gone = max(([each for each in terms if each.term.stage == one.term.stage] for one in terms), key=len)
-    if fit.held_chi2 < (ADEQUATE if len(gone) > 1 else INADEQUATE):
-        return state
     if len(gone) == 1:
+        if fit.held_chi2 < INADEQUATE:
+            return state
         gone = [max(terms, key=lambda each: without(comparison, fit, each).evidence)]
     free = all_candidates(fit.model.device, fit.model, FREE.values())
-    others = [each for each in instead(comparison, fit, gone, free) if each.evidence < fit.evidence]
-    if not others:
+    others = [each for each in instead(comparison, fit, gone, free) if each.chi2 < fit.chi2]
+    fewer = [each for each in (sparse(comparison, other) for other in others[:LIKELY]) if each is not None]
+    best = min(fewer, key=lambda each: each.evidence, default=fit)
+    if best.evidence > fit.evidence - LEAD_OVER_NEXT:
         return state
-    found = needed_only(comparison, others[0])
-    worse = fit.chi2 + fit.penalty - others[0].chi2 - others[0].penalty
-    leads = tuple(Lead(fit.evidence - others[0].evidence, each, worse) for each in gone)
+    found = needed_only(comparison, best)
+    worse = fit.chi2 + fit.penalty - best.chi2 - best.penalty
+    leads = tuple(Lead(fit.evidence - best.evidence, each, worse) for each in gone)
     return replace(state, best=found, rivals={**state.rivals, found.model.candidates[-1].key: leads})
 
 
