@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,6 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.process import peak_mb, timed
 from benchmarks.speed import digitised
 from estimation.tracker import track
 from phantoms.experiment import Experiment, run
@@ -111,12 +111,6 @@ def costs(period: Path, size: int, axes: str = "xy", pixels: int = 400) -> Resul
     return done | {"peak_mb": peak_mb()}
 
 
-def peak_mb() -> float:
-    """Peak resident memory of this process alone: what getrusage tells has the process in it that started this one."""
-    (peak,) = (line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)
-    return int(peak) / 1024
-
-
 def apart(function: Callable[..., Results], *arguments: Any) -> Results:
     """A case in a process of its own."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
@@ -163,18 +157,7 @@ def from_disk(folder: Path, seconds: float) -> Results:
     path = folder / "recording.h5"
     with Recording.open(written(one_period(), folder)) as period:
         repeated(period, round(seconds * RATE)).write(path)
-    began = time.perf_counter()
-    command = [sys.executable, "-m", "benchmarks.scale", "once", str(path), str(folder / "out")]
-    used = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
-    return {"seconds": time.perf_counter() - began, **used}
-
-
-def once(path: str, out: str) -> None:
-    """The command on one recording, then what it took as JSON."""
-    from recon.cli import main as command
-
-    command(["reconstruct", path, "-o", out])
-    print(json.dumps({"cpu_s": time.process_time(), "peak_mb": peak_mb()}))
+    return timed("reconstruct", str(path), "-o", str(folder / "out"))
 
 
 def live(folder: Path) -> Results:
@@ -238,4 +221,4 @@ def main(wanted: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    once(*sys.argv[2:]) if sys.argv[1:2] == ["once"] else main(sys.argv[1:])
+    main(sys.argv[1:])

@@ -7,11 +7,12 @@ from test_mismatch import DEVICE, RATE, N, recording
 
 from estimation.mismatch.diagnosis import diagnose
 from estimation.mismatch.experiment import experiment
-from estimation.mismatch.fit import Comparison, solve
+from estimation.mismatch.fit import Comparison, Fit, solve
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.search import _State, _unnamed
 from estimation.mismatch.start import first_whiteners, grown, started, windows
+from scanner.recording import Recording
 from scanner.terms import catalogue
 
 
@@ -51,34 +52,31 @@ def test_a_play_in_the_readout_is_unknown_in_the_readout() -> None:
     assert "P_0" in curve["formula"]
 
 
-def test_three_laws_of_one_stage_give_way_to_the_one_that_they_begin() -> None:
-    """A stop on one side is no power of the angle: three powers together imitate it, one free force is it."""
-    run = experiment(recording(stop=0.2, seed=6), DEVICE)
-    nominal = Model([run], DEVICE)
-    comparison = Comparison([run], first_whiteners(nominal))
+def searched(run: Recording, *names: str, turns: int = 8) -> tuple[_State, Fit]:
+    """A search that stands at named terms, and what it finds to put in their place."""
+    seen = experiment(run, DEVICE)
+    nominal = Model([seen], DEVICE)
+    comparison = Comparison([seen], first_whiteners(nominal))
     stops = windows(nominal)
     early = grown(comparison, nominal, started(comparison, nominal, stops[0]).x, stops)[-1]
-    powers = [Candidate(catalogue()[f"{n}-stiffness"], "x", "sense") for n in ("quadratic", "cubic", "quintic")]
-    model = Model([run], DEVICE, powers, nominal.mains)
-    named = solve(comparison, model, model.embed(early.model, early.x), turns=20)
-    told = _unnamed(_State(comparison, early, named, {}))
+    model = Model([seen], DEVICE, [Candidate(catalogue()[name], "x", "sense") for name in names], nominal.mains)
+    named = solve(comparison, model, model.embed(early.model, early.x), turns=turns)
+    return _unnamed(_State(comparison, early, named, {})), named
+
+
+def test_three_laws_of_one_stage_give_way_to_the_one_that_they_begin() -> None:
+    """A stop on one side is no power of the angle: three powers together imitate it, one free force is it."""
+    powers = [f"{name}-stiffness" for name in ("quadratic", "cubic", "quintic")]
+    told, named = searched(recording(stop=0.2, seed=6), *powers, turns=20)
     assert [each.term.effect for each in told.best.model.candidates] == ["free-mechanics"]
-    assert [lead.candidate for lead in told.rivals["x.free-mechanics"]] == powers
+    assert [lead.candidate.term.effect for lead in told.rivals["x.free-mechanics"]] == powers
     assert told.best.held_chi2 < named.held_chi2
 
 
 def test_two_names_for_one_law_of_the_timing_give_way_to_the_numbers_that_it_needs() -> None:
-    run = experiment(recording(late=2e-6, seed=6), DEVICE)
-    nominal = Model([run], DEVICE)
-    comparison = Comparison([run], first_whiteners(nominal))
-    stops = windows(nominal)
-    early = grown(comparison, nominal, started(comparison, nominal, stops[0]).x, stops)[-1]
-    pair = [Candidate(catalogue()[name], "x", "sense") for name in ("channel-delay", "clock-skew")]
-    model = Model([run], DEVICE, pair, nominal.mains)
-    named = solve(comparison, model, model.embed(early.model, early.x))
-    told = _unnamed(_State(comparison, early, named, {})).best
-    (candidate,) = told.model.candidates
+    told, named = searched(recording(late=2e-6, seed=6), "channel-delay", "clock-skew")
+    (candidate,) = told.best.model.candidates
     assert candidate.term.effect == "free-timing"
     assert "r2" in {each.name for each in candidate.term.free}
     assert len(candidate.term.free) < 5 < len(FREE["free-timing"].free)
-    assert told.held_chi2 < named.held_chi2
+    assert told.best.held_chi2 < named.held_chi2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -105,18 +105,17 @@ def track(
         signs, belief, walk = [""] * len(sense.axes), None, _walk_of(before, sense)
         courses: list[list[Course]] = [[] for _ in sense.axes]
         live = np.zeros(len(sense.axes), bool)
-        told: list[tuple[float, ...]] = []
+        kept: list[Kept] = []
         for first, stop in sections(layout.share):
             section = tuned(prepare(layout, first, stop + LAG), device, belief, walk, causal)
-            prepared, walk, signs = section.prepared, section.walk, signs if told else section.signs
+            prepared, walk, signs = section.prepared, section.walk, signs if kept else section.signs
             helped = with_phases(prepared, seen or {})
             found = averaged(helped, section.belief, section.likely, causal, stop - first)
             for a, own in enumerate(courses):
                 own.append(course(prepared, found.states, found.sds, a))
             belief, live = found.onward, live | found.live
-            told.append((stop - first, prepared.clean, prepared.noise_var, found.chi2, found.log_likelihood))
-        facts = np.array(told)
-        if np.isnan(facts[:, 2]).all():
+            kept.append(Kept(stop - first, prepared.clean, prepared.noise_var, found.chi2, found.log_likelihood))
+        if all(np.isnan(section.noise_var) for section in kept):
             raise BadInput("holds no sample that can be used", file=sense.channel.file, channel=sense.channel.name)
         clock = intensity_clock(recording, sense.channel)
         for a, name in enumerate(sense.axes):
@@ -128,8 +127,18 @@ def track(
                     hint="the resonance did not start; check drive voltage and frequency",
                 )
             axes[name] = axis_motion(layout.references[name], joined(courses[a]), clock, signs[a])
-        info[sense.channel.name] = _facts(layout, facts, walk)
+        info[sense.channel.name] = _facts(layout, kept, walk)
     return Motion(axes, "tracker-causal" if causal else "tracker", info)
+
+
+class Kept(NamedTuple):
+    """What is kept of a section beside its courses, each as in ``Prepared`` or ``Track``."""
+
+    blocks: int
+    clean: float
+    noise_var: float
+    chi2: float
+    log_likelihood: float
 
 
 def sections(share: Array) -> Iterator[tuple[int, int]]:
@@ -360,18 +369,13 @@ def _walk_of(motion: Motion | None, sense: Sense) -> Array:
     return np.array([list(told[axis].values()) for axis in sense.axes])
 
 
-def _facts(layout: Layout, told: Array, walk: Array) -> dict[str, object]:
-    """What is worth reporting of one channel.
-
-    Args:
-        told: blocks, share of samples used, noise variance, chi2 and log-likelihood of every section.
-        walk: of the last section.
-    """
-    blocks, used, noise_var, chi2, log_likelihood = told.T
+def _facts(layout: Layout, sections: Sequence[Kept], walk: Array) -> dict[str, object]:
+    """What is worth reporting of one channel; ``walk`` is that of its last section."""
+    blocks, clean, noise_var, chi2, log_likelihood = np.array(sections).T
     names = ("white_phase", "stiffness_trend", "damping")
     return {
         "block_s": layout.length / layout.sense.channel.sample_rate,
-        "used": float(np.average(used, weights=blocks)),
+        "used": float(np.average(clean, weights=blocks)),
         "noise_sd": float(np.sqrt(np.nanmedian(noise_var))),
         "mean_squared_innovation": float(np.average(chi2, weights=blocks)),
         "log_likelihood": float(log_likelihood.sum()),
