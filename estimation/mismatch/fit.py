@@ -7,7 +7,7 @@ mirror to the whole, and every residual is whitened by the noise that was measur
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -23,6 +23,12 @@ Mask = NDArray[np.bool_]
 
 POOL = ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count())
 """For independent trajectories: compiled code and numpy let go of the interpreter."""
+
+ABREAST = 2
+"""Fits at a time; the same on every machine, for a race drops those that lag behind the ones before them."""
+
+FITTING = ThreadPoolExecutor(ABREAST)
+"""For independent fits, which wait for ``POOL`` and may not run in it."""
 
 FOLDS = 20
 """Blocks of time that a recording is cut into; every ``HELD``-th is held out of every fit."""
@@ -140,7 +146,7 @@ class Comparison:
 
     def jacobian(self, model: Model, x: Array, base: Array, steps: Array, stop: float = 1.0) -> Array:
         """Derivatives of the residual by one-sided differences; ``steps`` adapts in place to a change of 0.3."""
-        columns = np.empty((base.size, x.size))
+        columns = np.empty((x.size, base.size)).T  # column by column, as they are filled
         additive = self._additive(model, stop)
         for i, column in additive.items():
             columns[:, i] = column
@@ -218,6 +224,22 @@ def solve(
             if turn == turns or (turn > 4 and gain < 0.2 * (value - hopeless)):
                 break
     return _made(comparison, model, x, residual, jacobian, rows)
+
+
+def solve_all(
+    comparison: Comparison,
+    starts: Iterable[tuple[Model, Array]],
+    stop: float = 1.0,
+    turns: int = 12,
+    tolerance: float = 0.05,
+    hopeless: float = np.inf,
+) -> list[Fit]:
+    """:func:`solve` from every one of ``starts``, ``ABREAST`` at a time."""
+
+    def one(start: tuple[Model, Array]) -> Fit:
+        return solve(comparison, *start, stop, turns, tolerance=tolerance, hopeless=hopeless)
+
+    return list(FITTING.map(one, starts))
 
 
 def unmoved(comparison: Comparison, model: Model, x: Array, stop: float = 1.0) -> Fit:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from numpy.polynomial.chebyshev import chebval
 from numpy.typing import NDArray
 
 from scanner.terms import Parameter, Term, View
@@ -102,8 +101,24 @@ def _profile(theta, p, nominal):  # type: ignore[no-untyped-def]
 
 
 def waves(turn: Array, sizes: Sequence[float]) -> Array:
-    """sum_j sizes[j] cos(j turn), of the shape of ``turn``; cos(j turn) is Chebyshev's polynomial of its cosine."""
-    return np.asarray(chebval(np.cos(turn), np.asarray(sizes)))
+    """sum_j sizes[j] cos(j turn), of the shape of ``turn``."""
+    return np.asarray(_chebyshev(np.cos(turn).ravel(), np.asarray(sizes, float)).reshape(turn.shape))
+
+
+@njit(cache=True, fastmath={"contract"})
+def _chebyshev(cosine, sizes):  # type: ignore[no-untyped-def]
+    """sum_j sizes[j] T_j(cosine) by Clenshaw's recurrence, piece by piece as the processor's first cache holds them."""
+    out = np.empty_like(cosine)
+    for first in range(0, cosine.size, 512):
+        c = cosine[first : first + 512]
+        one, two = np.zeros(c.size), np.zeros(c.size)
+        for j in range(sizes.size - 1, 0, -1):
+            for i in range(c.size):
+                two[i] = sizes[j] + 2.0 * c[i] * one[i] - two[i]
+            one, two = two, one
+        for i in range(c.size):
+            out[first + i] = sizes[0] + c[i] * one[i] - two[i]
+    return out
 
 
 def _drive(voltage: Array, p: Sequence[float], view: View) -> Array:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import Comparison, Fit, solve
+from estimation.mismatch.fit import Comparison, Fit, solve_all
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.naming import HOPELESS, possible
 from estimation.mismatch.screen import LARGEST, Projection, Screened, amplitudes, gain_of, placed, screen
@@ -77,16 +77,15 @@ def instead(
         gain, estimate = gain_of(normal[np.ix_(at, at)], gradient[at])
         return gain, np.clip(estimate, -LARGEST, LARGEST)
 
-    fits = []
+    starts = []
     for size in (1, 2) if pairs else (1,):
         promised = [(*promise(group), group) for group in combinations(range(len(seen)), size)]
         promised.sort(key=lambda each: -each[0])
         for place, (_, estimate, group) in enumerate(promised):
             if place < TRIED or (size == 1 and any(_alike(seen[group[0]].candidate, each) for each in gone)):
-                model, x = _start(fit, gone, [seen[i] for i in group], estimate)
-                # Around a free correction the way is far; around a named fit, what is not soon as good never will be.
-                turns = 20 if pairs else 8
-                fits.append(solve(comparison, model, x, turns=turns, hopeless=fit.evidence + HOPELESS))
+                starts.append(_start(fit, gone, [seen[i] for i in group], estimate))
+    # Around a free correction the way is far; around a named fit, what is not soon as good never will be.
+    fits = solve_all(comparison, starts, turns=20 if pairs else 8, hopeless=fit.evidence + HOPELESS)
     return sorted((each for each in fits if possible(each)), key=lambda each: each.evidence)
 
 

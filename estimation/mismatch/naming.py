@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.mismatch.fit import Comparison, Fit, solve, unmoved
+from estimation.mismatch.fit import ABREAST, Comparison, Fit, solve, solve_all, unmoved
 from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.screen import PROMISING, Screened, from_starts, screen, stepped
@@ -66,7 +66,8 @@ QUIET = 0.95
 HOPELESS = 2000.0
 """A fit that is this far behind another's evidence after a few turns is not polished."""
 
-Progress = Callable[[str], None]
+SAME = 1.0
+"""Square of the distance, in sigma, within which two motions of one candidate over a window are one."""
 
 
 def possible(fit: Fit) -> bool:
@@ -151,12 +152,12 @@ def _finalists(comparison: Comparison, base: Fit, promising: Sequence[Screened])
     running = [(each.model, stepped(comparison, base, each)) for each in promising]
     if promising and promising[0].gain > MUCH:
         for turns in (2, 3):
-            fits = sorted((solve(comparison, *each, turns=turns) for each in running), key=lambda fit: fit.evidence)
+            fits = sorted(solve_all(comparison, running, turns=turns), key=lambda fit: fit.evidence)
             running = [(fit.model, fit.x) for fit in fits[: max(FINALISTS, len(fits) // 2)]]
     else:
         clear = [each for each in promising if each.gain > 0.5 * promising[0].gain]
         running = running[: max(FINALISTS, len(clear))]
-    return [fit for fit in (solve(comparison, *each) for each in running) if possible(fit)]
+    return [fit for fit in solve_all(comparison, running) if possible(fit)]
 
 
 def race(
@@ -277,9 +278,10 @@ def _raced(
         stop = ahead[-1]
         turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
         fits = []
-        for model, x in running:
+        for first in range(0, len(running), ABREAST):
             best = min((fit.evidence for fit in fits if possible(fit)), default=bar - HOPELESS)
-            fits.append(solve(comparison, model, x, stop, turns, tolerance=tolerance, hopeless=best + HOPELESS))
+            some = running[first : first + ABREAST]
+            fits += solve_all(comparison, some, stop, turns, tolerance, hopeless=best + HOPELESS)
         fits.sort(key=lambda fit: (not possible(fit), fit.evidence))
         now = _level(fits[0])
         if now > LOST * max(level, 1.0) and splits and stop > FINEST * reached > 0.0:
@@ -290,11 +292,21 @@ def _raced(
             return []
         reached, level = ahead.pop(), now
         if len(fits) <= FINALISTS or fits[FINALISTS].evidence > fits[0].evidence + NO_VERDICT:
-            running = _kept(fits, now > EXPLAINED, 4 * stop > stops[-1])
+            running = _kept(list(_distinct(fits)), now > EXPLAINED, 4 * stop > stops[-1])
         # else nothing has shown: all go on as they came, a mode that will grow with what it grows from
     # the best alone of a candidate that ran from several starts
     best_of = {fit.model.candidates[-1].key: fit for fit in reversed(fits) if possible(fit)}
     return list(best_of.values())
+
+
+def _distinct(fits: Sequence[Fit]) -> Iterator[Fit]:
+    """Of fits, the best first, those whose motion another start of the same candidate has not led to already."""
+    met: dict[str, list[Fit]] = {}
+    for fit in fits:
+        others = met.setdefault(fit.model.candidates[-1].key, [])
+        if all(np.sum((fit.residual[fit.rows] - other.residual[other.rows]) ** 2) > SAME for other in others):
+            others.append(fit)
+            yield fit
 
 
 def _beaten(comparison: Comparison, fit: Fit, rival: Fit | None) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.experiment import Run
-from estimation.mismatch.fit import Comparison, Fit, solve
+from estimation.mismatch.fit import Comparison, Fit, solve, solve_all
 from estimation.mismatch.free import FREE
 from estimation.mismatch.instead import Lead, Leads, behind, instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
@@ -108,7 +108,7 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
     states += _extended(states[0], [*named, *FREE.values()], early, stops, say)
     found = states[-1]
     if _is_free(found.best) and found.nominal.held_chi2 > LARGE and found.best.held_chi2 > ADEQUATE:
-        several = _several(states[-2], _extended(states[-2], named, early, stops, say))
+        several = _several(states[-2], _extended(states[-2], named, early, stops, say, found.tried))
         enough = several.best.held_chi2 - 1.0 < NEXT_TO_NOTHING * (several.nominal.held_chi2 - 1.0)
         if enough and solve(found.comparison, several.best.model, several.best.x).evidence < found.best.evidence:
             found = several
@@ -123,18 +123,34 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
 
 @dataclass(frozen=True)
 class _State:
-    """How far a search has come: the nominal device and the best fit, under the same noise, and rivals by key."""
+    """How far a search has come.
+
+    Attributes:
+        nominal, best: the nominal device and the best fit, under the same noise.
+        rivals: by key.
+        tried: fits of the named terms among which the newest was chosen, under the noise before it.
+    """
 
     comparison: Comparison
     nominal: Fit
     best: Fit
     rivals: Mapping[str, Leads]
+    tried: Sequence[Fit] = ()
 
 
 def _extended(
-    state: _State, terms: Sequence[Term], early: Sequence[Fit], stops: Sequence[float], say: Progress
+    state: _State,
+    terms: Sequence[Term],
+    early: Sequence[Fit],
+    stops: Sequence[float],
+    say: Progress,
+    tried: Sequence[Fit] = (),
 ) -> Iterator[_State]:
-    """The states that a search passes as it takes up ``terms``, one after the other."""
+    """The states that a search passes as it takes up ``terms``, one after the other.
+
+    Args:
+        tried: fits of all that may come first, if these have been made.
+    """
     comparison, nominal, best, rivals = state.comparison, state.nominal, state.best, dict(state.rivals)
     for _ in range(MOST_EFFECTS - len(best.model.candidates)):
         best = with_line(comparison, best)
@@ -143,7 +159,9 @@ def _extended(
         pool = [each for each in terms if not (adequate and each.effect in FREE)]
         candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
         say(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
-        if best.chi2 < (ASTRAY if taken else TRACKED) * best.rows.sum():
+        if tried:
+            fits, tried = list(tried), ()
+        elif best.chi2 < (ASTRAY if taken else TRACKED) * best.rows.sum():
             fits = near(comparison, best, candidates)
         else:
             if taken:
@@ -154,14 +172,16 @@ def _extended(
             return
         say(f"refit with {fits[0].model.candidates[-1].key}")
         comparison = Comparison(best.model.runs, measured_whiteners(fits[0].model, fits[0].x))
+        by_name = [fit for fit in fits if not _is_free(fit)]
         reach = max(CLOSE, NEARLY * (best.evidence - fits[0].evidence))
-        close = [solve(comparison, fit.model, fit.x) for fit in fits if fit.evidence < fits[0].evidence + reach][:6]
+        close = [fit for fit in fits if fit.evidence < fits[0].evidence + reach][:6]
+        close = solve_all(comparison, [(fit.model, fit.x) for fit in close])
         close = sorted((fit for fit in close if possible(fit)), key=lambda fit: fit.evidence)
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
         found = next((fit for fit in close if convincing(comparison, before, fit)), None)
         if found is None:
-            yield _State(comparison, nominal, before, rivals)
+            yield _State(comparison, nominal, before, rivals, by_name)
             return
         named = [each for each in candidates if each.term.effect not in FREE]
         leads = _behind_newest(found, before, close)
@@ -178,7 +198,7 @@ def _extended(
             found = final.fit
         rivals |= leads
         best = needed_only(comparison, found)
-        yield _State(comparison, nominal, best, rivals)
+        yield _State(comparison, nominal, best, rivals, by_name)
         if _is_free(best):
             return
 
@@ -299,11 +319,11 @@ def with_hum(comparison: Comparison, fit: Fit) -> Fit:
     return min(_by_hum(comparison, fit), key=lambda each: each.evidence)
 
 
-def _by_hum(comparison: Comparison, fit: Fit) -> Iterator[Fit]:
+def _by_hum(comparison: Comparison, fit: Fit) -> list[Fit]:
     """The fit without hum, and with hum of each mains frequency alone."""
-    for mains in ((), *((each,) for each in MAINS)):
-        model = Model(fit.model.runs, fit.model.device, fit.model.candidates, mains)
-        yield solve(comparison, model, model.embed(fit.model, fit.x), turns=3)
+    heard = ((), *((each,) for each in MAINS))
+    models = [Model(fit.model.runs, fit.model.device, fit.model.candidates, mains) for mains in heard]
+    return solve_all(comparison, [(model, model.embed(fit.model, fit.x)) for model in models], turns=3)
 
 
 def _quietest(fits: Iterable[Fit]) -> list[list[Whitener]]:

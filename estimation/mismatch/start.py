@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.experiment import Output
-from estimation.mismatch.fit import Comparison, Fit, solve
+from estimation.mismatch.fit import Comparison, Fit, solve, solve_all
 from estimation.mismatch.model import Model
 from estimation.mismatch.noise import Whitener, flat_psd, near_lines, noise_psd, whitener
 
@@ -89,14 +89,13 @@ def started(
             scored.sort(key=lambda pair: pair[0])
             x[at] = scored[0][1]
             starts.append([values for _, values in scored[:finalists]])
-    fits = []
-    for i in range(finalists):
-        tried = x.copy()
+    tried = [x.copy() for _ in range(finalists)]
+    for i, one in enumerate(tried):
         place = iter(starts)
         for r, run in enumerate(model.runs):
             for axis in run.inputs:
-                tried[_start_of(model, axis, r)] = next(place)[i]
-        fits.append(solve(comparison, model, tried, stop, turns=10))
+                one[_start_of(model, axis, r)] = next(place)[i]
+    fits = solve_all(comparison, [(model, one) for one in tried], stop, turns=10)
     return min(fits, key=lambda fit: fit.chi2 + fit.penalty)
 
 
