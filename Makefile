@@ -38,8 +38,7 @@ papers: $(STAMP)
 concealed: $(STAMP)
 	mkdir -p sealed
 	$(BIN)/python -m benchmarks.concealed.make sealed/recordings sealed/keys --workers 2
-	$(BIN)/python -m benchmarks.concealed.score sealed/recordings sealed/keys/keys.json sealed/out
-	cp sealed/out/score.md docs/concealed.md
+	$(BIN)/python -m benchmarks.concealed.score sealed/recordings sealed/keys/keys.json sealed/out --page docs/results.md
 
 wheel-check: $(STAMP)
 	$(BIN)/python benchmarks/wheel.py

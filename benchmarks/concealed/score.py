@@ -1,11 +1,12 @@
 """Run the diagnosis on sealed recordings, open the keys, and count.
 
-    python -m benchmarks.concealed.score RECORDINGS KEYS OUT [--timeout 600] [--workers 2]
+    python -m benchmarks.concealed.score RECORDINGS KEYS OUT [--timeout 600] [--workers 2] [--page PAGE]
 
 KEYS is a file of keys, or the folder into which they are being written: what is there by now is scored.
 
-Writes ``OUT/<recording>/`` (what the diagnosis wrote), ``OUT/score.json`` and ``OUT/score.md``. A recording whose
-diagnosis was run into the same OUT is not run again. Keys with one effect and no distances are taken as well.
+Writes ``OUT/<recording>/`` (what the diagnosis wrote), ``OUT/score.json`` and ``OUT/score.md``, which goes into PAGE as
+well. A recording whose diagnosis was run into the same OUT is not run again. Keys with one effect and no distances are
+taken as well.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from tqdm import tqdm
 from benchmarks.concealed.table import markdown, summary
 
 KEYS = "keys.json"
+BEGIN, END = "<!-- sealed recordings: written by `make concealed` -->\n", "<!-- end of sealed recordings -->"
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,15 @@ def keys_of(path: Path) -> dict[str, Any]:
     return keys
 
 
+def put_into(page: Path, text: str) -> None:
+    """Write ``text`` between the two marks of a page."""
+    before, _, rest = page.read_text().partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not end:
+        raise SystemExit(f"{page}: holds no {BEGIN.strip()} before {END}")
+    page.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Diagnose sealed recordings, then open their keys and count.")
     parser.add_argument("recordings", type=Path)
@@ -95,6 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--timeout", type=float, default=600.0, metavar="SECONDS")
     parser.add_argument("--workers", type=int, default=2, choices=(1, 2))
     parser.add_argument("--command", default=str(Path(sys.executable).with_name("lissajous")))
+    parser.add_argument("--page", type=Path)
     options = parser.parse_args(arguments)
     keys = keys_of(options.keys)
 
@@ -109,6 +121,8 @@ def main(arguments: list[str] | None = None) -> int:
     score = summary(runs)
     (options.out / "score.json").write_text(json.dumps(score, indent=1))
     (options.out / "score.md").write_text(markdown(score))
+    if options.page:
+        put_into(options.page, markdown(score))
     return 0
 
 
