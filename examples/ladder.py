@@ -25,5 +25,6 @@ def told(found: Diagnosis) -> str:
         values = ", ".join(
             f"{p.name} = {p.value:.5g} [{p.ci95[0]:.5g}, {p.ci95[1]:.5g}] {p.unit}" for p in finding.parameters
         )
-        lines.append(f"  {finding.stage}: {finding.effect} (probability {finding.probability:.3f}): {values}")
+        law = values or (finding.curve or {}).get("formula", "")
+        lines.append(f"  {finding.stage}: {finding.effect} (probability {finding.probability:.3f}): {law}")
     return "\n".join([*lines, f"  unexplained: {found.unexplained or 'nothing'}"])
