@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import cache
 from itertools import accumulate
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,9 +21,8 @@ from estimation.mismatch.free import FREE
 from estimation.mismatch.instead import instead
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.naming import HOPELESS, NO_VERDICT, QUIET, _beaten, _kept, _mirrored
 from estimation.mismatch.noise import noise_psd, whitener
-from estimation.mismatch.screen import Projection, all_candidates, gain_of
+from estimation.mismatch.screen import all_candidates
 from estimation.mismatch.start import first_whiteners, grown, measured_whiteners, started, windows
 from recon.cli import main
 from scanner.device import Axis, Device, Drive, Mechanics, Position
@@ -134,45 +132,6 @@ def test_a_drifting_baseline_is_neither_hum_nor_slow_noise() -> None:
     assert [(each.effect, each.stage) for each in told.findings] == [("offset-drift", "readout")]
     low, high = told.findings[0].parameters[0].ci95
     assert low < 0.03 < high
-
-
-def test_a_mode_told_with_the_wrong_sign_goes_on_with_the_other() -> None:
-    model = Model([experiment(recording(), DEVICE)], DEVICE, [Candidate(catalogue()["second-mode"], "x", "sense")])
-    fit = SimpleNamespace(model=model, x=np.linspace(-0.9, -0.1, len(model.free)))
-    changed = _mirrored(fit) != fit.x  # type: ignore[arg-type]
-    assert [f.name for f, turned in zip(model.free, changed, strict=True) if turned] == ["c", "0", "1"]
-
-
-def test_who_explains_a_window_as_well_stays_in_the_race() -> None:
-    def fit(evidence: float, chi2: float) -> SimpleNamespace:
-        model = SimpleNamespace(free=[], candidates=[])
-        return SimpleNamespace(model=model, x=np.zeros(0), evidence=evidence, chi2=chi2, rows=np.ones(1000, bool))
-
-    bent = 2.0 * NO_VERDICT  # what nominal values cost
-    fits = [fit(1000.0, 990.0), fit(1000.0 + bent, 995.0), fit(1000.0 + bent, 1100.0), fit(9000.0, 8990.0)]
-    far = [each.model for each in fits[:2]]
-    assert [model for model, _ in _kept(fits[:3], False, True)] == far  # type: ignore[arg-type]
-    lost = [fit(each.evidence + 5000.0, each.chi2 + 5000.0) for each in fits[:3]]
-    assert len(_kept(lost, False, True)) == 1  # type: ignore[arg-type]
-
-
-def test_a_fit_that_misses_more_by_now_than_its_rival_in_all_is_beaten() -> None:
-    comparison = SimpleNamespace(rows=np.ones(20_000, bool))
-    rival = SimpleNamespace(evidence=20_300.0, residual=np.ones(20_000))
-    seen = np.arange(20_000) < 8000
-    least = 8000.0 + HOPELESS + 300.0 + (1.0 - QUIET) * 12_000
-    for chi2, beaten in ((least - 1.0, False), (least + 1.0, True)):
-        fit = SimpleNamespace(rows=seen, chi2=chi2)
-        assert _beaten(comparison, fit, rival) is beaten  # type: ignore[arg-type]
-    assert not _beaten(comparison, fit, None)  # type: ignore[arg-type]
-
-
-def test_around_a_motion_that_has_burst_nothing_is_promised() -> None:
-    free = [SimpleNamespace(kind="nominal", owner="x")] * 2
-    model = SimpleNamespace(free=free, precision=np.ones(2))
-    burst = SimpleNamespace(jacobian=np.full((3, 2), 1e20), residual=np.full(3, 1e6), x=np.zeros(2), model=model)
-    known = Projection(burst, np.ones(3, bool))  # type: ignore[arg-type]
-    assert gain_of(*known.system(np.ones((3, 1)))[:2])[0] == 0.0
 
 
 def test_the_nominal_fit_finds_the_values_within_their_errors() -> None:
