@@ -81,8 +81,16 @@ def test_a_skewed_profile_has_a_skewed_interval() -> None:
     """One number with -2 log posterior (x - 1)^2 / 0.04 above 1 and four times that below."""
 
     class Skewed:
-        def residual(self, model: object, x: np.ndarray) -> np.ndarray:
-            return np.array([(x[0] - 1.0) / (0.2 if x[0] > 1.0 else 0.1), 0.0])
+        held = np.zeros(2, bool)
+
+        def fitted(self, stop: float) -> np.ndarray:
+            return ~self.held
+
+        def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
+            return np.array([(x[0] - 1.0) / (0.2 if x[0] > 1.0 else 0.1), x[1]])
+
+        def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
+            return np.diag([5.0 if x[0] > 1.0 else 10.0, 1.0])
 
     class Plain:
         precision = np.full(2, 1e-12)
@@ -93,3 +101,28 @@ def test_a_skewed_profile_has_a_skewed_interval() -> None:
     low, high = profile_interval(Skewed(), fit, 0)  # type: ignore[arg-type]
     assert high - 1.0 == pytest.approx(SIDE * 0.2, rel=1e-6)
     assert 1.0 - low == pytest.approx(SIDE * 0.1, rel=1e-6)
+
+
+def test_a_bent_ridge_is_followed_to_its_ends() -> None:
+    """-2 log posterior 4 (x - 1)^2 + 1e4 (y - x^2)^2: of x there is no doubt but the first term's, wherever y goes."""
+
+    class Bent:
+        held = np.zeros(2, bool)
+
+        def fitted(self, stop: float) -> np.ndarray:
+            return ~self.held
+
+        def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
+            return np.array([2.0 * (x[0] - 1.0), 100.0 * (x[1] - x[0] ** 2)])
+
+        def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
+            return np.array([[2.0, 0.0], [-200.0 * x[0], 100.0]])
+
+    class Plain:
+        precision = np.full(2, 1e-12)
+
+    rows, bent = np.ones(2, bool), Bent()
+    fit = Fit(Plain(), np.ones(2), 0.0, 0.0, np.zeros(2), bent.jacobian(None, np.ones(2)), rows, ~rows, 0.0)  # type: ignore[arg-type]
+    assert profile_interval(bent, fit, 0) == pytest.approx((1.0 - 0.5 * SIDE, 1.0 + 0.5 * SIDE), rel=1e-3)  # type: ignore[arg-type]
+    _, high = profile_interval(bent, fit, 1)  # type: ignore[arg-type]
+    assert high == pytest.approx((1.0 + 0.5 * SIDE) ** 2, rel=0.1)

@@ -175,6 +175,7 @@ def solve(
     steps: Array | None = None,
     tolerance: float = 0.05,
     hopeless: float = np.inf,
+    fixed: int | None = None,
 ) -> Fit:
     """Levenberg-Marquardt on the fitted samples up to the fraction ``stop`` of the recordings.
 
@@ -184,6 +185,7 @@ def solve(
         steps: difference steps, adapted in place.
         tolerance: stop when a step lowers chi-square by less.
         hopeless: stop when chi-square is still above and no longer comes down towards it.
+        fixed: which of x stays as it is.
     """
     steps = np.full(x.size, 1e-4) if steps is None else steps
     rows = comparison.fitted(stop)
@@ -197,6 +199,8 @@ def solve(
         part = jacobian[rows]
         normal = part.T @ part + np.diag(precision)
         gradient = part.T @ residual[rows] + precision * x
+        if fixed is not None:
+            normal[fixed], normal[:, fixed], normal[fixed, fixed], gradient[fixed] = 0.0, 0.0, 1.0, 0.0
         gain = promised = 0.0
         while damping < 1e8:
             try:
