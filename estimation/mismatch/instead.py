@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Comparison, Fit, solve_all
+from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.naming import HOPELESS, possible
 from estimation.mismatch.screen import LARGEST, Projection, Screened, amplitudes, gain_of, placed, screen
@@ -82,15 +83,18 @@ def instead(
         promised = [(*promise(group), group) for group in combinations(range(len(seen)), size)]
         promised.sort(key=lambda each: -each[0])
         for place, (_, estimate, group) in enumerate(promised):
-            if place < TRIED or (size == 1 and any(_alike(seen[group[0]].candidate, each) for each in gone)):
+            if place < TRIED or (size == 1 and any(_akin(seen[group[0]].candidate, each) for each in gone)):
                 starts.append(_start(fit, gone, [seen[i] for i in group], estimate))
     # Around a free correction the way is far; around a named fit, what is not soon as good never will be.
     fits = solve_all(comparison, starts, turns=20 if pairs else 8, hopeless=fit.evidence + HOPELESS)
     return sorted((each for each in fits if possible(each)), key=lambda each: each.evidence)
 
 
-def _alike(one: Candidate, other: Candidate) -> bool:
-    """Whether two terms are known for taking each other's place: where they are large, first order may miss it."""
+def _akin(one: Candidate, other: Candidate) -> bool:
+    """Whether two terms are known for taking each other's place, as every law of a stage may take that of its free
+    correction: where they are large, first order may miss it."""
+    if other.term.effect in FREE:
+        return one.term.stage == other.term.stage
     return other.term.effect in one.term.lookalikes or one.term.effect in other.term.lookalikes
 
 
