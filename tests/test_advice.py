@@ -77,52 +77,50 @@ def test_the_profile_rises_by_what_95_percent_are(fitted: tuple[Comparison, Fit]
     assert low * scale < cubic_spring(0.012) < high * scale
 
 
+class Posterior:
+    """A comparison of two samples with a model of two numbers, and that model; both samples are fitted."""
+
+    held, precision = np.zeros(2, bool), np.full(2, 1e-12)
+
+    def fitted(self, stop: float) -> np.ndarray:
+        return ~self.held
+
+    def best(self, *x: float) -> Fit:
+        """The fit at ``x``, where nothing is missed."""
+        at = np.array(x)
+        return Fit(self, at, 0.0, 0.0, np.zeros(2), self.jacobian(self, at), ~self.held, self.held, 0.0)  # type: ignore[arg-type]
+
+
+class Skewed(Posterior):
+    """-2 log posterior (x - 1)^2 / 0.04 above 1 and four times that below."""
+
+    def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
+        return np.array([(x[0] - 1.0) / (0.2 if x[0] > 1.0 else 0.1), x[1]])
+
+    def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
+        return np.diag([10.0 if x[0] < 1.0 else 5.0, 1.0])
+
+
+class Bent(Posterior):
+    """-2 log posterior 4 (x - 1)^2 + 1e4 (y - x^2)^2: of x there is no doubt but the first term's, wherever y goes."""
+
+    def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
+        return np.array([2.0 * (x[0] - 1.0), 100.0 * (x[1] - x[0] ** 2)])
+
+    def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
+        return np.array([[2.0, 0.0], [-200.0 * x[0], 100.0]])
+
+
 def test_a_skewed_profile_has_a_skewed_interval() -> None:
-    """One number with -2 log posterior (x - 1)^2 / 0.04 above 1 and four times that below."""
-
-    class Skewed:
-        held = np.zeros(2, bool)
-
-        def fitted(self, stop: float) -> np.ndarray:
-            return ~self.held
-
-        def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
-            return np.array([(x[0] - 1.0) / (0.2 if x[0] > 1.0 else 0.1), x[1]])
-
-        def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
-            return np.diag([5.0 if x[0] > 1.0 else 10.0, 1.0])
-
-    class Plain:
-        precision = np.full(2, 1e-12)
-
-    rows = np.ones(2, bool)
-    jacobian = np.array([[5.0, 0.0], [0.0, 1.0]])
-    fit = Fit(Plain(), np.array([1.0, 0.0]), 0.0, 0.0, np.zeros(2), jacobian, rows, ~rows, 0.0)  # type: ignore[arg-type]
-    low, high = profile_interval(Skewed(), fit, 0)  # type: ignore[arg-type]
+    skewed = Skewed()
+    low, high = profile_interval(skewed, skewed.best(1.0, 0.0), 0)  # type: ignore[arg-type]
     assert high - 1.0 == pytest.approx(SIDE * 0.2, rel=1e-6)
     assert 1.0 - low == pytest.approx(SIDE * 0.1, rel=1e-6)
 
 
 def test_a_bent_ridge_is_followed_to_its_ends() -> None:
-    """-2 log posterior 4 (x - 1)^2 + 1e4 (y - x^2)^2: of x there is no doubt but the first term's, wherever y goes."""
-
-    class Bent:
-        held = np.zeros(2, bool)
-
-        def fitted(self, stop: float) -> np.ndarray:
-            return ~self.held
-
-        def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
-            return np.array([2.0 * (x[0] - 1.0), 100.0 * (x[1] - x[0] ** 2)])
-
-        def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
-            return np.array([[2.0, 0.0], [-200.0 * x[0], 100.0]])
-
-    class Plain:
-        precision = np.full(2, 1e-12)
-
-    rows, bent = np.ones(2, bool), Bent()
-    fit = Fit(Plain(), np.ones(2), 0.0, 0.0, np.zeros(2), bent.jacobian(None, np.ones(2)), rows, ~rows, 0.0)  # type: ignore[arg-type]
+    bent = Bent()
+    fit = bent.best(1.0, 1.0)
     assert profile_interval(bent, fit, 0) == pytest.approx((1.0 - 0.5 * SIDE, 1.0 + 0.5 * SIDE), rel=1e-3)  # type: ignore[arg-type]
     _, high = profile_interval(bent, fit, 1)  # type: ignore[arg-type]
     assert high == pytest.approx((1.0 + 0.5 * SIDE) ** 2, rel=0.1)
