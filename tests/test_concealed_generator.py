@@ -324,6 +324,13 @@ def test_a_lone_tone_is_as_plain_as_its_energy_says():
     assert seen["distance"] <= seen["sigma"]
 
 
+def test_what_nobody_states_may_be_off_by_two_percent():
+    """A filter of which no tolerance is stated lies only as many of the default off as its corners do."""
+    sealed = seal(order("drive", "filter-lag"))
+    (seen,) = distances(sealed)
+    assert seen["sigma"] == pytest.approx(abs(sealed.hidden[0].size) / 0.02, rel=0.1)
+
+
 def test_drag_lies_nearest_to_other_damping():
     (seen,) = distances(seal(order("ring", "quadratic-drag")))
     assert seen["nearest"] in {"cubic-damping", "coulomb-friction", "viscoelastic", "damping-drift"}

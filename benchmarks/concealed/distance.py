@@ -27,13 +27,17 @@ from benchmarks.concealed.worlds import World
 Array = NDArray[np.float64]
 
 UNSTATED = 0.02
-"""Relative uncertainty of a nominal value whose tolerance the device file does not state."""
+"""Relative uncertainty of a nominal value whose tolerance the device file does not state, the reference angle's gain
+included: nothing says how well that one is calibrated."""
 START = 0.1
 """Uncertainty of the state in which a recording finds the mirror, over its swing."""
 SHAPES = np.array([[0.15, 0.85, 0.1], [0.45, 0.55, 0.4], [0.8, 0.2, 0.75]])
 """At which a look-alike whose law has a shape is tried, in order of their first number."""
-FIELDS = {"b_cir": "offset"}
+FIELDS = {"b_cir": "offset", "lpf_hz": "sections"}
 """Nominal values that the truth calls by another name."""
+NOMINAL = ("J", "b", "k", "torque_per_volt", "C0", "theta0", "R_s", "a_cir", "b_cir", "gain")
+DEMODULATED = ("Cb", "lpf_hz")
+"""What only a readout of the capacitance itself, not of its rate, depends on."""
 
 
 def distances(sealed: Sealed) -> list[dict[str, Any]]:
@@ -62,7 +66,7 @@ def _distance(sealed: Sealed, secret: Hidden) -> dict[str, Any]:
         start = settle(scene.world, to) if effect.stage == "mechanics" else world
         return change(to, effect.gentle**effect.power, start)
 
-    nuisances, priors = zip(*_nuisances(sealed, world, base, change), strict=True)
+    nuisances, priors = zip(*_nuisances(sealed, world, base, change, here), strict=True)
     free = [change(_hiding(scene, [replace(h, size=1.005 * h.size) for h in others]), 0.005)] if others else []
     taken = {name for h in sealed.hidden for name in h.fields}
     rivals = [
@@ -128,15 +132,15 @@ def _hiding(scene: Scene, hidden: Iterable[Hidden]) -> Truth:
 
 
 def _nuisances(
-    sealed: Sealed, world: World, truth: Truth, change: Callable[..., Array]
+    sealed: Sealed, world: World, truth: Truth, change: Callable[..., Array], here: Array
 ) -> Iterator[tuple[Array, float]]:
     """Columns of what a fit is free to move, and the weight of the prior that holds each: 1 of a tolerance, 0 none."""
-    tolerance: dict[str, float] = dict(world.device["x"]["tolerance"])
-    if not truth.torque_per_volt:
-        tolerance.setdefault("J", UNSTATED)
-    for name, relative in tolerance.items():
-        field = str(FIELDS.get(name, name))
-        moved: dict[str, float] = {field: getattr(truth, field) * (1 + 0.01 * relative)}
+    stated: dict[str, float] = world.device["x"]["tolerance"]
+    for name in (*NOMINAL, *(DEMODULATED if truth.a_cir else ())):
+        field = FIELDS.get(name, name)
+        moved: dict[str, float] = {field: getattr(truth, field) * (1 + 0.01 * stated.get(name, UNSTATED))}
+        if moved[field] == 0.0:
+            continue
         yield change(truth._replace(**moved), 0.01), 1.0
     for state, size in ((THETA, world.swing), (RATE, world.swing * world.omega)):
         initial = world.initial.copy()
@@ -144,7 +148,11 @@ def _nuisances(
         yield change(truth, 1e-4 / START, replace(world, initial=initial)), 1.0
     yield change(truth._replace(offset=truth.offset + 1e-3 * sealed.scene.height), 1e-3), 0.0
     t = world.times
-    silent = np.zeros(world.samples if world.angle_sd is not None else 0)
+    angle = here[world.samples :]
+    silent = np.zeros(angle.size)
+    if angle.size:
+        yield np.concatenate([np.zeros(t.size), UNSTATED * angle]), 1.0
+        yield np.concatenate([np.zeros(t.size), np.ones(t.size)]), 0.0
     for harmonic in range(1, len(sealed.noise.hum) + 1):
         turn = 2 * pi * sealed.noise.mains * harmonic * t
         for wave in (np.sin(turn), np.cos(turn)):

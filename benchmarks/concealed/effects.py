@@ -184,7 +184,7 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect("viscoelastic", "mechanics", {"ring": (0.02, 0.2), "drive": (0.001, 0.008), "tf": (0.02, 0.2)}, shaped=True,
            law=lambda s, p, r, u: {"k_v": r * p.k, "tau_v": 0.2 * 30 ** float(u[0]) / s.omega}),
     Effect("second-mode", "mechanics", {"ring": (0.02, 0.15), "drive": (0.01, 0.05), "tf": (0.02, 0.15)}, shaped=True,
-           parameters=IN_HERTZ, gentle=0.2, power=2, law=_second_mode),
+           parameters=IN_HERTZ, gentle=0.1, power=2, law=_second_mode),
     Effect("mode-coupling", "mechanics", {"drive": (1.5, 4.0), "tf": (3.0, 6.0)}, shaped=True,
            parameters=IN_HERTZ, gentle=1.0, law=_mode_coupling),
     Effect("inertia-scale", "mechanics", {"drive": (0.05, 0.3)}, signed=True, law=lambda s, p, r, u: {"scale": 1 + r}),
