@@ -29,6 +29,9 @@ LEAST_BINS = 14
 SLOPE_SD = 0.3
 """Standard deviation of the power law that continues the spectrum below its first window."""
 
+SLOWEST = 6
+"""Half bins, from 0 Hz on, of which no noise is measured: wandering so slow is physics to judge."""
+
 STEEPER = 0.6
 """By how much it may really rise more steeply: two medians of fourteen bins tell no better."""
 
@@ -115,6 +118,13 @@ def periodogram(residual: Array) -> Array:
     return np.abs(np.fft.rfft(residual * window)) ** 2 * (residual.size / np.sum(window**2))
 
 
+def without_slow(residual: Array) -> Array:
+    """A residual without its slowest wandering: a strong one leaks through any window into what is measured."""
+    cosines = dct(residual, norm="ortho")
+    cosines[:SLOWEST] = 0.0
+    return np.asarray(idct(cosines, norm="ortho"))
+
+
 def noise_psd(
     residual: Array, bins: int, step: float, lines: Sequence[float] | Array, width: float
 ) -> tuple[Array, float]:
@@ -130,7 +140,7 @@ def noise_psd(
     Returns:
         variances, shape (bins,), and the slowest bin that was measured.
     """
-    power = periodogram(residual)
+    power = periodogram(without_slow(residual))
     frequency = np.arange(power.size) / (residual.size * step)
     spoilt = near_lines(frequency, lines, max(width, 3.0 / (residual.size * step)))
     spoilt[:3] = True  # the slowest wandering is physics to judge, its noise is continued from above

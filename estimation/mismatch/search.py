@@ -112,7 +112,12 @@ def search(runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: 
         enough = several.best.held_chi2 - 1.0 < NEXT_TO_NOTHING * (several.nominal.held_chi2 - 1.0)
         if enough and solve(found.comparison, several.best.model, several.best.x).evidence < found.best.evidence:
             found = several
-    if found.best.model.candidates and not _is_free(found.best):
+    if _is_free(found.best):
+        # with the numbers alone that it needs its law is plainer, and better known
+        fewer = sparse(found.comparison, found.best)
+        if fewer is not None and fewer.evidence < found.best.evidence:
+            found = replace(found, best=fewer)
+    elif found.best.model.candidates:
         found = _unnamed(found)
     rounds = tuple(
         _round(found.comparison, found.nominal, found.best, each, found.rivals.get(each.key, ()))
@@ -153,8 +158,12 @@ def _extended(
     """
     comparison, nominal, best, rivals = state.comparison, state.nominal, state.best, dict(state.rivals)
     for _ in range(MOST_EFFECTS - len(best.model.candidates)):
-        best = with_line(comparison, best)
         taken = {each.key for each in best.model.candidates}
+        if taken:
+            # It was measured where these had not been fitted under it: what they left then passes for noise.
+            comparison = Comparison(best.model.runs, measured_whiteners(best.model, best.x))
+            best = solve(comparison, best.model, best.x)
+        best = with_line(comparison, best)
         adequate = bool(rivals) and best.held_chi2 < ADEQUATE
         pool = [each for each in terms if not (adequate and each.effect in FREE)]
         candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
