@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from test_mismatch import DEVICE, RATE, N, recording
+import pytest
+from test_mismatch import DEVICE, F0, RATE, N, recording
 
 from estimation.mismatch.diagnosis import diagnose
 from estimation.mismatch.experiment import experiment
 from estimation.mismatch.fit import Comparison, Fit, solve
-from estimation.mismatch.free import FREE
+from estimation.mismatch.free import FREE, remembered
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.search import _State, _unnamed
 from estimation.mismatch.start import first_whiteners, grown, started, windows
@@ -40,6 +41,23 @@ def test_a_delay_that_grows_with_the_swing_is_unknown_in_the_timing() -> None:
     swing, delay, sd = np.array(curve["points"]).T
     assert (np.abs(delay - 2e-6 * (swing / 1e-3) ** 2) < 4.0 * sd + 1e-9).all()
     assert sd[-1] < 0.1 * delay[-1]
+
+
+def test_a_delay_that_remembers_the_swing_is_unknown_in_the_timing() -> None:
+    """A delay of the swing as it is left enough for a force over the motion's state to do better."""
+    told = diagnose([recording(late=1e-5, memory=4 / F0, seed=6)])
+    assert [(each.effect, each.stage) for each in told.findings] == [("unknown", "timing")]
+    scatter = np.sqrt(2.0 / told.search.final.held.sum())
+    assert told.search.final.held_chi2 < 1.0 + 3.0 * scatter < 2.0 < told.search.nominal.held_chi2
+    curve = told.findings[0].curve
+    assert curve is not None
+    assert "M_4" in curve["formula"].split(" with ")[0]
+
+
+def test_what_is_remembered_fades_as_an_exponential() -> None:
+    step = np.repeat([0.0, 1.0], [5, 100])
+    assert remembered(step, 20.0)[5:] == pytest.approx(1.0 - np.exp(-np.arange(1, 101) / 20.0))
+    assert remembered(step[5:], 20.0) == pytest.approx(1.0)
 
 
 def test_a_play_in_the_readout_is_unknown_in_the_readout() -> None:

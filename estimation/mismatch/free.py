@@ -11,11 +11,15 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from scanner.terms import Parameter, Term, View
 from scanner.trajectory import BELL, TORQUE
 
 Array = NDArray[np.float64]
+
+FADING = (0.05, 0.25)
+"""Shares of the recording's length over which stiffness and damping remember the swing, as what warms with it does."""
 
 DEGREE = 5
 """Highest total degree of the free force in angle and rate."""
@@ -36,6 +40,9 @@ of other things, up to a dozen cycles where nothing else stands."""
 PLAYS = (0.125, 0.25, 0.5, 1.0)
 """Half-widths, over the signal's deviation, of the plays in a readout: weighed against each other they make up any
 memory without rate (Prandtl-Ishlinskii)."""
+
+MEMORIES = (1.0, 4.0, 16.0)
+"""Turns of the motion over which a delay remembers the swing: weighed against each other they make up any fading."""
 
 STEEPEST = 2.0
 """Slope of the drive, over its deviation and rate, from which a law of it says no more: edges are steep without end."""
@@ -68,6 +75,12 @@ def play(signal, width):  # type: ignore[no-untyped-def]
     return out
 
 
+def remembered(swing: Array, samples: float) -> Array:
+    """``swing`` (n,) behind a first-order low-pass with a time constant in samples, at rest at the first of them."""
+    kept = np.exp(-1.0 / samples)
+    return np.asarray(lfilter([1.0 - kept], [1.0, -kept], swing, zi=[kept * swing[0]])[0])
+
+
 @njit(TORQUE, cache=True)
 def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
     x, y = theta / p[0], omega / (p[0] * p[1])
@@ -76,9 +89,11 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
         for j in range(n + 1):
             total += p[at] * x ** (n - j) * y**j
             at += 1
+    total += (p[at] * z0 + p[at + 1] * z1) * x + (p[at + 2] * z0 + p[at + 3] * z1) * y
     turn = np.pi * t / p[2]
-    total += _cosines(turn, p[at::2]) * x + _cosines(turn, p[at + 1 :: 2]) * y
-    return -total * nominal[2] * p[0], 0.0, 0.0
+    total += _cosines(turn, p[at + 4 :: 2]) * x + _cosines(turn, p[at + 5 :: 2]) * y
+    swing = x * x + y * y
+    return -total * nominal[2] * p[0], (swing - z0) / (p[2] * FADING[0]), (swing - z1) / (p[2] * FADING[1])
 
 
 @njit(TORQUE, cache=True)
@@ -150,8 +165,12 @@ def _readout(signal: Array, p: Sequence[float], view: View) -> Array:
 
 def _timing(signal: Array, p: Sequence[float], view: View) -> Array:
     swing = (view.theta**2 + (view.rate / p[1]) ** 2) / p[2] ** 2
-    late = waves(np.pi * view.time / p[0], p[5:]) + swing * (p[3] + p[4] * swing)
-    return signal - late * np.gradient(signal, view.step)
+    turn = 2.0 * np.pi / (p[1] * view.step)
+    behind = sum(m * (remembered(swing, n * turn) - swing) for m, n in zip(p[5:8], MEMORIES, strict=True))
+    late = waves(np.pi * view.time / p[0], p[8:]) + swing * (p[3] + p[4] * swing) + behind
+    slope = np.gradient(signal, view.step)
+    # to second order: half the square of a tenth of a radian is seen where the signal is a thousand times its noise
+    return signal - late * (slope - 0.5 * late * np.gradient(slope, view.step))
 
 
 def _optics(signal: Array, p: Sequence[float], view: View) -> Array:
@@ -169,19 +188,20 @@ FREE: dict[str, Term] = {
     term.effect: term
     for term in (
         Term(
-            "free-mechanics", "mechanics", "J θ'' + b θ' + k θ + f(θ, θ', t) = τ",
+            "free-mechanics", "mechanics", "J θ'' + b θ' + k θ + f(θ, θ', t, H_s[r]) = τ",
             (
                 Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
                 Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 *(Parameter(f"f{i}{j}", "k A", _size(i, j)) for i, j in POWERS),
+                *(Parameter(f"h{i}", "k", _size(1, i // 2)) for i in range(4)),
                 *(
                     Parameter(f"{name}{j}", "k A", size)
                     for j in range(1, WAVES + 1)
                     for name, size in (("k", lambda s: 0.01), ("b", lambda s: 0.3 * s.b * s.rate / s.k))
                 ),
             ),
-            SOURCE, torque=_force,
+            SOURCE, torque=_force, hidden=(lambda s: 1.0, lambda s: 1.0),
         ),
         Term(
             "free-stiffness", "mechanics", "J θ'' + (b + δb(t)) θ' + (k + δk(t)) θ = τ",
@@ -225,12 +245,13 @@ FREE: dict[str, Term] = {
             SOURCE, output=_readout,
         ),
         Term(
-            "free-timing", "timing", "y(t − δ(t, r))",
+            "free-timing", "timing", "y(t − δ(t, r, M_n[r]))",
             (
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
                 Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
                 *(Parameter(f"r{i}", "s", lambda s: 0.05 / s.rate) for i in (2, 4)),
+                *(Parameter(f"m{i}", "s", lambda s: 0.05 / s.rate) for i in range(len(MEMORIES))),
                 *(Parameter(f"d{i}", "s", lambda s: 0.05 / s.rate) for i in range(DELAYS + 1)),
             ),
             SOURCE, output=_timing, channels=("sense", "angle"),

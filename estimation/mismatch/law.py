@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.mismatch.fit import Fit
-from estimation.mismatch.free import DEGREE, KNOTS, PLAYS, play
+from estimation.mismatch.free import DEGREE, FADING, KNOTS, MEMORIES, PLAYS, play
 from scanner.terms import Scales
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ EARNS = 12.0
 LENGTH = "T: the recording's length"
 STATE = "x = θ/A, y = θ'/(A ω)"
 VARIABLES = {
-    "free-mechanics": ("f/(k A)", f"{STATE}, {LENGTH}"),
+    "free-mechanics": ("f/(k A)", f"{STATE}, H_s: x² + y² as remembered over s T, {LENGTH}"),
     "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
     "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
     "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),
@@ -27,19 +27,22 @@ VARIABLES = {
         "δy/s",
         f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), P_h: play of half-width h, s: the signal's rms, {LENGTH}",
     ),
-    "free-timing": ("delay/s", f"r² = x² + y², {STATE}, {LENGTH}"),
+    "free-timing": ("delay/s", f"r² = x² + y², {STATE}, M_n: what is remembered over n turns, {LENGTH}"),
     "free-optics": ("δθ/A", "x = θ/A"),
 }
 """What the formula of a free correction gives, and the variables that it is written in."""
 
 POLYNOMIALS = {
+    "free-mechanics": {f"h{2 * i + j}": f"H_{FADING[j]:g} {state}" for i, state in enumerate("xy") for j in range(2)},
     "free-capacitance": {"a1": "u", "a3": "u³", "a4": "u⁴", "a5": "u⁵", "a6": "u⁶"},
     "free-drive": {"v0": "u", "v1": "v", "v2": "u²", "v3": "u³", "v4": "u v", "v5": "v³"},
     "free-readout": {
         "y0": "u²", "y1": "u³", "y2": "w", "w0": "u y", "w1": "u x y", "w2": "u r", "w3": "u r³", "w4": "u r⁵",
         **{f"m{i}": f"(P_{width}[u] − u)" for i, width in enumerate(PLAYS)},
     },
-    "free-timing": {"r2": "r²", "r4": "r⁴"},
+    "free-timing": {
+        "r2": "r²", "r4": "r⁴", **{f"m{i}": f"(M_{turns:g}[r²] − r²)" for i, turns in enumerate(MEMORIES)},
+    },
 }  # fmt: skip
 """Parts of free corrections that are no cosines, as a formula shows them."""
 
