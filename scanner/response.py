@@ -218,7 +218,7 @@ def _thirds(path: Path) -> Array:
     return np.stack([a, middle, b], axis=1)
 
 
-def sense(readout: Readout, paths: Sequence[Path]) -> Array:
+def sense(readout: Readout, paths: Sequence[Path], beneath: Array | float = 0.0) -> Array:
     """The sense channel, shape (n + 1,) [V]; several paths stand for combs on one electrode.
 
     Args:
@@ -243,7 +243,7 @@ def sense(readout: Readout, paths: Sequence[Path]) -> Array:
                 transimpedance_voltage(_comb_slope(path), path.rate, readout.R_s, path.voltage) for path in paths
             ]
             signal = np.sum(currents, axis=0)
-    return passed("sense", signal, paths, readout)
+    return passed("sense", signal, paths, readout, beneath)
 
 
 def effective(readout: Readout, paths: Sequence[Path]) -> Readout:
@@ -259,13 +259,23 @@ def reference(path: Path) -> Array:
     return passed("angle", path.angle, [path], path.axis.readout)
 
 
-def passed(channel: str, signal: Array, paths: Sequence[Path], readout: Readout | None) -> Array:
-    """``signal`` after the terms that act on ``channel``, in the order of their stages, those of its output last."""
-    acting = [(each, path) for path in paths for each in path.added]
-    for each, path in sorted(acting, key=lambda pair: (pair[0].term.at_output, STAGES.index(pair[0].term.stage))):
-        kind, _, variant = each.channel.partition(":")
-        if kind == channel:
-            signal = each.term.passed(signal, each.values, _view(path, readout, variant))
+def passed(
+    channel: str, signal: Array, paths: Sequence[Path], readout: Readout | None, beneath: Array | float = 0.0
+) -> Array:
+    """``signal`` after the terms that act on ``channel``, in the order of their stages, those of its output last.
+
+    Args:
+        beneath: what lies under the channel whatever the mirror does (hum): an output clips it with the signal.
+    """
+    acting = [(each, path) for path in paths for each in path.added if each.channel.partition(":")[0] == channel]
+    acting.sort(key=lambda pair: STAGES.index(pair[0].term.stage))
+    for at_output in (False, True):
+        for each, path in acting:
+            if each.term.at_output is at_output:
+                variant = each.channel.partition(":")[2]
+                signal = each.term.passed(signal, each.values, _view(path, readout, variant))
+        if not at_output:
+            signal = signal + beneath
     return signal
 
 

@@ -91,6 +91,8 @@ def recording(k3: float = 0.0, b2: float = 0.0, seed: int = 0, coloured: bool = 
         noise = noise + slow + 1e-3 * np.cos(2 * np.pi * 50 * np.arange(N) / RATE + 1.0)
     sense = 20.0 * angle * (1 + change.get("gain", 0.0) * np.arange(N) / N) + noise
     sense += change.get("drift", 0.0) * np.cos(np.pi * np.arange(N) / N)
+    sense += change.get("hum", 0.0) * np.cos(2 * np.pi * 50 * np.arange(N) / RATE + 1.0)
+    sense = np.clip(sense, -change.get("limit", np.inf), change.get("limit", np.inf))
     channels = {"drive_x": (drive, "V", RATE, 0.0), "sense_x": (sense, "V", RATE, 0.0)}
     return Recording.from_arrays(channels, device=DEVICE, name="bench <b>")
 
@@ -135,6 +137,16 @@ def test_a_drifting_baseline_is_neither_hum_nor_slow_noise() -> None:
     assert [(each.effect, each.stage) for each in told.findings] == [("offset-drift", "readout")]
     low, high = told.findings[0].parameters[0].ci95
     assert low < 0.03 < high
+
+
+def test_hum_is_clipped_with_the_signal() -> None:
+    """Hum behind the clip left what interference or a drifting offset before it explains: two findings for one."""
+    size = 20.0 * np.abs(signals(0.0, 0.0)[1]).max()
+    told = diagnose([recording(limit=0.6 * size, hum=2e-3, seed=9)])
+    assert [each.effect for each in told.findings] == ["saturation"]
+    (limit,) = told.findings[0].parameters
+    assert limit.ci95[0] < 0.6 * size < limit.ci95[1]
+    assert told.search.final.held_chi2 == pytest.approx(1.0, abs=0.15)
 
 
 def test_the_nominal_fit_finds_the_values_within_their_errors() -> None:

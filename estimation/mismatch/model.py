@@ -36,6 +36,8 @@ START_SD = 3.0
 REFERENCE_GAIN_SD = 0.02
 """Relative gain of a reference angle, where nothing is stated: the contract's default tolerance."""
 
+_NOTHING: tuple[list[int], Array] = [], np.zeros((0, 0))
+
 OFFSET_SD = 0.05
 """Prior of an offset that nobody states, in units of the signal's deviation."""
 
@@ -125,9 +127,17 @@ class Model:
         self.free = tuple(self._free())
         self.precision = np.array([each.precision for each in self.free])
         self._where = {(f.kind, f.owner, f.name, f.run): i for i, f in enumerate(self.free)}
-        self.basis = {
-            (r, output.name): self._basis(r, output) for r, run in enumerate(self.runs) for output in run.outputs
-        }
+        # Shapes of what lies under a channel: behind all else, or before an output that clips it with the signal.
+        self.basis, self._beneath = {}, {}
+        terms = [each.term for each in self.candidates] + [each.term for added in self.given.values() for each in added]
+        clips = any(term.at_output for term in terms)
+        for r, run in enumerate(self.runs):
+            for output in run.outputs:
+                at, shapes = self._basis(r, output)
+                if clips and output.kind == "sense":
+                    self._beneath[r, output.name] = at, _on_grid(shapes, output, run)
+                    at, shapes = _NOTHING
+                self.basis[r, output.name] = at, shapes
         self._paths: dict[_Key, Path] = {}
         self._ready: dict[_Key, Path] = {}
         self._made: dict[_Key, Axis] = {}
@@ -228,7 +238,8 @@ class Model:
 
     def full_signals(self, x: Array, r: int = 0) -> list[Array]:
         """Every channel of one run on the whole integration grid, shape (n + 1,) each, nothing added under it."""
-        return self._signals(self.runs[r], r, {name: self.nominal(name, x) for name in self.axes}, x, 1.0)
+        bare = np.where([each.kind == "additive" for each in self.free], 0.0, x)
+        return self._signals(self.runs[r], r, {name: self.nominal(name, x) for name in self.axes}, bare, 1.0)
 
     def _run_outputs(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
         signals = self._signals(run, r, axes, x, stop)
@@ -243,7 +254,8 @@ class Model:
             if output.kind == "sense":
                 readout = axes[output.axes[0]].readout
                 assert readout is not None
-                signals.append(sense(readout, seen))
+                at, shapes = self._beneath.get((r, output.name), _NOTHING)
+                signals.append(sense(readout, seen, x[at] @ shapes[:, : seen[0].angle.size] if at else 0.0))
             else:
                 signals.append(reference(seen[0]))
         return signals
@@ -328,6 +340,13 @@ class Model:
         return np.array(
             [0.0 if (i := other.index(f.kind, f.owner, f.name, f.run)) is None else x[i] for f in self.free]
         )
+
+
+def _on_grid(shapes: Array, output: Output, run: Run) -> Array:
+    """``shapes`` (q, n) on a channel's own clock, on the integration grid, (q, N + 1): they are slow."""
+    grid = np.arange(len(run.inputs[output.axes[0]].voltage) + 1)
+    at, own = (grid - output.first) / output.stride, np.arange(shapes.shape[1])
+    return np.array([np.interp(at, own, shape) for shape in shapes]).reshape(len(shapes), grid.size)
 
 
 @lru_cache(maxsize=16)
