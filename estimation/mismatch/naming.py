@@ -100,9 +100,9 @@ def convincing(comparison: Comparison, before: Fit, after: Fit) -> bool:
     if changed < share:
         beside_clip = any(each.term.at_output for each in before.model.candidates)
         return unharmed and lead > 2.0 * LEAD_OVER_NOTHING and not beside_clip
-    if not before.model.candidates:
-        # A further one must not be how the first one's law was written down; this one need only be there, and what it
-        # gains scatters by twice the root of what it changes.
+    if lead > 4.0 * LEAD_OVER_NOTHING and not before.model.candidates:
+        # No chance leads by so much, and none is how another term's law was written down: it has to gain what it may,
+        # which scatters by twice the root of what it changes.
         share = min(share, max(0.0, changed - 4.0 * np.sqrt(changed)))
     return gained > share
 
