@@ -21,7 +21,7 @@ LEAD_OVER_NOTHING = 10.0
 """Fall of -2 log evidence from which a term is said to be there at all."""
 
 DOUBTFUL = 2.5
-"""Times ``LEAD_OVER_NOTHING`` that must be left of a lead of which steeper slow noise explains the most: of false drifts
+"""Times ``LEAD_OVER_NOTHING`` that must be left of a lead most of which steeper slow noise explains: of false drifts
 17 to 22 were left, of true ones 32 and more."""
 
 LEAD_OVER_NEXT = 6.0
