@@ -277,11 +277,13 @@ def _behind_newest(found: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, L
 
 
 def _merged(*parts: Leads) -> Leads:
-    """All rivals, each with its smallest distance, the nearest first."""
+    """All rivals, the nearest first: each as near, and fitting as well, as the best of its fits in either."""
     nearest: dict[str, Lead] = {}
     for lead in (each for part in parts for each in part):
-        if lead.candidate.key not in nearest or lead.behind < nearest[lead.candidate.key].behind:
-            nearest[lead.candidate.key] = lead
+        known = nearest.setdefault(lead.candidate.key, lead)
+        nearest[lead.candidate.key] = Lead(
+            min(known.behind, lead.behind), lead.candidate, min(known.worse, lead.worse)
+        )
     return tuple(sorted(nearest.values(), key=lambda each: each.behind))
 
 
