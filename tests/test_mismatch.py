@@ -205,6 +205,9 @@ def test_a_strong_drift_leaves_the_measured_noise_as_it_is() -> None:
     still, _ = noise_psd(noise, 2001, 1e-4, [100.0], 5.0)
     drifting, _ = noise_psd(noise + drift, 2001, 1e-4, [100.0], 5.0)
     np.testing.assert_allclose(drifting, still, rtol=1e-6)
+    settling = 300.0 * np.exp(-turn / (0.3 * np.pi))  # no sum of a few cosines: through the window alone 14 times
+    drifting, _ = noise_psd(noise + settling, 2001, 1e-4, [100.0], 5.0)
+    assert (drifting[9:] / still[9:]).max() < 2.0
 
 
 def test_the_ends_of_red_noise_are_as_white_as_its_middle() -> None:

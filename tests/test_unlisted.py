@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from test_mismatch import DEVICE, F0, RATE, N, recording
 
 from estimation.mismatch.diagnosis import diagnose
 from estimation.mismatch.experiment import experiment
 from estimation.mismatch.fit import Comparison, Fit, solve
-from estimation.mismatch.free import FREE, remembered
+from estimation.mismatch.free import FREE
 from estimation.mismatch.model import Candidate, Model
 from estimation.mismatch.search import _State, _unnamed
 from estimation.mismatch.start import first_whiteners, grown, started, windows
@@ -52,12 +51,6 @@ def test_a_delay_that_remembers_the_swing_is_unknown_in_the_timing() -> None:
     curve = told.findings[0].curve
     assert curve is not None
     assert "M_4" in curve["formula"].split(" with ")[0]
-
-
-def test_what_is_remembered_fades_as_an_exponential() -> None:
-    step = np.repeat([0.0, 1.0], [5, 100])
-    assert remembered(step, 20.0)[5:] == pytest.approx(1.0 - np.exp(-np.arange(1, 101) / 20.0))
-    assert remembered(step[5:], 20.0) == pytest.approx(1.0)
 
 
 def test_a_play_in_the_readout_is_unknown_in_the_readout() -> None:

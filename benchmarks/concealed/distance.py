@@ -33,11 +33,12 @@ START = 0.1
 """Uncertainty of the state in which a recording finds the mirror, over its swing."""
 SHAPES = np.array([[0.15, 0.85, 0.1], [0.45, 0.55, 0.4], [0.8, 0.2, 0.75]])
 """At which a look-alike whose law has a shape is tried, in order of their first number."""
-FIELDS = {"b_cir": "offset", "lpf_hz": "sections"}
-"""Nominal values that the truth calls by another name."""
-NOMINAL = ("J", "b", "k", "torque_per_volt", "C0", "theta0", "R_s", "a_cir", "b_cir", "gain")
-DEMODULATED = ("Cb", "lpf_hz")
-"""What only a readout of the capacitance itself, not of its rate, depends on."""
+NOMINAL = {
+    **{name: name for name in ("J", "b", "k", "torque_per_volt", "C0", "Cb", "theta0", "R_s", "a_cir", "gain")},
+    "b_cir": "offset",
+    "lpf_hz": "sections",
+}
+"""Values that device files state, and what the truth calls them."""
 
 
 def distances(sealed: Sealed) -> list[dict[str, Any]]:
@@ -136,12 +137,10 @@ def _nuisances(
 ) -> Iterator[tuple[Array, float]]:
     """Columns of what a fit is free to move, and the weight of the prior that holds each: 1 of a tolerance, 0 none."""
     stated: dict[str, float] = world.device["x"]["tolerance"]
-    for name in (*NOMINAL, *(DEMODULATED if truth.a_cir else ())):
-        field = FIELDS.get(name, name)
-        moved: dict[str, float] = {field: getattr(truth, field) * (1 + 0.01 * stated.get(name, UNSTATED))}
-        if moved[field] == 0.0:
-            continue
-        yield change(truth._replace(**moved), 0.01), 1.0
+    for name, field in NOMINAL.items():
+        if value := getattr(truth, field):
+            moved: dict[str, float] = {field: value * (1 + 0.01 * stated.get(name, UNSTATED))}
+            yield change(truth._replace(**moved), 0.01), 1.0
     for state, size in ((THETA, world.swing), (RATE, world.swing * world.omega)):
         initial = world.initial.copy()
         initial[state] += 1e-4 * size

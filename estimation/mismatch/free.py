@@ -11,15 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
+from scanner.lowpass import low_passed
 from scanner.terms import Parameter, Term, View
 from scanner.trajectory import BELL, TORQUE
 
 Array = NDArray[np.float64]
-
-FADING = (0.05, 0.25)
-"""Shares of the recording's length over which stiffness and damping remember the swing, as what warms with it does."""
 
 DEGREE = 5
 """Highest total degree of the free force in angle and rate."""
@@ -40,6 +37,9 @@ of other things, up to a dozen cycles where nothing else stands."""
 PLAYS = (0.125, 0.25, 0.5, 1.0)
 """Half-widths, over the signal's deviation, of the plays in a readout: weighed against each other they make up any
 memory without rate (Prandtl-Ishlinskii)."""
+
+FADING = (0.05, 0.25)
+"""Shares of the recording's length over which stiffness and damping remember the swing, as what warms with it does."""
 
 MEMORIES = (1.0, 4.0, 16.0)
 """Turns of the motion over which a delay remembers the swing: weighed against each other they make up any fading."""
@@ -73,12 +73,6 @@ def play(signal, width):  # type: ignore[no-untyped-def]
         held = min(max(held, signal[i] - width), signal[i] + width)
         out[i] = held
     return out
-
-
-def remembered(swing: Array, samples: float) -> Array:
-    """``swing`` (n,) behind a first-order low-pass with a time constant in samples, at rest at the first of them."""
-    kept = np.exp(-1.0 / samples)
-    return np.asarray(lfilter([1.0 - kept], [1.0, -kept], swing, zi=[kept * swing[0]])[0])
 
 
 @njit(TORQUE, cache=True)
@@ -165,8 +159,8 @@ def _readout(signal: Array, p: Sequence[float], view: View) -> Array:
 
 def _timing(signal: Array, p: Sequence[float], view: View) -> Array:
     swing = (view.theta**2 + (view.rate / p[1]) ** 2) / p[2] ** 2
-    turn = 2.0 * np.pi / (p[1] * view.step)
-    behind = sum(m * (remembered(swing, n * turn) - swing) for m, n in zip(p[5:8], MEMORIES, strict=True))
+    fading = p[1] / (2.0 * np.pi) ** 2  # cut-off of what is remembered over one turn [Hz]
+    behind = sum(m * (low_passed(swing, fading / n, view.step) - swing) for m, n in zip(p[5:8], MEMORIES, strict=True))
     late = waves(np.pi * view.time / p[0], p[8:]) + swing * (p[3] + p[4] * swing) + behind
     slope = np.gradient(signal, view.step)
     # to second order: half the square of a tenth of a radian is seen where the signal is a thousand times its noise
@@ -194,7 +188,7 @@ FREE: dict[str, Term] = {
                 Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
                 Parameter("T", "s", lambda s: s.duration, kind="fixed"),
                 *(Parameter(f"f{i}{j}", "k A", _size(i, j)) for i, j in POWERS),
-                *(Parameter(f"h{i}", "k", _size(1, i // 2)) for i in range(4)),
+                *(Parameter(f"h{i}", "k", _size(1 - i // 2, i // 2)) for i in range(4)),
                 *(
                     Parameter(f"{name}{j}", "k A", size)
                     for j in range(1, WAVES + 1)

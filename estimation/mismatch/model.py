@@ -36,8 +36,6 @@ START_SD = 3.0
 REFERENCE_GAIN_SD = 0.02
 """Relative gain of a reference angle, where nothing is stated: the contract's default tolerance."""
 
-_NOTHING: tuple[list[int], Array] = [], np.zeros((0, 0))
-
 OFFSET_SD = 0.05
 """Prior of an offset that nobody states, in units of the signal's deviation."""
 
@@ -105,6 +103,10 @@ class _Motion(NamedTuple):
             r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
             *[(each.term.effect, each.values, each.hidden) for each in added],
         )  # fmt: skip
+
+
+_NOTHING: tuple[list[int], Array] = [], np.zeros((0, 0))
+"""Under a channel: where it stands in x, and its shapes."""
 
 
 class Model:

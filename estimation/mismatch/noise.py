@@ -118,13 +118,6 @@ def periodogram(residual: Array) -> Array:
     return np.abs(np.fft.rfft(residual * window)) ** 2 * (residual.size / np.sum(window**2))
 
 
-def without_slow(residual: Array) -> Array:
-    """A residual without its slowest wandering: a strong one leaks through any window into what is measured."""
-    cosines = dct(residual, norm="ortho")
-    cosines[:SLOWEST] = 0.0
-    return np.asarray(idct(cosines, norm="ortho"))
-
-
 def noise_psd(
     residual: Array, bins: int, step: float, lines: Sequence[float] | Array, width: float
 ) -> tuple[Array, float]:
@@ -140,14 +133,21 @@ def noise_psd(
     Returns:
         variances, shape (bins,), and the slowest bin that was measured.
     """
-    power = periodogram(without_slow(residual))
+    power = periodogram(_without_slow(residual))
     frequency = np.arange(power.size) / (residual.size * step)
     spoilt = near_lines(frequency, lines, max(width, 3.0 / (residual.size * step)))
-    spoilt[:3] = True  # the slowest wandering is physics to judge, its noise is continued from above
+    spoilt[: SLOWEST // 2] = True  # their noise is continued from above
     good = np.flatnonzero(~spoilt)
     if good.size < 16:
         good = np.arange(1, power.size)
     return _running_median(good.astype(float), power[good], np.arange(bins, dtype=float))
+
+
+def _without_slow(residual: Array) -> Array:
+    """A residual without its slowest wandering: a strong one leaks through any window into what is measured."""
+    cosines = dct(residual, norm="ortho")
+    cosines[:SLOWEST] = 0.0
+    return np.asarray(idct(cosines, norm="ortho"))
 
 
 def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -> NDArray[np.bool_]:

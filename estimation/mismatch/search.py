@@ -160,7 +160,7 @@ def _extended(
     for _ in range(MOST_EFFECTS - len(best.model.candidates)):
         taken = {each.key for each in best.model.candidates}
         if taken:
-            # It was measured where these had not been fitted under it: what they left then passes for noise.
+            # The noise was measured where these had not been fitted under it: what they left then passes for it.
             comparison = Comparison(best.model.runs, measured_whiteners(best.model, best.x))
             best = solve(comparison, best.model, best.x)
         best = with_line(comparison, best)
@@ -281,9 +281,7 @@ def _merged(*parts: Leads) -> Leads:
     nearest: dict[str, Lead] = {}
     for lead in (each for part in parts for each in part):
         known = nearest.setdefault(lead.candidate.key, lead)
-        nearest[lead.candidate.key] = Lead(
-            min(known.behind, lead.behind), lead.candidate, min(known.worse, lead.worse)
-        )
+        nearest[lead.candidate.key] = Lead(min(known.behind, lead.behind), lead.candidate, min(known.worse, lead.worse))
     return tuple(sorted(nearest.values(), key=lambda each: each.behind))
 
 
