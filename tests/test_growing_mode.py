@@ -40,8 +40,8 @@ def test_a_mode_that_grows_late_is_found_among_what_explains_nothing_yet(tmp_pat
     true = sealed.truth
     assert frequency == pytest.approx(true.mode_frequency / (2 * np.pi), rel=1e-4)
     assert quality == pytest.approx(true.mode_frequency / true.mode_damping, rel=0.01)
-    # in the units of the law: q² of a mode that gives back k q²/2
-    pushed = true.mode_coupling / true.mode_frequency**2 * np.sqrt(true.mode_exchange * true.J / true.k)
+    # in the units of the law: q of a mode that gives back k q²/2
+    pushed = true.mode_coupling / np.sqrt(true.mode_exchange * true.k / true.J)
     assert push == pytest.approx(pushed, rel=0.1)
 
 

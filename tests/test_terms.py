@@ -53,7 +53,7 @@ def test_a_mode_at_half_the_frequency_holds_the_swing_at_its_threshold(sign: flo
     """It grows where g A passes 2/Q2 (Nayfeh & Mook 5.3), and then takes all that the drive gives beyond."""
     k, quality, threshold = LINEAR.mechanics.k, 100.0, 0.1
     axis = replace(LINEAR, mechanics=Mechanics(1e-12, 1e-12 * W / quality, k))
-    values = sign * 2.0 / (40.0 * threshold), 0.5 * F0, 40.0, 1e-3 / threshold**0.5
+    values = sign * 2.0 / (40.0 * threshold), 0.5 * F0, 40.0, 2e-3 * threshold**0.5
     time = STEP * (np.arange(100 * 800)[:, None] + [0.0, 0.5, 1.0])
     for driven, held in ((0.08, 0.08), (0.2, threshold)):
         inputs = Inputs(driven * k / quality / 1e-9 * np.cos(W * time), STEP)
@@ -61,6 +61,33 @@ def test_a_mode_at_half_the_frequency_holds_the_swing_at_its_threshold(sign: flo
         assert np.ptp(angle) / 2 == pytest.approx(held, rel=0.02)
         # what it takes at the swing's frequency it takes of the mean as well: q² has both in equal parts
         assert angle.mean() == pytest.approx(sign * (held - driven) / quality, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("effect", "values"),
+    [
+        ("second-mode", (0.05, 700.0, 1e9)),
+        ("overtone-coupling", (2.0, 1200.0, 1e9)),
+        ("mode-coupling", (0.6, 300.0, 1e9, 0.02)),
+        ("mode-coupling", (-0.6, 300.0, 1e9, 0.02)),
+    ],
+)
+def test_a_mode_is_pushed_as_it_pushes(effect: str, values: tuple[float, ...]) -> None:
+    """Forces that are the slopes of one energy: the mirror's by q is the mode's by θ, up to the mode's inertia."""
+    law, nominal = catalogue()[effect].torque, np.array([1e-12, 1e-12, 1e-12 * W**2])
+    assert law is not None
+
+    def forces(theta: float, q: float) -> np.ndarray:
+        torque, _, pushed = law(0.0, theta, 0.0, 0.0, 0.0, q, 0.0, np.array(values), nominal)
+        return np.array([torque, pushed])
+
+    ratios, h = [], 1e-6
+    for theta, q in np.random.default_rng(1).uniform(-0.2, 0.2, (20, 2)):
+        by_theta = (forces(theta + h, q) - forces(theta - h, q))[1]
+        by_mode = (forces(theta, q + h) - forces(theta, q - h))[0]
+        ratios.append(by_mode / by_theta)
+    np.testing.assert_allclose(ratios, ratios[0], rtol=1e-4)
+    assert ratios[0] > 0.0
 
 
 def test_quintic_stiffness_shifts_the_frequency_by_five_sixteenths() -> None:

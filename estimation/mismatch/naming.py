@@ -52,6 +52,9 @@ EASE = 5
 LOST = 3.0
 """Growth of the reduced chi-square, from one window to the next, by which the motion has been lost."""
 
+AGAIN = 0.95
+"""Share of what it was, to which a window in between must have brought that growth for another to be worth while."""
+
 FAR = 8.0
 """Growth of it from which the model is no longer about to lose the motion: a window in between tells more."""
 
@@ -164,10 +167,11 @@ def _finalists(comparison: Comparison, base: Fit, promising: Sequence[Screened])
         for turns in (2, 3):
             fits = sorted(solve_all(comparison, running, turns=turns), key=lambda fit: fit.evidence)
             running = [(fit.model, fit.x) for fit in fits[: max(FINALISTS, len(fits) // 2)]]
+        hopeless = min((fit.evidence for fit in fits if possible(fit)), default=np.inf) + HOPELESS
     else:
         clear = [each for each in promising if each.gain > 0.5 * promising[0].gain]
-        running = running[: max(FINALISTS, len(clear))]
-    return [fit for fit in solve_all(comparison, running) if possible(fit)]
+        running, hopeless = running[: max(FINALISTS, len(clear))], np.inf
+    return [fit for fit in solve_all(comparison, running, hopeless=hopeless) if possible(fit)]
 
 
 def race(
@@ -187,8 +191,8 @@ def race(
         early: fits of the nominal model over the windows ``stops``.
     """
     followed, reached, base, brink = _brink(comparison, nominal, early, stops)
-    growing = [each for each in candidates if reached and each.term.seeds]
-    others = [each for each in candidates if not (reached and each.term.seeds)]
+    growing = [each for each in candidates if each.term.seeds]
+    others = [each for each in candidates if not each.term.seeds]
     field = sorted(screen(comparison, base, others, brink), key=lambda each: -each.gain)
     choosy = base.rows.sum() > MANY_SAMPLES
     named, _ = _apart(field)
@@ -274,8 +278,8 @@ def _raced(
 ) -> list[Fit]:
     """Possible fits of those that keep up through the growing windows ``stops``.
 
-    Where all lose the motion, windows are put in between: after too long a stretch of what a law has not seen yet, no
-    step leads back.
+    Where all lose the motion, windows are put in between, as long as that helps: after too long a stretch of what a law
+    has not seen yet, no step leads back.
 
     Args:
         reached: window up to which they start as good fits, 0 for none.
@@ -284,6 +288,7 @@ def _raced(
     """
     ahead, level, bar = list(stops)[::-1], 1.0, np.inf if rival is None else rival.evidence
     fits: list[Fit] = []
+    lost_at: dict[float, float] = {}
     while running and ahead:
         stop = ahead[-1]
         turns, tolerance = (14, 0.05) if stop == stops[-1] else (8, 1.0)
@@ -294,8 +299,10 @@ def _raced(
             fits += solve_all(comparison, some, stop, turns, tolerance, hopeless=best + HOPELESS)
         fits.sort(key=lambda fit: (not possible(fit), fit.evidence))
         now = _level(fits[0])
-        if now > LOST * max(level, 1.0) and splits and stop > FINEST * reached > 0.0:
+        lost = level < TRACKED and now > LOST * max(level, 1.0)
+        if lost and splits and stop > FINEST * reached > 0.0 and now < AGAIN * lost_at.get(stop, np.inf):
             ahead.append(float(np.sqrt(reached * stop)))
+            lost_at[stop] = now
             splits -= 1
             continue
         if fits[0].chi2 > bar or (stop >= stops[:EASE][-1] and _beaten(comparison, fits[0], rival)):
