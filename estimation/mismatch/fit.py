@@ -35,6 +35,9 @@ FOLDS = 20
 
 HELD = 5
 
+FAR_OFF = 100.0
+"""Misfit over the one that is no hope, from which a fit has lost the motion: it has less time to come down."""
+
 KEPT = 0.9
 """Share of the gain that first order promises, from which a Jacobian serves for another step."""
 
@@ -225,7 +228,8 @@ def solve(
         if fresh:
             turn += 1
             jacobian = comparison.jacobian(model, x, residual, steps, stop)
-            if turn == turns or (turn > 4 and gain < 0.2 * (value - hopeless)):
+            patience = 2 if value > FAR_OFF * hopeless else 4
+            if turn == turns or (turn > patience and gain < 0.2 * (value - hopeless)):
                 break
     return _made(comparison, model, x, residual, jacobian, rows)
 

@@ -16,6 +16,9 @@ the square of this."""
 STRAIGHT = 0.1
 """Share by which the root of the rise may miss ``SIDE`` where an end is taken to lie in proportion."""
 
+NEAR = 0.2
+"""Of a rise of 3.84, what a refit may leave on the table: 3 % of the way to an end."""
+
 REFITS = 6
 """Points of a bent ridge that are refitted on the way to an end, each at most twice as far as the one before."""
 
@@ -53,6 +56,6 @@ def _reach(comparison: Comparison, fit: Fit, i: int, side: float) -> float:
         if abs(far - 1.0) < STRAIGHT:
             break
         reach *= np.clip(1.0 / far, 0.5, 2.0)
-        at = solve(comparison, fit.model, fit.x + ridge * reach, turns=4, fixed=i)
+        at = solve(comparison, fit.model, fit.x + ridge * reach, turns=4, tolerance=NEAR, fixed=i)
         ridge, far = (at.x - fit.x) / reach, over(at.chi2 + at.penalty)
     return float(reach / np.clip(far, 0.5, 2.0))

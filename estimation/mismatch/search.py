@@ -189,6 +189,8 @@ def _extended(
         before = solve(comparison, best.model, best.x, turns=4)
         nominal = before if not rivals else solve(comparison, nominal.model, nominal.x, turns=4)
         found = next((fit for fit in close if convincing(comparison, before, fit)), None)
+        if found is None and before.held_chi2 > INADEQUATE and not taken:
+            found = next((fit for fit in close if _is_free(fit)), None)  # something is missing, if only its stage shows
         if found is None:
             yield _State(comparison, nominal, before, rivals, by_name)
             return
