@@ -51,6 +51,19 @@ def test_a_mode_hardly_above_its_threshold_is_found(tmp_path: Path) -> None:
     assert frequency == pytest.approx(sealed.truth.mode_frequency / (2 * np.pi), rel=1e-3)
 
 
+def test_what_a_mode_gives_back_of_its_push_is_not_told_as_another_mode(tmp_path: Path) -> None:
+    """Of 6e4 sigma the push's own reaction is a thousandth: without it, a second mode of 60 sigma was found beside."""
+    order = Order("sealed-001", "one", "drive", ("mode-coupling",), True, 1736519047)
+    sealed, found = searched(order, tmp_path, ("mode-coupling", "second-mode"))
+    assert [each.candidate.term.effect for each in found.rounds] == ["mode-coupling"]
+    true, fit = sealed.truth, found.final
+    at = fit.model.index("term", found.rounds[0].candidate.key, "s")
+    assert at is not None
+    pushed = true.mode_coupling / np.sqrt(true.mode_exchange * true.k / true.J)
+    size = abs(fit.model.values(found.rounds[0].candidate, fit.x)[3])
+    assert size == pytest.approx(pushed, rel=4.0 * np.sqrt(fit.covariance[at, at]) / abs(fit.x[at]))
+
+
 def test_what_fits_as_well_with_more_numbers_is_a_rival(tmp_path: Path) -> None:
     order = Order("sealed-001", "one", "drive", ("second-mode",), False, 1327034240)
     _, found = searched(order, tmp_path, ("drive-lag", "second-mode", "viscoelastic"))

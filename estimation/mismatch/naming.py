@@ -86,18 +86,26 @@ def possible(fit: Fit) -> bool:
     )
 
 
-def convincing(comparison: Comparison, before: Fit, after: Fit) -> bool:
-    """Whether a term is there: well ahead of nothing, and better on samples that no fit has seen.
+def lead_of(comparison: Comparison, before: Fit, after: Fit) -> float:
+    """By how much -2 log evidence falls, 0 where that is not well ahead of nothing.
 
-    What slow noise would explain as well, if it rises more steeply than it was continued, is no lead. Where held-out
-    samples hardly show a term (a nominal value pulled off that it relieves, a clip level reached in the first turns
-    only), they may stay as they were, within the scatter of what it changes there. Beside a clip level they may not:
-    slow noise is clipped with the signal, and looks like an offset in the turns that are.
+    What slow noise would explain as well, if it rises more steeply than it was continued, is no lead.
     """
     excused = comparison.excused(before) - comparison.excused(after)
     lead = before.evidence - after.evidence - excused
     # what is left beside an excuse is known no better than how steeply slow noise rises
-    if lead < LEAD_OVER_NOTHING * (DOUBTFUL if excused > lead else 1.0):
+    return lead if lead >= LEAD_OVER_NOTHING * (DOUBTFUL if excused > lead else 1.0) else 0.0
+
+
+def convincing(comparison: Comparison, before: Fit, after: Fit) -> bool:
+    """Whether a term is there: well ahead of nothing, and better on samples that no fit has seen.
+
+    Where held-out samples hardly show a term (a nominal value pulled off that it relieves, a clip level reached in the
+    first turns only), they may stay as they were, within the scatter of what it changes there. Beside a clip level they
+    may not: slow noise is clipped with the signal, and looks like an offset in the turns that are.
+    """
+    lead = lead_of(comparison, before, after)
+    if not lead:
         return False
     gained = float(np.sum(before.residual[before.held] ** 2) - np.sum(after.residual[after.held] ** 2))
     changed = float(np.sum((before.residual[before.held] - after.residual[after.held]) ** 2))
@@ -106,12 +114,12 @@ def convincing(comparison: Comparison, before: Fit, after: Fit) -> bool:
     if fitted <= before.penalty - after.penalty:
         return unharmed
     share = min(SHARE_HELD * fitted * int(after.held.sum()) / int(after.rows.sum()), LEAD_OVER_NOTHING)
+    beside_clip = any(each.term.at_output for each in before.model.candidates)
     if changed < share:
-        beside_clip = any(each.term.at_output for each in before.model.candidates)
         return unharmed and lead > 2.0 * LEAD_OVER_NOTHING and not beside_clip
-    if lead > 4.0 * LEAD_OVER_NOTHING and not before.model.candidates:
-        # No chance leads by so much, and none is how another term's law was written down: it has to gain what it may,
-        # which scatters by twice the root of what it changes.
+    if lead > (20.0 if before.model.candidates else 4.0) * LEAD_OVER_NOTHING and not beside_clip:
+        # No chance leads by so much, nor how another term's law was written down: it has to gain what it may, which
+        # scatters by twice the root of what it changes.
         share = min(share, max(0.0, changed - 4.0 * np.sqrt(changed)))
     return gained > share
 

@@ -14,7 +14,16 @@ from estimation.mismatch.free import FREE
 from estimation.mismatch.instead import Lead, Leads, behind, instead, settled
 from estimation.mismatch.lines import strongest_foreign_line
 from estimation.mismatch.model import MAINS, Candidate, Model
-from estimation.mismatch.naming import LEAD_OVER_NEXT, LEAD_OVER_NOTHING, TRACKED, convincing, near, possible, race
+from estimation.mismatch.naming import (
+    LEAD_OVER_NEXT,
+    LEAD_OVER_NOTHING,
+    TRACKED,
+    convincing,
+    lead_of,
+    near,
+    possible,
+    race,
+)
 from estimation.mismatch.noise import Whitener
 from estimation.mismatch.screen import all_candidates
 from estimation.mismatch.sparse import sparse
@@ -301,7 +310,7 @@ def needed_only(comparison: Comparison, fit: Fit) -> Fit:
     several = len(fit.model.candidates) > 1
     for each in fit.model.candidates if several else ():
         less = with_hum(comparison, without(comparison, fit, each))
-        if less.evidence - fit.evidence < LEAD_OVER_NOTHING:
+        if not lead_of(comparison, less, fit):
             return needed_only(comparison, less)
     return fit
 
