@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint docs notebooks bench papers concealed wheel-check clean
+.PHONY: demo test test-fast lint docs notebooks bench papers blind wheel-check clean
 
 $(STAMP): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed; run make PYTHON=python3.x" if sys.version_info < (3, 11) else 0)'
@@ -18,6 +18,10 @@ demo: $(STAMP)
 
 test: $(STAMP) lint
 	$(BIN)/python -m pytest
+
+# For development: all tests but those marked slow.
+test-fast: $(STAMP) lint
+	$(BIN)/python -m pytest -m "not slow"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -35,10 +39,10 @@ bench: $(STAMP)
 papers: $(STAMP)
 	$(BIN)/python benchmarks/papers/run.py
 
-concealed: $(STAMP)
-	mkdir -p sealed
-	$(BIN)/python -m benchmarks.concealed.make sealed/recordings sealed/keys --workers 2
-	$(BIN)/python -m benchmarks.concealed.score sealed/recordings sealed/keys/keys.json sealed/out --page docs/results.md
+blind: $(STAMP)
+	mkdir -p blind-benchmark
+	$(BIN)/python -m benchmarks.blind.generate blind-benchmark/recordings blind-benchmark/keys --workers 2
+	$(BIN)/python -m benchmarks.blind.score blind-benchmark/recordings blind-benchmark/keys/keys.json blind-benchmark/out --page docs/results.md
 
 wheel-check: $(STAMP)
 	$(BIN)/python benchmarks/wheel.py

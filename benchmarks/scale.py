@@ -1,10 +1,10 @@
-"""What a reconstruction costs against its length, its pixels and its axes, and 10 s of 5 MS/s from the disk.
+"""Costs of a reconstruction by the length of the recording, by the pixels of the picture and by the number of axes.
 
 python -m benchmarks.scale [disk|disk_long|live|length|pixels|axes|longest ...]
 
-A scan without drift repeats itself every 0.1 s, so one simulated period makes a recording of any length. The same
-noise comes back with it, which costs a tracker neither more nor less. Each case runs in a process of its own, whose
-peak memory is its own.
+A scan without drift repeats every 0.1 s, so that one simulated period makes a recording of any length. Its noise
+repeats too, which does not change the cost of the tracker. Each case runs in a separate process, whose peak memory is
+measured.
 """
 
 from __future__ import annotations
@@ -25,29 +25,52 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.process import peak_mb, timed
-from benchmarks.speed import digitised
+from benchmarks.process import read_peak_memory_mb, time_command
+from benchmarks.speed import digitise_recording
+from benchmarks.tracker_bound import SEPARATE_READOUT_OFFSET_V
 from estimation.tracker import track
-from phantoms.experiment import Experiment, run
-from recon.mapping import Grid
-from recon.pipeline import Options, mapped
+from phantoms.experiment import Experiment, simulate_experiment
+from recon.imaging.intensity_gridding import grid_intensity
+from recon.imaging.picture import Grid
+from recon.pipeline import Options
 from scanner.device import Amdm, Device
 from scanner.recording import Recording
 
-RATE = 5e6
-PERIOD = 500_000  # samples in which 13840 and 3270 Hz both come round
-LENGTHS = (1_000_000, 10_000_000, 100_000_000)
-LONGEST = 1_000_000_000
-SIZE = 20_000_000  # samples for pixels and axes
-PIXELS = (100, 400, 1600)
-LIVE_S, FRAME_S, WRITTEN_EVERY = 6.0, 0.1, 0.01
+SAMPLE_RATE_HZ = 5e6
+
+PERIOD_SAMPLES = 500_000
+"""Samples after which the scan repeats: 0.1 s has whole cycles of 13840 and of 3270 Hz."""
+
+LENGTHS_SAMPLES = (1_000_000, 10_000_000, 100_000_000)
+"""Lengths of ``measure_lengths``: 0.2, 2 and 20 s."""
+
+LONGEST_SAMPLES = 1_000_000_000
+"""Length of ``measure_longest``: 200 s."""
+
+COMPARISON_SAMPLES = 20_000_000
+"""Length at which pictures and axes are compared: 4 s, so that the costs of the start are small."""
+
+PICTURE_WIDTHS_PX = (100, 400, 1600)
+"""Widths of the square pictures: 1600 squared does not fit in a second-level cache."""
+
+HALF_ANGLE_RAD = 0.18
+"""Half the field of the pictures, that of the imaging scanner."""
+
+LIVE_S, FRAME_S, WRITE_INTERVAL_S = 6.0, 0.1, 0.01
+"""Lengths of the live recording and of a frame (the period of the scan), and interval between two writes [s]."""
+
 RESULTS = Path(__file__).with_name("scale.json")
 Results = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Repeated:
-    """One period's samples over and over, made when they are sliced, as a ``Channel`` wants them."""
+class RepeatedSamples:
+    """The samples of one period, repeated. They are copied when they are sliced; a ``Channel`` needs no more.
+
+    Attributes:
+        period: samples, shape (PERIOD_SAMPLES,).
+        size: number of samples after repetition.
+    """
 
     period: NDArray[np.int16]
     size: int
@@ -64,159 +87,196 @@ class Repeated:
 
     def __getitem__(self, rows: slice) -> NDArray[np.int16]:
         first, stop, _ = rows.indices(self.size)
-        turn = first % PERIOD
-        return np.tile(self.period, (turn + stop - first) // PERIOD + 1)[turn : turn + stop - first]
+        offset = first % PERIOD_SAMPLES
+        return np.tile(self.period, (offset + stop - first) // PERIOD_SAMPLES + 1)[offset : offset + stop - first]
 
 
-def one_period(device: Device | None = None) -> Recording:
-    """0.1 s of the demo's scan once its motion has settled; by another device if one is given."""
+def simulate_period(device: Device | None = None) -> Recording:
+    """0.1 s of the demo's scan in its steady motion; with another device if one is given."""
     experiment = Experiment(duration=0.2, drift={})
-    simulated, _ = run(experiment if device is None else replace(experiment, device=device), seed=1)
-    return simulated.slice(0.1, 0.2)
+    recording, _ = simulate_experiment(experiment if device is None else replace(experiment, device=device), seed=1)
+    return recording.slice(0.1, 0.2)
 
 
-def separate(device: Device) -> Device:
+def with_separate_readouts(device: Device) -> Device:
     """The device with a readout for each axis."""
     assert isinstance(device.readout, Amdm)
-    readout = replace(device.readout, b_cir=4.95)  # half the sum of two combs stays within the converter's range
+    readout = replace(device.readout, b_cir=SEPARATE_READOUT_OFFSET_V)
     return replace(device, axes={n: replace(a, readout=readout) for n, a in device.axes.items()}, readout=None)
 
 
-def repeated(period: Recording, size: int, axes: str = "xy") -> Recording:
-    """A recording of ``size`` samples of the same scan, int16, that takes no memory; of some axes only if so said."""
+def repeat_period(period: Recording, size: int, axes: str = "xy") -> Recording:
+    """A recording of ``size`` samples of the repeated scan, int16, which takes no memory.
+
+    Args:
+        period: one period of the scan.
+        size: number of samples.
+        axes: whose channels it has; the intensity is included.
+    """
     channels = {
-        name: replace(channel, raw=Repeated(channel.stored(), size), first=0, stop=size, start=0.0)
-        for name, channel in digitised(period).channels.items()
+        name: replace(channel, raw=RepeatedSamples(channel.stored(), size), first=0, stop=size, start=0.0)
+        for name, channel in digitise_recording(period).channels.items()
         if name.rpartition("_")[2] in (*axes, name)
     }
     return Recording(MappingProxyType(channels), period.attrs, None, period.device_toml)
 
 
-def costs(period: Path, size: int, axes: str = "xy", pixels: int = 400) -> Results:
-    """Processor seconds of each step on ``size`` samples, one thread, and the process's peak memory [MB]."""
-    grid = Grid(pixels, pixels, 0.18, 0.18)
-    done: Results = {}
-    with Recording.open(period) as one:
-        for samples in (PERIOD, size):  # the first compiles
-            recording = repeated(one, samples, axes)
+def measure_costs(path: Path, size: int, axes: str = "xy", width: int = 400) -> Results:
+    """Processor seconds of each step with one thread, and the process's peak memory [MB].
+
+    Args:
+        path: file of one period of the scan.
+        size: number of samples.
+        axes: that are tracked; two are mapped too.
+        width: of the picture [pixels].
+    """
+    grid = Grid(width, width, HALF_ANGLE_RAD, HALF_ANGLE_RAD)
+    results: Results = {}
+    with Recording.open(path) as period:
+        for samples in (PERIOD_SAMPLES, size):  # the first run compiles
+            recording = repeat_period(period, samples, axes)
             assert recording.device is not None
             device = replace(recording.device, axes={name: recording.device.axes[name] for name in axes})
-            began = time.process_time()
+            start = time.process_time()
             motion = track(recording, device)
-            done["track_s"] = time.process_time() - began
+            results["track_s"] = time.process_time() - start
             if axes == "xy":
-                began = time.process_time()
-                mapped(motion, recording["intensity"], grid, [])
-                done["map_s"] = time.process_time() - began
-    return done | {"peak_mb": peak_mb()}
+                start = time.process_time()
+                grid_intensity(motion, recording["intensity"], grid, [])
+                results["map_s"] = time.process_time() - start
+    return results | {"peak_mb": read_peak_memory_mb()}
 
 
-def apart(function: Callable[..., Results], *arguments: Any) -> Results:
-    """A case in a process of its own."""
+def run_in_process(prefix: str, function: Callable[..., Results], *arguments: Any) -> Results:
+    """Results of a function in a separate process, their keys with ``prefix`` and a dot in front."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
+        return add_prefix(prefix, pool.submit(function, *arguments).result())
 
 
-def named(prefix: str, results: Results) -> Results:
+def add_prefix(prefix: str, results: Results) -> Results:
+    """The results, their keys with ``prefix`` and a dot in front."""
     return {f"{prefix}.{key}": value for key, value in results.items()}
 
 
-def length(folder: Path) -> Results:
-    period = written(one_period(), folder)
-    return {k: v for n in LENGTHS for k, v in named(f"length.{n:.0e}", apart(costs, period, n)).items()}
+def measure_lengths(folder: Path) -> Results:
+    """Costs by the length of the recording, LENGTHS_SAMPLES."""
+    period, results = write_period(simulate_period(), folder), Results()
+    for size in LENGTHS_SAMPLES:
+        results |= run_in_process(f"length.{size:.0e}", measure_costs, period, size)
+    return results
 
 
-def longest(folder: Path) -> Results:
-    return named(f"length.{LONGEST:.0e}", apart(costs, written(one_period(), folder), LONGEST))
+def measure_longest(folder: Path) -> Results:
+    """Costs of LONGEST_SAMPLES."""
+    period = write_period(simulate_period(), folder)
+    return run_in_process(f"length.{LONGEST_SAMPLES:.0e}", measure_costs, period, LONGEST_SAMPLES)
 
 
-def pixels(folder: Path) -> Results:
-    period = written(one_period(), folder)
-    return {k: v for n in PIXELS for k, v in named(f"pixels.{n}", apart(costs, period, SIZE, "xy", n)).items()}
+def measure_pixels(folder: Path) -> Results:
+    """Costs by the width of the picture, PICTURE_WIDTHS_PX."""
+    period, results = write_period(simulate_period(), folder), Results()
+    for width in PICTURE_WIDTHS_PX:
+        results |= run_in_process(f"pixels.{width}", measure_costs, period, COMPARISON_SAMPLES, "xy", width)
+    return results
 
 
-def axes(folder: Path) -> Results:
-    period = written(one_period(separate(Experiment().device)), folder)
-    return {
-        k: v for each in ("x", "y", "xy") for k, v in named(f"axes.{each}", apart(costs, period, SIZE, each)).items()
-    }
+def measure_axes(folder: Path) -> Results:
+    """Costs of either axis and of both, each with a separate readout."""
+    period, results = write_period(simulate_period(with_separate_readouts(Experiment().device)), folder), Results()
+    for axes in ("x", "y", "xy"):
+        results |= run_in_process(f"axes.{axes}", measure_costs, period, COMPARISON_SAMPLES, axes)
+    return results
 
 
-def disk(folder: Path) -> Results:
-    """10 s of two axes from the disk by the command itself; a tenth of it before, to compile."""
-    from_disk(folder, 1.0)
-    return named("disk", from_disk(folder, 10.0))
+def measure_disk(folder: Path) -> Results:
+    """Costs of the command on 10 s of two axes from the disk. A run on 1 s before it compiles."""
+    reconstruct_from_disk(folder, 1.0)
+    return add_prefix("disk", reconstruct_from_disk(folder, 10.0))
 
 
-def disk_long(folder: Path) -> Results:
-    """100 s likewise: 4 GB, and as many for the angles that the command leaves."""
-    return named("disk_long", from_disk(folder, 100.0))
+def measure_long_disk(folder: Path) -> Results:
+    """Costs of the command on 100 s: 4 GB of samples, and 4 GB of angles that the command writes."""
+    return add_prefix("disk_long", reconstruct_from_disk(folder, 100.0))
 
 
-def from_disk(folder: Path, seconds: float) -> Results:
+def reconstruct_from_disk(folder: Path, seconds: float) -> Results:
+    """Costs of the command ``reconstruct`` on a file of ``seconds`` of the scan."""
     path = folder / "recording.h5"
-    with Recording.open(written(one_period(), folder)) as period:
-        repeated(period, round(seconds * RATE)).write(path)
-    return timed("reconstruct", str(path), "-o", str(folder / "out"))
+    with Recording.open(write_period(simulate_period(), folder)) as period:
+        repeat_period(period, round(seconds * SAMPLE_RATE_HZ)).write(path)
+    return time_command("reconstruct", str(path), "-o", str(folder / "out"))
 
 
-def live(folder: Path) -> Results:
-    """LIVE_S seconds followed while another process writes them as fast as they would be recorded."""
-    from recon.follow import follow
+def measure_live(folder: Path) -> Results:
+    """Frames and latency while another process writes LIVE_S seconds at the rate of the recording."""
+    from recon.follow import follow_recording
 
-    period, path = written(one_period(), folder), folder / "growing.h5"
-    with Recording.open(period) as one:
+    period_path, path = write_period(simulate_period(), folder), folder / "growing.h5"
+    with Recording.open(period_path) as period:
         short = folder / "short.h5"
-        repeated(one, PERIOD).write(short)
-    follow(short, folder / "warm", Options(), frame_time=FRAME_S / 2, quiet_time=0.1)
-    writer = multiprocessing.get_context("spawn").Process(target=record, args=(period, path))
+        repeat_period(period, PERIOD_SAMPLES).write(short)
+    follow_recording(short, folder / "warm", Options(), frame_time=FRAME_S / 2, quiet_time=0.1)  # compiles
+    writer = multiprocessing.get_context("spawn").Process(target=record_live, args=(period_path, path))
     writer.start()
-    seen = follow(path, folder / "out", Options(), frame_time=FRAME_S, quiet_time=30.0)
+    summary = follow_recording(path, folder / "out", Options(), frame_time=FRAME_S, quiet_time=30.0)
     writer.join()
-    told = seen.summary()
-    done = {"live.frames": seen.frames, "live.dropped": seen.dropped, "live.frame_s": seen.frame_s}
-    return done | {f"live.latency_{key}_s": told["latency_s"][key] for key in ("median", "max")}
+    latency = summary.summary()["latency_s"]
+    counts = {"live.frames": summary.frames, "live.dropped": summary.dropped, "live.frame_s": summary.frame_s}
+    return counts | {f"live.latency_{key}_s": latency[key] for key in ("median", "max")}
 
 
-def record(period: Path, path: Path) -> None:
-    """Write a recording (HDF5, SWMR) in real time."""
-    with Recording.open(period) as one, h5py.File(path, "w", libver="latest") as file:
-        whole = repeated(one, round(LIVE_S * RATE))
+def record_live(period_path: Path, path: Path) -> None:
+    """Write LIVE_S seconds of the scan (HDF5, SWMR) in real time."""
+    size = round(LIVE_S * SAMPLE_RATE_HZ)
+    with Recording.open(period_path) as period, h5py.File(path, "w", libver="latest") as file:
+        recording = repeat_period(period, size)
         file.attrs.update({"format": "lissajous-recording", "version": 1})
-        file.create_group("device").attrs["toml"] = whole.device_toml
+        file.create_group("device").attrs["toml"] = recording.device_toml
         group = file.create_group("channels")
-        for channel in whole.channels.values():
+        for channel in recording.channels.values():
             dataset = group.create_dataset(channel.name, (0,), np.int16, maxshape=(None,), chunks=(1 << 16,))
-            dataset.attrs.update({"unit": "V", "sample_rate": RATE, "gain": channel.gain})
+            dataset.attrs.update({"unit": "V", "sample_rate": SAMPLE_RATE_HZ, "gain": channel.gain})
         file.swmr_mode = True
-        began = time.perf_counter()
-        there = 0
-        while there < round(LIVE_S * RATE):
-            stop = min(round((time.perf_counter() - began) * RATE), round(LIVE_S * RATE))
-            for channel in whole.channels.values():
+        start, written = time.perf_counter(), 0
+        while written < size:
+            stop = min(round((time.perf_counter() - start) * SAMPLE_RATE_HZ), size)
+            for channel in recording.channels.values():
                 group[channel.name].resize((stop,))
-                group[channel.name][there:stop] = channel.stored(there, stop)
+                group[channel.name][written:stop] = channel.stored(written, stop)
                 group[channel.name].flush()
-            there = stop
-            time.sleep(WRITTEN_EVERY)
+            written = stop
+            time.sleep(WRITE_INTERVAL_S)
 
 
-def written(recording: Recording, folder: Path) -> Path:
+def write_period(recording: Recording, folder: Path) -> Path:
+    """Write one period of the scan into the folder and return its path."""
     path = folder / "period.h5"
     recording.write(path)
     return path
 
 
-def main(wanted: list[str]) -> None:
+PARTS: dict[str, Callable[[Path], Results]] = {
+    "disk": measure_disk,
+    "disk_long": measure_long_disk,
+    "live": measure_live,
+    "length": measure_lengths,
+    "pixels": measure_pixels,
+    "axes": measure_axes,
+    "longest": measure_longest,
+}
+"""Parts of the benchmark by their names on the command line."""
+
+
+def main(selected: list[str]) -> None:
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    for part in (disk, disk_long, live, length, pixels, axes, longest):
-        if not wanted or part.__name__ in wanted:
-            print(f"{part.__name__} ...", file=sys.stderr)
+    for name, measure in PARTS.items():
+        if not selected or name in selected:
+            print(f"{name} ...", file=sys.stderr)
             with tempfile.TemporaryDirectory() as folder:
-                found = part(Path(folder))
-            for key, value in found.items():
+                part = measure(Path(folder))
+            for key, value in part.items():
                 print(f"{key:28} {value:12.4g}")
-            results |= {key: float(f"{value:.4g}") for key, value in found.items()}
+            results |= {key: float(f"{value:.4g}") for key, value in part.items()}
             RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 

@@ -1,8 +1,8 @@
-"""The handed-over cases: every recording diagnosed, every answer held against the key.
+"""Diagnose a folder of recordings with keys and compare every answer with its key.
 
     python -m benchmarks.shared_cases FOLDER [CASE ...]
 
-FOLDER holds ``case-NN.h5`` and ``keys.json``. The diagnosis sees the recording only; the key is opened when it is done.
+FOLDER holds ``case-NN.h5`` and ``keys.json``. The diagnosis reads the recording only.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from estimation.mismatch.diagnosis import diagnose
+from estimation.diagnosis.diagnose import diagnose
 from scanner.recording import Recording
 
 
-def judged(content: dict[str, Any], key: dict[str, Any]) -> str:
+def grade_answer(content: dict[str, Any], key: dict[str, Any]) -> str:
     """``right``, ``class`` (the truth is among the first finding's rivals), or what is wrong."""
     findings = content["findings"]
     if key["effect"] == "none":
@@ -34,33 +34,28 @@ def judged(content: dict[str, Any], key: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    folder, wanted = Path(arguments[0]), arguments[1:]
+    folder, selected = Path(arguments[0]), arguments[1:]
     keys = json.loads((folder / "keys.json").read_text(encoding="utf-8"))
-    tally: dict[str, int] = {}
+    counts: dict[str, int] = {}
     print("| case | truth | answer | stage | probability | held-out χ² | s | |\n|---|---|---|---|---|---|---|---|")
     for name, key in keys.items():
-        if wanted and name not in wanted:
+        if selected and name not in selected:
             continue
         with Recording.open(folder / f"{name}.h5") as recording:
-            began = time.perf_counter()
+            start = time.perf_counter()
             content = diagnose([recording]).to_json()
-            seconds = time.perf_counter() - began
-        result = judged(content, key)
-        tally[result] = tally.get(result, 0) + 1
+            seconds = time.perf_counter() - start
+        result = grade_answer(content, key)
+        counts[result] = counts.get(result, 0) + 1
         answers = " + ".join(finding["effect"] for finding in content["findings"]) or "consistent"
         first = content["findings"][0] if content["findings"] else None
-        shown = (
-            (
-                first["stage"],
-                f"{first['probability']:.3f}",
-                f"{first['heldout']['before']:.3g} → {first['heldout']['after']:.3f}",
-            )
-            if first
-            else ("", "", "")
-        )
-        row = [name, key["effect"], answers, *shown, f"{seconds:.0f}", result]
+        cells = ["", "", ""]
+        if first:
+            chi2 = first["heldout"]
+            cells = [first["stage"], f"{first['probability']:.3f}", f"{chi2['before']:.3g} → {chi2['after']:.3f}"]
+        row = [name, key["effect"], answers, *cells, f"{seconds:.0f}", result]
         print("| " + " | ".join(row) + " |", flush=True)
-    print(", ".join(f"{count} {result}" for result, count in sorted(tally.items())))
+    print(", ".join(f"{count} {result}" for result, count in sorted(counts.items())))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,7 @@
-"""Sphinx: the pages of this folder; gallery, catalogue and API are made from the sources."""
+"""Sphinx configuration. The gallery, the tables of the reference and the API pages are made from the sources."""
 
 from __future__ import annotations
 
-import html
-import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,10 +9,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
-    from scanner.terms import Term
-
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
 project = "lissajous"
 copyright = "MIT licence"
@@ -43,7 +39,7 @@ apidoc_separate_modules = True
 apidoc_module_first = True
 apidoc_modules = [
     {"path": f"../{package}", "destination": f"api/{package}", "automodule_options": {"members", "show-inheritance"}}
-    for package in ("scanner", "phantoms", "estimation", "recon")
+    for package in ("lissajous", "scanner", "phantoms", "estimation", "recon")
 ]
 
 sphinx_gallery_conf = {
@@ -60,35 +56,12 @@ sphinx_gallery_conf = {
 }
 
 
-def written(equation: str) -> str:
-    """An equation's text as HTML: ``_i`` and the number of a letter lowered, ``^(..)`` and ``^2`` raised."""
-    text = html.escape(equation, quote=False)
-    text = re.sub(r"_([A-Za-z0-9]+)|(?<=[A-Za-zα-ω])(\d)(?![A-Za-z0-9])", r"<sub>\1\2</sub>", text)
-    return re.sub(r"\^(?:\(([^)]*)\)|(\d))", r"<sup>\1\2</sup>", text)
+def insert_tables(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Put the generated tables into the pages that ask for them."""
+    from generated_tables import with_tables
 
-
-def entry(term: Term) -> str:
-    """One effect of the catalogue, in Markdown."""
-    units = ", ".join(f"`{p.name}`" + ("" if p.unit == "1" else f" [{written(p.unit)}]") for p in term.parameters)
-    lines = [
-        f"### {term.effect}",
-        f'<p class="equation"><i>{written(term.equation)}</i></p>',
-        f"Parameters: {units}. Source: {term.source}.",
-        *(f"- Looks like [{other}](#{other}): {apart}." for other, apart in term.lookalikes.items()),
-    ]
-    return "\n\n".join(lines[:3]) + "\n\n" + "\n".join(lines[3:])
-
-
-def with_catalogue(app: Sphinx, docname: str, source: list[str]) -> None:
-    """The page ``catalogue`` goes on with every term, stage by stage, as the term files tell them."""
-    if docname != "catalogue":
-        return
-    from scanner.terms import STAGES, catalogue
-
-    for stage in STAGES:
-        entries = [entry(term) for term in catalogue().values() if term.stage == stage]
-        source[0] += "\n\n".join([f"\n## {stage.capitalize()}", *entries, ""])
+    source[0] = with_tables(source[0])
 
 
 def setup(app: Sphinx) -> None:
-    app.connect("source-read", with_catalogue)
+    app.connect("source-read", insert_tables)

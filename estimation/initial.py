@@ -1,4 +1,4 @@
-"""Amplitude, phase and offset from the first stretch of a sense signal, with no filter: where every filter starts."""
+"""Amplitude, phase and offset from the first cycles of a sense signal by least squares: the start of every filter."""
 
 from __future__ import annotations
 
@@ -6,25 +6,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from estimation.reference import Reference
-from estimation.signals import Sense, is_capacitive
+from estimation.reference import PhaseReference
+from estimation.signals import SenseChannel, is_capacitive
+from scanner.arrays import Array
 from scanner.device import Amdm, Axis, Capacitance, Device
 from scanner.errors import BadInput
 from scanner.harmonics import capacitance_harmonics, readout_response
-from scanner.lowpass import response
+from scanner.lowpass import lowpass_response
 
-Array = NDArray[np.float64]
+WINDOW_CYCLES = 6.0
+"""Cycles of the slowest motion that are fitted: enough to separate the harmonics of two axes, short against drift."""
 
-WINDOW_CYCLES = 6.0  # of the slowest motion
 MIN_SAMPLES = 512
-SIGNIFICANT = 6.0  # standard deviations: below it the signal shows no motion
+"""Samples fitted at least, so that noise averages out at low sample rates."""
+
+DETECTION_SIGMA = 6.0
+"""Size of a harmonic in standard deviations of its noise from which it counts as motion; by chance once in 1e8."""
 
 
 @dataclass(frozen=True)
-class AxisStart:
-    """Steady motion A sin(psi + phase) of one axis over the first stretch.
+class InitialAxisMotion:
+    """Steady motion A sin(psi + phase) of one axis over the first cycles.
 
     Attributes:
         amplitude: [rad]. phase: against the reference [rad], modulo pi unless ``sign`` is known.
@@ -40,26 +43,26 @@ class AxisStart:
 
 
 @dataclass(frozen=True)
-class Start:
-    """Where the filters of one sense channel start.
+class InitialMotion:
+    """Initial motion of all axes of one sense channel, and the offset of its readout.
 
     Attributes:
         axes: by name. offset: of the readout as measured [V]. noise_sd: of the signal about the fit [V].
-        window: length of the stretch [s].
+        window: length of the fitted segment [s].
     """
 
-    axes: Mapping[str, AxisStart]
+    axes: Mapping[str, InitialAxisMotion]
     offset: float
     noise_sd: float
     window: float
 
 
-def start_from_signal(sense: Sense, device: Device, references: Mapping[str, Reference]) -> Start:
-    """Fit an offset and the harmonics of every axis to the first stretch of ``sense``.
+def fit_initial_motion(sense: SenseChannel, device: Device, references: Mapping[str, PhaseReference]) -> InitialMotion:
+    """Fit an offset and the harmonics of every axis to the first cycles of ``sense``.
 
     The second harmonic of the motion in a capacitive signal (the first in a position signal) gives amplitude and
-    phase through the readout's response at the frequency of the moment; the offset is what the capacitance's mean
-    leaves. A resonance that never started is refused.
+    phase, through the readout's response at its frequency. The offset is the signal's mean minus that of the
+    capacitance.
 
     Raises:
         BadInput: the signal shows no motion at a reference's frequency, or is too short.
@@ -93,7 +96,7 @@ def start_from_signal(sense: Sense, device: Device, references: Mapping[str, Ref
     axes, offset = {}, float(fitted[0])
     for name in sense.axes:
         line = phasors[name, 2 if is_capacitive(sense.readout) else 1]
-        if abs(line) < SIGNIFICANT * line_sd:
+        if abs(line) < DETECTION_SIGMA * line_sd:
             raise BadInput(
                 f"shows no motion of axis {name} at {frequencies[name]:.6g} Hz: "
                 f"{abs(line):.1e} V where noise gives {line_sd:.1e} V",
@@ -108,46 +111,55 @@ def start_from_signal(sense: Sense, device: Device, references: Mapping[str, Ref
             gain = float(readout_response(sense.readout, 0.0).real)
             phase = float(np.angle(1j * line / gain))  # Re(Z e^{i psi}) = A sin(psi + phase) for Z = -i A e^{i phase}
             sd = line_sd / abs(gain)
-            axes[name] = AxisStart(abs(line / gain), phase, sd, sd * abs(gain / line), "known: position readout")
-    return Start(axes, offset, noise_sd, n / rate)
+            axes[name] = InitialAxisMotion(
+                abs(line / gain), phase, sd, sd * abs(gain / line), "known: position readout"
+            )
+    return InitialMotion(axes, offset, noise_sd, n / rate)
 
 
-def amplitude_of_line(size: float, comb: Capacitance, gain: float) -> tuple[float, float]:
+def amplitude_from_line(size: float, comb: Capacitance, gain: float) -> tuple[float, float]:
     """Amplitude [rad] whose second harmonic of C, times ``gain`` [V/F], is ``size`` [V]; and d size/dA [V/rad]."""
     amplitudes = np.linspace(0.0, 1.6, 161) * comb.theta0
     lines = gain * np.array([abs(capacitance_harmonics(float(a), comb, 2)[2]) for a in amplitudes])
-    top = int(lines.argmax())  # beyond it a larger swing gives no larger line
-    # The line grows as A^2 at first: interpolated in its square root it is nearly straight.
+    top = int(lines.argmax())  # beyond it the line falls with the amplitude
+    # The line grows as A^2 at first, so that its square root is nearly linear.
     amplitude = float(np.interp(np.sqrt(size), np.sqrt(lines[: top + 1]), amplitudes[: top + 1]))
-    for _ in range(3):  # and two or three steps of Newton take the rest of the error away
+    for _ in range(3):  # Newton steps remove the interpolation error
         step = 1e-4 * comb.theta0
-        here, there = (gain * abs(capacitance_harmonics(a, comb, 2)[2]) for a in (amplitude, amplitude + step))
-        slope = max((there - here) / step, 1e-3 * gain * comb.C0 / comb.theta0)
-        amplitude = float(np.clip(amplitude + (size - here) / slope, amplitudes[1], amplitudes[top]))
+        value, value_ahead = (gain * abs(capacitance_harmonics(a, comb, 2)[2]) for a in (amplitude, amplitude + step))
+        slope = max((value_ahead - value) / step, 1e-3 * gain * comb.C0 / comb.theta0)
+        amplitude = float(np.clip(amplitude + (size - value) / slope, amplitudes[1], amplitudes[top]))
     return amplitude, slope
 
 
 def _from_capacitance(
-    sense: Sense, axis: Axis, frequency: float, name: str, phasors: Mapping[tuple[str, int], complex], line_sd: float
-) -> tuple[AxisStart, float]:
+    sense: SenseChannel,
+    axis: Axis,
+    frequency: float,
+    name: str,
+    phasors: Mapping[tuple[str, int], complex],
+    line_sd: float,
+) -> tuple[InitialAxisMotion, float]:
     comb = axis.require_capacitance()
     line = phasors[name, 2]
-    seen = complex(readout_response(sense.readout, 2.0 * frequency))
-    amplitude, slope = amplitude_of_line(abs(line), comb, abs(seen))
+    gain = complex(readout_response(sense.readout, 2.0 * frequency))
+    amplitude, slope = amplitude_from_line(abs(line), comb, abs(gain))
     harmonics = capacitance_harmonics(amplitude, comb)
-    phase = 0.5 * float(np.angle(line / (seen * harmonics[2])))
+    phase = 0.5 * float(np.angle(line / (gain * harmonics[2])))
     sign = "ambiguous"
     odd = complex(readout_response(sense.readout, frequency)) * harmonics[1]
-    if abs(odd) > SIGNIFICANT * line_sd and (name, 1) in phasors:
+    if abs(odd) > DETECTION_SIGMA * line_sd and (name, 1) in phasors:
         agreement = (np.conj(odd * np.exp(1j * phase)) * phasors[name, 1]).real / abs(odd)
-        if abs(agreement) > SIGNIFICANT * line_sd:
+        if abs(agreement) > DETECTION_SIGMA * line_sd:
             phase += 0.0 if agreement > 0.0 else np.pi
             sign = "known: the combs' offset theta_th"
     mean = sense.readout.a_cir * harmonics[0].real if isinstance(sense.readout, Amdm) else 0.0
-    return AxisStart(amplitude, phase, line_sd / slope, 0.5 * line_sd / abs(line), sign), mean
+    return InitialAxisMotion(amplitude, phase, line_sd / slope, 0.5 * line_sd / abs(line), sign), mean
 
 
-def section_states(sense: Sense, device: Device, start: Start, references: Mapping[str, Reference]) -> Array:
+def initial_section_states(
+    sense: SenseChannel, device: Device, start: InitialMotion, references: Mapping[str, PhaseReference]
+) -> Array:
     """Output of each low-pass section at the signal's first sample under the steady motion of ``start`` [F]."""
     if not isinstance(sense.readout, Amdm):
         return np.empty(0)
@@ -159,6 +171,6 @@ def section_states(sense: Sense, device: Device, start: Start, references: Mappi
         harmonics = capacitance_harmonics(motion.amplitude, device.axis(name).require_capacitance())
         orders = np.arange(harmonics.size)
         for s in range(out.size):
-            passed = harmonics * response(orders * f, sense.readout.lpf_hz[: s + 1])
+            passed = harmonics * lowpass_response(orders * f, sense.readout.lpf_hz[: s + 1])
             out[s] += float(np.sum(passed * np.exp(1j * orders * turn)).real)
     return out

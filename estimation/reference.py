@@ -1,27 +1,38 @@
-"""The phase that a motion's phase is told against: half the drive's, the drive's, or absolute."""
+"""The reference against which the phase of a motion is stated: half the drive's phase, the drive's, or 2 pi f t."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.demodulate import block_length, block_phasors, unwrapped
 from scanner.errors import BadInput
+from scanner.lock_in import block_length, block_phasors, unwrap_phase
 
-Array = NDArray[np.float64]
+BLOCK_CYCLES = 4
+"""Cycles of the drive per block: the phase then advances by less than half a cycle a block for a chirp of up to an
+eighth of the frequency each way, and can be unwrapped."""
 
-_CYCLES = 4  # of the drive, a block: a sweep of an eighth of the frequency each way is followed
-_CHUNK = 1 << 19  # samples read at a time
-_MOST = 1 << 18  # samples in which a line is looked for
-_FEW_PERIODS = 3.0
-_QUIET = 0.1  # of the largest amplitude: below it the drive counts as off and its phase goes on as it was
+CHUNK_SAMPLES = 1 << 19
+"""Samples read at a time, which bounds the memory."""
+
+MAX_SPECTRUM_SAMPLES = 1 << 18
+"""Samples in whose spectrum a line is searched."""
+
+SHORT_SPECTRUM_PERIODS = 3.0
+"""Periods of the lowest frequency that are searched first: enough where the line is present from the beginning."""
+
+DRIVE_ON_RATIO = 0.1
+"""Amplitude relative to the largest below which the drive counts as off; its phase is then interpolated."""
+
+LINE_RATIO = 10.0
+"""Height of a line over the median of the spectrum from which it counts as an oscillation."""
 
 
 @dataclass(frozen=True)
-class Reference:
+class PhaseReference:
     """Reference phase psi(t) of one axis: 2 pi f t plus a slow part given at knots.
 
     Attributes:
@@ -36,7 +47,7 @@ class Reference:
     slow: Array
 
     def phase(self, time: Array) -> Array:
-        """psi at ``time`` [s]: [rad]; beyond the knots it goes on at the end's frequency."""
+        """psi at ``time`` [s]: [rad]; extrapolated beyond the knots at the frequency of the nearest end."""
         inside = np.interp(time, self.knots, self.slow)
         first, last = (
             np.diff(self.slow[:2]) / np.diff(self.knots[:2]),
@@ -46,61 +57,62 @@ class Reference:
         return inside + 2 * np.pi * self.frequency * time
 
     def frequency_at(self, time: Array) -> Array:
-        """psi' / 2 pi [Hz]: the motion's frequency but for the motion's own slow phase."""
+        """psi' / 2 pi at ``time`` [s]: [Hz], shape (n,); the motion's frequency without its slow phase."""
         slope = np.gradient(self.slow, self.knots) / (2 * np.pi)
         return self.frequency + np.interp(time, self.knots, slope)
 
 
-def absolute(frequency: float, start: float, end: float) -> Reference:
-    """2 pi f t, where no drive was recorded."""
-    return Reference("absolute", frequency, np.array([start, end]), np.zeros(2))
+def absolute_reference(frequency: float, start: float, end: float) -> PhaseReference:
+    """The reference 2 pi f t from ``start`` to ``end`` [s], for a recording without a drive."""
+    return PhaseReference("absolute", frequency, np.array([start, end]), np.zeros(2))
 
 
-def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> Reference:
-    """The reference from a recorded drive voltage; through a gap (NaN) in it the phase runs straight.
+def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> PhaseReference:
+    """The reference from a recorded drive voltage; the phase is interpolated linearly through gaps (NaN).
 
     Args:
         drive: its channel.
         kind: ``"half-drive"`` for a parametric drive, ``"drive"`` for a linear one.
-        low: the drive oscillates above this [Hz]; what is below comes from switching it on and off.
+        low: lower bound of the drive's frequency [Hz]; lines below come from switching it on and off.
 
     Raises:
         BadInput: the drive holds no oscillation.
     """
     f = dominant_frequency(drive, low)
-    block = block_length(f, drive.sample_rate, _CYCLES)
+    block = block_length(f, drive.sample_rate, BLOCK_CYCLES)
     if drive.size < 2 * block:
         raise BadInput(
-            f"is {drive.size / drive.sample_rate:.3g} s long, less than {2 * _CYCLES} periods of its {f:.6g} Hz",
+            f"is {drive.size / drive.sample_rate:.3g} s long, less than {2 * BLOCK_CYCLES} periods of its {f:.6g} Hz",
             file=drive.file,
             channel=drive.name,
             hint="record for longer",
         )
-    looks: list[tuple[Array, Array, Array]] = []
-    chunk = block * max(1, _CHUNK // block)
+    chunks: list[tuple[Array, Array, Array]] = []
+    chunk = block * max(1, CHUNK_SAMPLES // block)
     for first in range(0, drive.size - block + 1, chunk):
         values = drive.stored(first, min(first + chunk, drive.size))
         start = drive.start + first / drive.sample_rate
         t, z = block_phasors(values, drive.sample_rate, start, f, block, drive.gain)
-        looks.append((t, np.angle(z * np.exp(-2j * np.pi * f * t)), np.nan_to_num(np.abs(z))))
-    time, phase, size = (np.concatenate(parts) for parts in zip(*looks, strict=True))
-    on = size > _QUIET * size.max()
+        chunks.append((t, np.angle(z * np.exp(-2j * np.pi * f * t)), np.nan_to_num(np.abs(z))))
+    time, phase, size = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    on = size > DRIVE_ON_RATIO * size.max()
     time, phase = (time[on], phase[on]) if on.sum() >= 2 else (time, phase)
-    slow = unwrapped(phase)
-    share = 0.5 if kind == "half-drive" else 1.0
-    return Reference(kind, share * f, time, share * slow)
+    slow = unwrap_phase(phase)
+    ratio = 0.5 if kind == "half-drive" else 1.0
+    return PhaseReference(kind, ratio * f, time, ratio * slow)
 
 
 def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
     """Frequency of the strongest line in (low, high) over the first ``window`` seconds (at most 2^18 samples) [Hz].
 
-    A few periods of ``low`` are looked at first: they are enough where the line is there from the beginning.
+    A few periods of ``low`` are searched first, which is fast.
 
     Raises:
         BadInput: no line stands out there.
     """
-    most = min(channel.size, _MOST, round(window * channel.sample_rate) if window else _MOST)
-    few = round(min(most, _FEW_PERIODS * channel.sample_rate / low)) if low > 0.0 else most
+    window_samples = round(window * channel.sample_rate) if window else MAX_SPECTRUM_SAMPLES
+    most = min(channel.size, MAX_SPECTRUM_SAMPLES, window_samples)
+    few = round(min(most, SHORT_SPECTRUM_PERIODS * channel.sample_rate / low)) if low > 0.0 else most
     few = 1 << (max(few, 1).bit_length() - 1)
     for n in (few, most):
         found = _strongest(channel.read(0, n), channel.sample_rate, low, high)
@@ -119,7 +131,7 @@ def _strongest(values: Array, rate: float, low: float, high: float) -> float | N
     spectrum[(frequency <= max(low, 2.0 * rate / n)) | (frequency >= high)] = 0.0
     peak = int(spectrum[1:-1].argmax()) + 1
     rest = np.median(spectrum[spectrum > 0.0]) if (spectrum > 0.0).any() else 0.0
-    if not spectrum[peak] > 10.0 * rest:
+    if not spectrum[peak] > LINE_RATIO * rest:
         return None
     around = np.log(np.maximum(spectrum[peak - 1 : peak + 2], 1e-300))
     shift = 0.5 * (around[0] - around[2]) / (around[0] - 2 * around[1] + around[2])

@@ -1,23 +1,20 @@
-"""What a recording offers an estimator: which channel tells of which axis, behind which readout."""
+"""The channels of a recording that estimators use: sense signals with their readout, drives, phase references."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from estimation.reference import Reference, absolute, dominant_frequency, drive_reference
+from estimation.reference import PhaseReference, absolute_reference, dominant_frequency, drive_reference
 from scanner.channel import Channel, check_signal
 from scanner.device import Device, Position, Readout
 from scanner.errors import BadInput, ChannelMissing, DeviceInvalid
 from scanner.recording import Recording
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
-class Sense:
+class SenseChannel:
     """One sense channel: its readout and the axes whose motion it carries."""
 
     channel: Channel
@@ -25,22 +22,22 @@ class Sense:
     axes: tuple[str, ...]
 
 
-def device_of(recording: Recording, device: Device | None) -> Device:
+def require_device(recording: Recording, device: Device | None) -> Device:
     """The device given, else the recording's own.
 
     Raises:
         DeviceInvalid: there is none.
     """
-    found = device or recording.device
-    if found is None:
+    chosen = device or recording.device
+    if chosen is None:
         raise DeviceInvalid(
             "states no device", file=recording.path, channel="/device", hint="give one with --device FILE"
         )
-    return found
+    return chosen
 
 
-def senses(recording: Recording, device: Device, gaps_ok: bool = False) -> list[Sense]:
-    """The sense channels, checked: every axis of the device in one of them.
+def sense_channels(recording: Recording, device: Device, gaps_ok: bool = False) -> list[SenseChannel]:
+    """The sense channels, each checked; every axis of the device is in one of them.
 
     Args:
         gaps_ok: samples may be missing (NaN).
@@ -57,22 +54,23 @@ def senses(recording: Recording, device: Device, gaps_ok: bool = False) -> list[
                 channel="readout",
                 hint="add [readout] with kind and its values at the top level of the device",
             )
-        found = [Sense(recording["sense"], device.readout, tuple(device.axes))]
+        signals = [SenseChannel(recording["sense"], device.readout, tuple(device.axes))]
     else:
-        found = [
-            Sense(recording.require(f"sense_{name}", "this estimator needs it"), axis.require_readout(), (name,))
+        signals = [
+            SenseChannel(recording.require(f"sense_{name}", "this estimator needs it"), axis.require_readout(), (name,))
             for name, axis in device.axes.items()
         ]
-    for sense in found:
+    for sense in signals:
         check_signal(sense.channel, gaps_ok=gaps_ok)
-    return found
+    return signals
 
 
-def drive_voltage(recording: Recording, axis: str, gaps_ok: bool = False) -> Channel | None:
-    """The voltage on one axis's combs: its drive, else its bias during a free decay, else None for none recorded.
+def drive_channel(recording: Recording, axis: str, gaps_ok: bool = False) -> Channel | None:
+    """The voltage channel of one axis: its drive, or its bias during a free decay; None if none was recorded.
 
     Args:
-        gaps_ok: samples may be missing (NaN). ``reference_of`` has then looked through a drive already.
+        gaps_ok: samples may be missing (NaN). The drive is then not checked here, because ``phase_reference`` has
+        checked it.
     """
     for name in (f"drive_{axis}", f"bias_{axis}"):
         if name in recording:
@@ -82,9 +80,9 @@ def drive_voltage(recording: Recording, axis: str, gaps_ok: bool = False) -> Cha
     return None
 
 
-def reference_of(
+def phase_reference(
     recording: Recording, device: Device, axis: str, sense: Channel | None = None, even: bool = False
-) -> Reference:
+) -> PhaseReference:
     """The phase reference of one axis (see ``estimation.reference``).
 
     Args:
@@ -94,18 +92,18 @@ def reference_of(
     Raises:
         BadInput: neither the drive nor the signal holds an oscillation.
     """
-    own = device.axis(axis)
+    stated = device.axis(axis)
     if f"drive_{axis}" in recording:
         drive = recording[f"drive_{axis}"]
         check_signal(drive, gaps_ok=True)
-        low = 0.1 * own.resonance if own.mechanics else 0.0
-        if own.require_drive().kind == "linear":
+        low = 0.1 * stated.resonance if stated.mechanics else 0.0
+        if stated.require_drive().kind == "linear":
             return drive_reference(drive, "drive", low)
         reference = drive_reference(drive, "half-drive", low)
-        if own.mechanics and not 0.75 < reference.frequency / own.resonance < 1.33:
+        if stated.mechanics and not 0.75 < reference.frequency / stated.resonance < 1.33:
             raise BadInput(
                 f"oscillates at {2 * reference.frequency:.6g} Hz, and axis {axis} moves at half of that near its "
-                f"resonance of {own.resonance:.6g} Hz",
+                f"resonance of {stated.resonance:.6g} Hz",
                 file=drive.file,
                 channel=drive.name,
                 hint="check its sample_rate, and J and k of the device",
@@ -119,14 +117,14 @@ def reference_of(
             hint="record the drive",
         )
     double = 2.0 if even else 1.0
-    band = (0.8 * double * own.resonance, 1.25 * double * own.resonance) if own.mechanics else (0.0, np.inf)
-    window = 60.0 / own.resonance if own.mechanics else None
+    band = (0.8 * double * stated.resonance, 1.25 * double * stated.resonance) if stated.mechanics else (0.0, np.inf)
+    window = 60.0 / stated.resonance if stated.mechanics else None
     frequency = dominant_frequency(sense, *band, window=window) / double
-    return absolute(frequency, sense.start, sense.end)
+    return absolute_reference(frequency, sense.start, sense.end)
 
 
 def is_capacitive(readout: Readout) -> bool:
-    """Whether the readout sees a capacitance: it carries twice the motion's frequency and not its sign."""
+    """Whether the readout measures a capacitance: its signal has twice the motion's frequency and no sign."""
     return not isinstance(readout, Position)
 
 

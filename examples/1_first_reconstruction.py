@@ -2,41 +2,36 @@
 A first reconstruction
 ======================
 
-A scan is simulated while both resonances drift; its motion is estimated, its picture reconstructed and scored.
+A scan is simulated while both resonances drift. Its motion is estimated, and its picture is reconstructed and
+compared with the truth.
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from estimation.estimate import estimate
-from phantoms.experiment import Experiment, run
-from recon.blur import bound, picture_error, within_bound
-from recon.mapping import Grid, map_samples
-from recon.score import axis_error
+import lissajous
 
 # %%
-# Both combs share one sense electrode. ``run`` gives the recording and, apart from it, what only a simulation knows.
-recording, truth = run(Experiment(target="siemens_star", duration=0.03), seed=7)
-print(*recording.channels)
+# Both combs share one sense electrode. ``simulate`` returns the recording and, separately, what only the simulation
+# knows.
+recording, truth = lissajous.simulate(target="siemens_star", duration=0.03, seed=7)
+print(recording)
 
 # %%
-# The angles of both axes come from the sense signal alone; each sample of the light goes to the pixel that they name.
-motion = estimate(recording, method="ekf")
-scan = recording.device.scan
-grid = Grid(400, 400, scan.half_angle_x, scan.half_angle_y)
-x, y = (motion.axes[axis].angle.values for axis in "xy")
-picture = map_samples(x, y, recording["intensity"].read(), grid)
+# The angles of both axes are estimated from the sense signal. Each sample of the intensity is mapped to the pixel at
+# those angles.
+result = lissajous.reconstruct(recording, estimator="ekf", truth=truth)
+print(result.picture)
 
 # %%
-# The phase may err by p/m before a sample lands p pixels off, m being half the picture's width in pixels.
-errors = {axis: axis_error(motion.axes[axis], truth[f"angle_{axis}"][0].astype(float), 5e6, 0.0) for axis in "xy"}
-for axis, error in errors.items():
-    inside = within_bound(bound(p=1, m=200), error=error.phase)
+# The phase may be wrong by p/m before a sample is displaced by p pixels; m is half the width of the picture in pixels.
+limit = lissajous.phase_bound(p=1, m=200)
+for axis, error in result.evaluation.items():
+    inside = np.mean(np.abs(error.phase) < limit)
     print(f"{axis}: phase error {np.degrees(error.phase_rmse):.3f}° rms, {inside:.1%} of the scan within ±p/m")
-print(picture_error(picture, truth["scene"], errors["x"].mirrored, errors["y"].mirrored))
 
 # %%
-plt.imshow(picture.image, cmap="gray")
+plt.imshow(result.picture.image, cmap="gray")
 plt.title("reconstructed; white: never visited")
 plt.axis("off")
 plt.show()

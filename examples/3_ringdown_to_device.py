@@ -2,8 +2,8 @@
 From ringdown to device
 =======================
 
-The mirror is let go under a DC bias and rings down; a position detector and the comb's current are recorded. What the
-data sheet says of resonance, damping and comb is replaced by what the decay tells, with its uncertainty.
+The mirror is released under a DC bias and rings down; a position detector and the current of the comb are recorded.
+The nominal values of resonance, damping and comb are replaced by measured ones with their uncertainty.
 """
 
 from dataclasses import replace
@@ -11,23 +11,21 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 
-from estimation.calibration import identify
-from phantoms.forward import Plan, Start, simulate
+import lissajous
+from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant
-from scanner import devices
-from scanner.recording import Recording
 
 # %%
-# The mirror on the bench is not quite the nominal one: stiffer by 0.5 %, and its damping 8 % more.
-nominal = devices.load("chen2019")
+# The true mirror is stiffer than the nominal one by 0.5 %, and its damping is 8 % larger.
+nominal = lissajous.load_device("chen2019")
 axis = nominal.axis("x")
 mechanics = axis.mechanics
 true = replace(axis, mechanics=replace(mechanics, k=1.005 * mechanics.k, b=1.08 * mechanics.b))
 plan = Plan({"x": Constant(10.0)}, duration=0.08, sample_rate=200e3, angles=True)
-clean, _ = simulate(replace(nominal, axes={"x": true}), plan, seed=1, start={"x": Start(0.15, 0.0)})
+clean, _ = simulate(replace(nominal, axes={"x": true}), plan, seed=1, start={"x": InitialState(0.15, 0.0)})
 
 # %%
-# The detector has a noise of its own, 0.2 mrad. A constant voltage is a bias: nothing is driven.
+# The position detector has a noise of 0.2 mrad. A constant voltage is a bias, not a drive.
 angle, sense = clean["angle_x"], clean["sense_x"]
 noisy = angle.read() + 2e-4 * np.random.default_rng(2).standard_normal(angle.size)
 channels = {
@@ -35,7 +33,7 @@ channels = {
     "sense_x": (sense.read(), "V", sense.sample_rate, sense.start),
     "bias_x": (np.full(angle.size, 10.0), "V", angle.sample_rate, angle.start),
 }
-found = identify([Recording.from_arrays(channels, nominal, name="ringdown")], nominal)
+found = lissajous.identify(lissajous.Recording.from_arrays(channels, nominal, name="ringdown"))
 
 # %%
 figure, (top, bottom) = plt.subplots(2, 1, sharex=True, layout="constrained")
@@ -47,9 +45,9 @@ bottom.set(xlabel="time (ms)", ylabel="comb's current, amplified (V)")
 plt.show()
 
 # %%
-# The device that was found goes where the nominal one stood; its tolerances are what the decay left open.
+# The identified device replaces the nominal one. Its tolerances are the standard deviations of the identified values.
 for name, value in found.values["x"].items():
     print(f"{name:10} {value.value:.6g} ({value.ci95[0]:.6g} to {value.ci95[1]:.6g})")
-resonances = [each.resonance for each in (axis, found.device.axis("x"), true)]
+resonances = [state.resonance for state in (axis, found.device.axis("x"), true)]
 print("resonance: nominal {:.2f} Hz, found {:.2f} Hz, true {:.2f} Hz".format(*resonances))
 print(*found.notes, sep="\n")

@@ -15,20 +15,19 @@ from pathlib import Path
 
 import numpy as np
 from afm_spiral import TURNS_PER_SECOND, fit_spiral
-from ladder import ladder, told
+from effect_contributions import findings_text, nested_fits
 from numpy.typing import NDArray
 
-from estimation.mismatch.diagnosis import diagnose
-from estimation.mismatch.experiment import experiment
-from estimation.mismatch.fit import FOLDS, HELD, Comparison, Fit, solve
-from estimation.mismatch.model import Candidate, Model
-from estimation.mismatch.start import first_whiteners
-from recon.readers import read
+from estimation.diagnosis.data import prepare_run
+from estimation.diagnosis.diagnose import diagnose
+from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Comparison, Fit, fit_model
+from estimation.diagnosis.initial import flat_whiteners
+from estimation.diagnosis.model import Candidate, Model
+from recon.io.readers import read
+from scanner.arrays import Array
 from scanner.device import Axis, Device, Drive, Mechanics, Position
 from scanner.recording import Recording
 from scanner.terms import catalogue
-
-Array = NDArray[np.float64]
 
 RATE = 20e3
 THIN = 10
@@ -77,14 +76,15 @@ def by_laws(recording: Recording, laws: Sequence[str]) -> Fit:
     """The linear stage with ``laws`` of its sensed position, all fitted together."""
     device = recording.device
     assert device is not None
-    run = experiment(recording, device)
+    run = prepare_run(recording, device)
     model = Model([run], device, [Candidate(catalogue()[effect], "x", "sense") for effect in laws], ())
-    return solve(Comparison([run], first_whiteners(model)), model, np.zeros(len(model.free)), turns=8)
+    return fit_model(Comparison([run], flat_whiteners(model)), model, np.zeros(len(model.parameters)), max_iterations=8)
 
 
 def held_out(size: int) -> NDArray[np.bool_]:
     """Samples that no fit saw, shape (n,)."""
-    return np.asarray((np.floor(np.arange(size) / size * FOLDS).astype(int) % HELD) == HELD // 2)
+    block = np.floor(np.arange(size) / size * TIME_BLOCKS).astype(int)
+    return np.asarray(block % VALIDATION_BLOCK_INTERVAL == VALIDATION_BLOCK_INTERVAL // 2)
 
 
 def missed(fit: Fit) -> float:
@@ -120,8 +120,8 @@ def main(data: Path, output: Path) -> None:
         found = diagnose([recording], say=lambda text: print(f"  ... {text}", flush=True))
         (output / f"device_{name}.toml").write_text(found.device.to_toml(), encoding="utf-8")
         print(f"Axis {name}")
-        print(told(found))
-        steps[name] = {f"diagnosed: {effect}": fit for effect, fit in ladder(found).items()}
+        print(findings_text(found))
+        steps[name] = {f"diagnosed: {effect}": fit for effect, fit in nested_fits(found).items()}
         steps[name] |= {" and ".join(laws): by_laws(recording, laws) for laws in (LAWS[:1], LAWS[1:], LAWS)}
         print("  Commanded through the stage against sensed position, rms on samples not used in the fit")
         for label, fit in steps[name].items():

@@ -15,16 +15,15 @@ from pathlib import Path
 
 import numpy as np
 from grating import Grating, fft_wave, fit_grating
-from numpy.typing import NDArray
 
 from estimation.estimate import estimate
-from recon.convert import convert_file
-from recon.mapping import Grid, Picture, map_samples
-from recon.readers import read
+from recon.imaging.gridding import map_samples
+from recon.imaging.picture import Grid, Picture
+from recon.io.convert import convert_file
+from recon.io.readers import read
+from scanner.arrays import Array
 from scanner.device import Device
 from scanner.recording import Recording
-
-Array = NDArray[np.float64]
 
 MAPPING = Path(__file__).with_suffix(".toml")
 TURNS_PER_SECOND = 20.0

@@ -12,15 +12,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from ladder import ladder, told
+from effect_contributions import findings_text, nested_fits
 from numpy.typing import NDArray
 
-from estimation.mismatch.diagnosis import diagnose
-from estimation.mismatch.fit import FOLDS, HELD, Fit
-from recon.convert import convert_file
+from estimation.diagnosis.diagnose import diagnose
+from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit
+from recon.io.convert import convert_file
+from scanner.arrays import Array
 from scanner.recording import Recording
-
-Array = NDArray[np.float64]
 
 MAPPING = Path(__file__).with_suffix(".toml")
 FROM, TO = 12.4, 16.4
@@ -44,8 +43,8 @@ def slow_motion(signal: Array, rate: float) -> tuple[Array, Array, Array]:
 
 def held_out(size: int, rate: float) -> NDArray[np.bool_]:
     """Samples of the blocks that no fit saw, without those whose window reaches into the neighbours, shape (n,)."""
-    block = np.floor(np.arange(size) / size * FOLDS).astype(int)
-    inside = (block % HELD) == HELD // 2
+    block = np.floor(np.arange(size) / size * TIME_BLOCKS).astype(int)
+    inside = (block % VALIDATION_BLOCK_INTERVAL) == VALIDATION_BLOCK_INTERVAL // 2
     reach = int(CYCLES * rate / CENTRE / 2)
     return np.asarray(np.convolve(inside, np.ones(2 * reach + 1), "same") > 2 * reach)
 
@@ -87,7 +86,7 @@ def main(data: Path, output: Path) -> None:
         found = diagnose([whole.slice(FROM, TO)], say=lambda text: print(f"  ... {text}", flush=True))
     (output / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
     print(f"Found in the decay from {FROM} s to {TO} s")
-    print(told(found))
+    print(findings_text(found))
     assert found.search is not None
     channel = found.search.comparison.runs[0].outputs[0]
     rate = 1 / channel.step
@@ -95,7 +94,7 @@ def main(data: Path, output: Path) -> None:
     _, frequency, decay = slow_motion(channel.data - channel.data.mean(), rate)
     print(f"Not used in the fit: {unseen.sum()} samples. Frequency off, rms (Hz); decay rate off, rms (1/s)")
     print(f"  {'constant':22} {frequency[unseen].std():7.3f} {decay[unseen].std():7.3f}")
-    steps = ladder(found)
+    steps = nested_fits(found)
     for name, fit in steps.items():
         signal = simulated(fit)
         _, told_frequency, told_decay = slow_motion(signal - signal.mean(), rate)

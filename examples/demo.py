@@ -1,4 +1,4 @@
-"""What `make demo` runs: simulate a scan whose resonances drift, reconstruct it, say where the report is.
+"""The program of `make demo`: simulate a drifting scan, reconstruct it in five ways, print where the report is.
 
 python examples/demo.py [FOLDER]
 """
@@ -10,20 +10,21 @@ from pathlib import Path
 
 import afm_spiral
 
-from phantoms.experiment import Experiment, run
-from recon.output import finite, replacing_folder
+import lissajous
+from recon.evaluation import load_truth
+from recon.io.output import finite, replacing_folder
 from recon.pipeline import Options, reconstruct
-from recon.report import Figure, Section, comparison_report
-from recon.score import truth_of
-from recon.summary import summarise
-from recon.views import save_picture, uri
+from recon.report.comparison import comparison_report
+from recon.report.figures import data_uri, save_picture
+from recon.report.page import Figure, Section
+from recon.report.summary import summarise
 from scanner.recording import Recording
 
 SPIRAL = Path(__file__).parent.parent.parent / "shared" / "data" / "afm_spiral"
 ESTIMATORS = {"constant phase": "constant", "EKF": "ekf", "UKF": "ukf", "tracker": "tracker"}
 LEAD = (
     "A tissue picture under a resonant scanner, both axes on one electrode, 400 × 400 pixels, 60 ms at 5 MS/s. Both "
-    "mirrors soften by 0.2 %, and their phases leave the bound of 0.286° many times over."
+    "mirrors soften by 0.2 %, which changes their phases by 5 degrees; the bound is 0.286°."
 )
 
 
@@ -32,9 +33,8 @@ def main(folder: Path) -> None:
     began = time.perf_counter()
     scan = folder / "scan.h5"
     print("simulating a scan of 60 ms (compiled once, at the first run) ...", file=sys.stderr)
-    recording, truth = run(Experiment(), seed=1)
-    recording.write(scan, truth)
-    known = truth_of(scan)
+    lissajous.simulate(seed=1).write(scan)
+    known = load_truth(scan)
     results = {}
     with Recording.open(scan) as recording:
         for name, estimator in ESTIMATORS.items():
@@ -67,15 +67,15 @@ def main(folder: Path) -> None:
 
 
 def measured_spiral(folder: Path) -> Section:
-    """The AFM's spiral, reconstructed from its sensors and from the command, as a section of the report."""
+    """Section of the report on the AFM's spiral, reconstructed from its sensors and from the command."""
     print("reconstructing the measured AFM spiral ...", file=sys.stderr)
     afm_spiral.main(SPIRAL, folder)
     drawing = Figure(
-        uri((folder / "afm_spiral.png").read_bytes()), "from the position sensors, as commanded, raster scan"
+        data_uri((folder / "afm_spiral.png").read_bytes()), "from the position sensors, as commanded, raster scan"
     )
     text = (
-        "An atomic-force microscope's spiral over a grating of 3 µm pitch, gridded where its position sensors say that "
-        "the stage was, and where it was told to be; beside them the raster scan of the same sample."
+        "An atomic-force microscope's spiral over a grating of 3 µm pitch, gridded at the positions of its sensors and "
+        "at the commanded positions, and the raster scan of the same sample."
     )
     return Section("Measured: an AFM spiral", text, figures=[drawing], least="40rem")
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.mapping import Picture
-
-Array = NDArray[np.float64]
+from recon.imaging.picture import Picture
+from scanner.arrays import Array
 
 SURFACE_ORDER = 3  # polynomial in x and y that stands for the sample's tilt and the height's drift
 HARMONICS = (1, 2, 3)  # enough of a rectangular profile of any duty cycle

@@ -1,10 +1,10 @@
-"""A readout hides an effect: the picture blurs, a diagnosis names what is missing, the same scan comes out sharp.
+"""A readout with an unmodelled low-pass: the picture is blurred, a diagnosis names the effect, the same scan is sharp.
 
     python examples/missing_physics.py [FOLDER]
 
-Behind the demodulator the amplifier has one more low-pass than its data sheet says, and both axes share the electrode
-that it reads. A scan alone does not tell that: damping and combs within their tolerances would turn the phase as well.
-A calibration recording of the same device can, five milliseconds on a bench with a position detector.
+Behind the demodulator the amplifier has one more low-pass than its data sheet states, and both axes share the electrode
+that it reads. A scan alone does not determine that: damping and combs within their tolerances would change the phase as
+well. A calibration recording of the same device does: five milliseconds with a position detector.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from pathlib import Path
 
 import numpy as np
 
-from estimation.mismatch.diagnosis import Diagnosis, diagnose
-from phantoms.experiment import Experiment, run
+import lissajous
+from estimation.diagnosis.diagnose import Diagnosis
+from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.forward import Plan, simulate
-from recon.mapping import Picture
+from recon.evaluation import truth_from_simulation
+from recon.imaging.picture import Picture
 from recon.pipeline import Options, Reconstruction, reconstruct
-from recon.score import told_truth
-from recon.summary import summarise
-from recon.views import figure, stretched, visible
-from scanner import devices
+from recon.report.figures import fill_small_holes, new_figure, normalise_intensity
+from recon.report.summary import summarise
 from scanner.device import Device
 from scanner.recording import Recording
 
-HIDDEN = {"readout-lag": {"f_c": 1.5e5}}
+UNMODELLED = {"readout-lag": {"f_c": 1.5e5}}
 SCAN, CALIBRATION = 0.04, 0.005  # seconds
 DETECTOR_NOISE = 1e-4  # rad, of the bench's position detector
 SEED = 4
 
 
 def with_terms(device: Device, terms: dict[str, dict[str, float]]) -> Device:
-    """The device with terms of its readout; on a shared electrode they stand with the first axis."""
+    """The device with effects of its readout; on a shared electrode they are stated with the first axis."""
     return replace(device, axes=dict(device.axes) | {"x": replace(device.axis("x"), terms=terms)})
 
 
 def calibration(true: Device, nominal: Device, duration: float = CALIBRATION) -> Recording:
-    """Both axes driven on the bench: sense signal and a position detector's angles."""
+    """A recording of both axes driven, with the sense signal and the angles of a position detector."""
     recording, _ = simulate(true, Plan(Experiment().drives, duration, angles=True), seed=SEED + 1, nominal=nominal)
     rng = np.random.default_rng(SEED)
     channels = {}
@@ -54,32 +54,32 @@ def calibration(true: Device, nominal: Device, duration: float = CALIBRATION) ->
 
 def phase_errors(found: Reconstruction) -> dict[str, float]:
     """Phase error of each axis, root mean square [deg]."""
-    return {axis: float(np.degrees(error.phase_rmse)) for axis, error in found.errors.items()}
+    return {axis: float(np.degrees(error.phase_rmse)) for axis, error in found.evaluation.items()}
 
 
 def scanned(
     true: Device, nominal: Device, duration: float = SCAN, target: str = "immunohistochemistry"
 ) -> Callable[[Device], Reconstruction]:
-    """A scan by the true device, waiting for the device by which it is reconstructed."""
-    scan, told = run(Experiment(true, target, duration=duration), SEED, nominal=nominal)
-    truth = told_truth(told)
-    return lambda device: reconstruct(replace(scan, device_toml=device.to_toml()), Options(), truth)
+    """A function that reconstructs one scan of the true device with the device that it is given."""
+    scan, simulated_truth = simulate_experiment(Experiment(true, target, duration=duration), SEED, nominal=nominal)
+    truth = truth_from_simulation(simulated_truth)
+    return lambda device: reconstruct(replace(scan, device_toml=device.to_toml()), Options(sense_only=True), truth)
 
 
 def close_the_loop() -> tuple[Reconstruction, Diagnosis, Reconstruction]:
-    """The scan by the nominal device, what the calibration recording tells, the scan by the improved device."""
-    nominal = devices.load("imaging")
-    true = with_terms(nominal, HIDDEN)
+    """The scan by the nominal device, the diagnosis of the calibration recording, the scan by the improved device."""
+    nominal = lissajous.load_device("imaging")
+    true = with_terms(nominal, UNMODELLED)
     scan = scanned(true, nominal)
-    found = diagnose([calibration(true, nominal)], nominal)
+    found = lissajous.diagnose(calibration(true, nominal), nominal)
     return scan(nominal), found, scan(found.device)
 
 
 def draw(before: Picture, after: Picture, path: Path) -> None:
     """Both pictures side by side."""
-    drawing, axes = figure(1, 2, (9.0, 4.6))
+    drawing, axes = new_figure(1, 2, (9.0, 4.6))
     for place, picture, title in zip(axes.flat, (before, after), ("nominal device", "improved device"), strict=True):
-        place.imshow(stretched(visible(picture)), cmap="gray")
+        place.imshow(normalise_intensity(fill_small_holes(picture)), cmap="gray")
         place.set(title=title, xticks=[], yticks=[])
     drawing.savefig(path, dpi=150)
 
@@ -101,6 +101,7 @@ def main(folder: Path) -> None:
     (folder / "diagnosis.json").write_text(json.dumps(found.to_json(), indent=1), encoding="utf-8")
     (folder / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
     draw(before.picture, after.picture, folder / "missing_physics.png")
+    print(f"Pictures: {folder / 'missing_physics.png'}, improved device: {folder / 'device.toml'}")
 
 
 if __name__ == "__main__":

@@ -14,15 +14,14 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from ladder import ladder, told
-from numpy.typing import NDArray
+from effect_contributions import findings_text, nested_fits
 
-from estimation.mismatch.diagnosis import diagnose, improved_device
-from estimation.mismatch.prediction import Predicted, predict
-from recon.convert import convert_file
+from estimation.diagnosis.diagnose import diagnose
+from estimation.diagnosis.improvement import improved_device
+from estimation.diagnosis.predict import Predicted, predict
+from recon.io.convert import convert_file
+from scanner.arrays import Array
 from scanner.recording import Recording
-
-Array = NDArray[np.float64]
 
 MAPPING = Path(__file__).with_suffix(".toml")
 FITTED = 2
@@ -75,11 +74,11 @@ def main(data: Path, output: Path) -> None:
         found = diagnose([parts[FITTED]], say=lambda text: print(f"  ... {text}", flush=True))
         (output / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
         print(f"Found in multisine {FITTED + 1} of {len(parts)}")
-        print(told(found))
+        print(findings_text(found))
         unseen = [part for i, part in enumerate(parts) if i != FITTED]
         steps = {
             name: [predict(part, improved_device(fit))["sense_x"] for part in unseen]
-            for name, fit in ladder(found).items()
+            for name, fit in nested_fits(found).items()
         }
         print(f"Simulation error on the other {len(unseen)}, rms over all, and the worst one")
         for name, held in steps.items():

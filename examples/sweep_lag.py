@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.diagnosis.diagnose import Diagnosis, diagnose
 from estimation.estimate import estimate
-from estimation.mismatch.diagnosis import Diagnosis, diagnose
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
-from recon.score import axis_error, told_truth
-from recon.views import figure
+from recon.evaluation import evaluate_axis, truth_from_simulation
+from recon.report.figures import new_figure
 from scanner import devices
 from scanner.device import Amdm, Device
 from scanner.recording import Recording
@@ -69,9 +69,9 @@ def phase_over_sweep(true: Device, device: Device, sweep: Sequence[float] = SWEE
     errors = []
     for frequency in sweep:
         recording, told = simulate(true, driven(frequency, TEST), seed=round(frequency), nominal=device)
-        truth = told_truth(told)
+        truth = truth_from_simulation(told)
         assert truth is not None
-        error = axis_error(estimate(recording, device, "tracker").axes["x"], *truth.angles["x"])
+        error = evaluate_axis(estimate(recording, device, "tracker").axes["x"], *truth.angles["x"])
         errors.append(np.degrees(error.phase.mean()))
     return np.array(errors)
 
@@ -94,7 +94,7 @@ def main(folder: Path) -> None:
 
     (folder / "diagnosis.json").write_text(json.dumps(found.to_json(), indent=1), encoding="utf-8")
     (folder / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
-    drawing, axes = figure(1, 1, (6.0, 3.6))
+    drawing, axes = new_figure(1, 1, (6.0, 3.6))
     place = axes.flat[0]
     khz = np.array(SWEEP) / 1e3
     place.plot(khz, constant, "o-", label="the paper's model, one constant phase")

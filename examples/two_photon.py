@@ -17,11 +17,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.optics_fit import AT_REST, COARSEST, fit, look, measured_noise, scan_of
+from estimation.optics.fit import fit_optics
+from estimation.optics.samples import MIN_CELLS, NOMINAL, measure_cell_variances, project_samples, read_scan
+from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.motion import AngleTrack
+from scanner.motion import SampledAngle
 
-Array = NDArray[np.float64]
 Law = Callable[[Array, Array], Array]
 
 TURN_RATE = 2 * np.pi * 8000.0
@@ -99,17 +100,19 @@ def phase_by_samples(frame: Array, swing: float) -> tuple[float, float]:
     light = [np.interp(at, x, row, np.nan, np.nan) for at, row in zip(places, frame, strict=True)]
     rate = SWEEP * TURN_RATE / np.pi
     tracks = {
-        "x": AngleTrack(np.concatenate(places), rate),
-        "y": AngleTrack(np.linspace(-1.0, 1.0, rows * SWEEP), rate),
+        "x": SampledAngle(np.concatenate(places), rate),
+        "y": SampledAngle(np.linspace(-1.0, 1.0, rows * SWEEP), rate),
     }
     intensity = Channel("intensity", "1", rate, 0.0, np.concatenate(light), 0, rows * SWEEP)
-    scan = scan_of(tracks, intensity)
-    p, cells = AT_REST, COARSEST
+    scan = read_scan(tracks, intensity)
+    p, cells = NOMINAL, MIN_CELLS
     while True:
-        found = fit(scan, {"late_x": LATEST}, p, measured_noise(scan, look(scan, p, cells), cells), cells)
-        if cells == scan.finest:
-            return TURN_RATE * found.p["late_x"], TURN_RATE / float(np.sqrt(found.information[0, 0]))
-        p, cells = found.p, min(2 * cells, scan.finest)
+        found = fit_optics(
+            scan, {"delay_x": LATEST}, p, measure_cell_variances(scan, project_samples(scan, p, cells), cells), cells
+        )
+        if cells == scan.finest_cells:
+            return TURN_RATE * found.parameters["delay_x"], TURN_RATE / float(np.sqrt(found.information[0, 0]))
+        p, cells = found.parameters, min(2 * cells, scan.finest_cells)
 
 
 def draw(frames: dict[str, Array], output: Path) -> None:

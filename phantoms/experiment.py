@@ -1,4 +1,4 @@
-"""An imaging experiment in a few numbers: device, drives, drift, target, spot, light."""
+"""An imaging experiment as a few parameters: device, drives, drift, target, spot, detector."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from phantoms.forward import Plan, Scene, simulate
-from phantoms.optics import Detector, blur
-from phantoms.targets import target
+from phantoms.optics import Detector, blur_by_spot
+from phantoms.targets import make_target
 from phantoms.waveforms import Sine, Waveform
 from scanner import devices
 from scanner.device import Device
-from scanner.drift import Drift, settling
+from scanner.drift import Drift, exponential
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
@@ -22,15 +22,17 @@ class Experiment:
     """A two-axis scan of a target while both resonances drift.
 
     Attributes:
-        device: the true device; a field of view is needed.
-        target: name of a target or an image file.
-        drives: voltage on each axis's combs.
-        duration: [s]. sample_rate: of all channels [Hz].
-        drift: relative change of each axis's stiffness in the end. drift_tau: its time constant [s].
+        device: the true device; it needs a field of view.
+        target: name of a target, or path of an image file.
+        drives: voltage on the combs of each axis.
+        duration: of the recording [s].
+        sample_rate: of all channels [Hz].
+        drift: relative change of each axis's stiffness that the drift approaches.
+        drift_tau: time constant of the exponential drift [s].
         field_um: width of the field on the sample [um]; its height follows from the half angles.
         spot_um: standard deviation of the beam's spot [um].
-        detector: of the light.
-        angles: record the true angles as reference channels too.
+        detector: that converts the light to a voltage.
+        angles: whether the true angles are recorded as reference channels too.
     """
 
     device: Device = field(default_factory=lambda: devices.load("imaging"))
@@ -48,31 +50,43 @@ class Experiment:
     angles: bool = False
 
 
-def run(experiment: Experiment, seed: int = 0, nominal: Device | None = None) -> tuple[Recording, dict[str, object]]:
-    """The recording of an experiment and its truth (see ``phantoms.forward.simulate``).
+def simulate_experiment(
+    experiment: Experiment, seed: int = 0, nominal: Device | None = None
+) -> tuple[Recording, dict[str, object]]:
+    """Return the recording of an experiment and its truth.
 
     Args:
-        nominal: the device that the recording states, where its calibration differs from the truth.
+        experiment: device, drives, drift, target, spot and detector.
+        seed: of all random noise; the same seed gives the same samples.
+        nominal: the device that the recording states, if its calibration differs from the true device.
+
+    Returns:
+        The recording, and the truth as ``Recording.write`` takes it: that of ``phantoms.forward.simulate``, and
+        ``spot_sd``, the standard deviation of the spot as a fraction of the field's width.
+
+    Raises:
+        DeviceInvalid: the device has no field of view, or lacks a value that the simulation needs.
+        BadInput: the target is neither a known name nor a picture file, or its pixels are too coarse for the spot.
     """
     view = experiment.device.require_scan()
     height_um = experiment.field_um * view.half_angle_y / view.half_angle_x
-    light = blur(target(experiment.target), experiment.spot_um, experiment.field_um, height_um)
+    light = blur_by_spot(make_target(experiment.target), experiment.spot_um, experiment.field_um, height_um)
     plan = Plan(
         drives=experiment.drives,
         duration=experiment.duration,
         sample_rate=experiment.sample_rate,
-        drift={axis: Drift(settling(change, experiment.drift_tau)) for axis, change in experiment.drift.items()},
+        drift={axis: Drift(exponential(change, experiment.drift_tau)) for axis, change in experiment.drift.items()},
         angles=experiment.angles,
     )
     recording, truth = simulate(experiment.device, plan, Scene(light, experiment.detector), seed, nominal=nominal)
-    return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}  # of the field's width
+    return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}
 
 
 def device_named(name: str) -> Device:
-    """A device by the name it comes with, else from a TOML file.
+    """Return the device of that name that comes with the program, or else the one in that TOML file.
 
     Raises:
-        BadInput: neither.
+        BadInput: there is neither.
     """
     if name in devices.names():
         return devices.load(name)

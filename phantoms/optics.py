@@ -12,28 +12,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.arrays import Array
 from scanner.errors import BadInput
-from scanner.lowpass import lowpass, step_coefficients
+from scanner.lowpass import run_section, section_coefficients
 
-Array = NDArray[np.float64]
-FWHM_PER_SD = 2 * math.sqrt(2 * math.log(2))  # of a Gaussian
+FWHM_PER_SD = 2 * math.sqrt(2 * math.log(2))
+"""Full width at half maximum of a Gaussian over its standard deviation."""
+
+MIN_SPOT_PX = 0.5
+"""Least standard deviation of a spot [scene pixels]: a sampled Gaussian is 7 % too narrow there, 0.1 % at 0.7."""
+
+MAX_BITS = 24
+"""Most bits of a converter: float32 represents their codes exactly."""
 
 
-def blur(scene: Array, sd_um: float, field_x_um: float, field_y_um: float) -> Array:
-    """The scene as a Gaussian spot sees it.
+def blur_by_spot(scene: Array, sd_um: float, field_x_um: float, field_y_um: float) -> Array:
+    """The scene convolved with a Gaussian spot.
 
     Args:
         scene: shape (H, W), covering the whole field.
-        sd_um: standard deviation of the spot's intensity [um], 0 for none; a full width at half maximum is
-            ``FWHM_PER_SD`` times that.
+        sd_um: standard deviation of the spot's intensity [um]; 0 for no spot.
         field_x_um, field_y_um: the whole field's width and height [um].
 
     Returns:
-        Shape (H, W). Beyond its edge the scene goes on as it ends there, as in ``sample``.
+        Shape (H, W). Beyond its edge the scene continues with its edge values, as in ``sample_scene``.
 
     Raises:
-        BadInput: a spot below half a scene pixel, which sampling would make far too narrow (7 % at that limit,
-            0.1 % from 0.7 pixels on).
+        BadInput: the spot is narrower than ``MIN_SPOT_PX``.
     """
     import cv2
 
@@ -41,7 +46,7 @@ def blur(scene: Array, sd_um: float, field_x_um: float, field_y_um: float) -> Ar
         return scene.copy()
     height, width = scene.shape
     sd_x, sd_y = sd_um * width / field_x_um, sd_um * height / field_y_um
-    if min(sd_x, sd_y) < 0.5:
+    if min(sd_x, sd_y) < MIN_SPOT_PX:
         raise BadInput(
             f"the beam's spot has a standard deviation of {min(sd_x, sd_y):.2g} scene pixels",
             hint="give the target more pixels, or a wider spot, or one of width 0",
@@ -49,8 +54,8 @@ def blur(scene: Array, sd_um: float, field_x_um: float, field_y_um: float) -> Ar
     return np.asarray(cv2.GaussianBlur(scene, (0, 0), sd_x, sigmaY=sd_y, borderType=cv2.BORDER_REPLICATE), np.float64)
 
 
-def sample(scene: Array, theta_x: Array, theta_y: Array, half_angle_x: float, half_angle_y: float) -> Array:
-    """Bilinear look-up of the scene at mirror angles.
+def sample_scene(scene: Array, theta_x: Array, theta_y: Array, half_angle_x: float, half_angle_y: float) -> Array:
+    """The scene at mirror angles, by bilinear interpolation.
 
     Args:
         scene: shape (H, W); row 0 at theta_y = -half_angle_y, column 0 at theta_x = -half_angle_x.
@@ -58,10 +63,10 @@ def sample(scene: Array, theta_x: Array, theta_y: Array, half_angle_x: float, ha
         half_angle_x, half_angle_y: half the field [rad].
 
     Returns:
-        The light, of the angles' shape. Outside the field the scene goes on as it ends at its edge; NaN where an angle
-        is NaN.
+        The light, of the angles' shape. Outside the field the scene continues with its edge values. It is NaN where an
+        angle is NaN.
     """
-    # map_coordinates is exact; cv2.remap would round positions to 1/32 pixel and take no more than 32767 of them a row.
+    # map_coordinates is exact; cv2.remap would round positions to 1/32 pixel and accept at most 32767 of them.
     from scipy.ndimage import map_coordinates
 
     rows, columns = (
@@ -73,14 +78,14 @@ def sample(scene: Array, theta_x: Array, theta_y: Array, half_angle_x: float, ha
 
 @dataclass(frozen=True)
 class Detector:
-    """Photons to volts.
+    """Conversion of photons to volts.
 
     Attributes:
         gain: [V per photon in a sample].
         photons_per_sample: mean count in one sampling interval for light 1.
         read_noise_sd: of the electronics, after the gain [V].
-        bandwidth_hz: of a first-order low-pass between the photons and the electronics [Hz]; None: none.
-        bits: of the converter; None: no conversion.
+        bandwidth_hz: of a first-order low-pass between the photons and the electronics [Hz]; None for no low-pass.
+        bits: of the converter; None for no converter.
         full_scale: of the converter, which spans [0, full_scale) [V].
     """
 
@@ -100,23 +105,23 @@ class Detector:
                 raise BadInput(f"the detector's {name} is {value}", hint="give a finite value above zero")
         if not (math.isfinite(self.read_noise_sd) and self.read_noise_sd >= 0):
             raise BadInput(f"the detector's read_noise_sd is {self.read_noise_sd}", hint="give zero or more")
-        if self.bits is not None and not 1 <= self.bits <= 24:
+        if self.bits is not None and not 1 <= self.bits <= MAX_BITS:
             raise BadInput(f"the detector has {self.bits} bits", hint="give 1 to 24, what float32 holds exactly")
 
 
 def detect(light: Array, rate: float, detector: Detector, rng: np.random.Generator) -> NDArray[np.float32]:
-    """What the detector makes of the light: photon noise, bandwidth, gain, read noise, converter, in this order.
+    """The detector's signal: light with photon noise, bandwidth, gain, read noise and converter, in this order.
 
     Without bandwidth the mean is ``gain N`` and the variance ``gain^2 N + read_noise_sd^2`` (shot-noise law), with
-    N = photons_per_sample * light. The low-pass takes the light as linear between samples, so that a slow signal comes
-    out late by 1 / (2 pi bandwidth_hz) and not by half a sample less, and the photon noise as even within a sample, so
-    that its variance falls to N tanh(pi bandwidth_hz / rate). It starts from rest at the first sample's light.
+    N = photons_per_sample * light. For the low-pass, the light is linear between samples, so that a slow signal is
+    delayed by 1 / (2 pi bandwidth_hz). The photon noise is constant within a sample, so that its variance decreases to
+    N tanh(pi bandwidth_hz / rate). The low-pass starts in the steady state of the first sample's light.
 
     Args:
         light: relative to full light, not negative, shape (n,), n > 0.
-        rate: [Hz].
+        rate: of the samples [Hz].
         detector: its constants.
-        rng: the only source of randomness.
+        rng: source of the noise.
 
     Returns:
         Shape (n,) [V].
@@ -124,9 +129,9 @@ def detect(light: Array, rate: float, detector: Detector, rng: np.random.Generat
     mean = np.multiply(light, detector.photons_per_sample, dtype=np.float64)
     noise = rng.poisson(mean) - mean
     if detector.bandwidth_hz is not None:
-        decay, previous, new = step_coefficients(detector.bandwidth_hz, 1 / rate)
-        lowpass(mean, decay, previous, new, mean[0], mean[0])
-        lowpass(noise, decay, 0.0, 1 - decay, 0.0, 0.0)
+        decay, previous, new = section_coefficients(detector.bandwidth_hz, 1 / rate)
+        run_section(mean, decay, previous, new, mean[0], mean[0])
+        run_section(noise, decay, 0.0, 1 - decay, 0.0, 0.0)
     signal = detector.gain * (mean + noise)
     signal += rng.normal(0.0, detector.read_noise_sd, signal.shape)
     if detector.bits is not None:

@@ -1,8 +1,8 @@
-"""Drive voltages as exact functions of time, so that an integrator can ask anywhere between two samples.
+"""Drive voltages as exact functions of time, which an integrator can evaluate between two samples.
 
-A waveform is called with times [s], any shape, and answers with volts of that shape. It is defined for all times:
-before t = 0 and after its duration it goes on as it began or ended. What turns has an ``angle(t)`` [rad], the drive's
-own phase, against which the motion's phase is told.
+A waveform is called with times [s] of any shape and returns volts of that shape. It is defined for all times:
+before t = 0 and after its duration it continues as at its start or end. A periodic waveform has an ``angle(t)``
+[rad], the phase of the drive, which is the reference of the motion's phase.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from collections.abc import Sequence as Ordered
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from scanner.arrays import Array
 from scanner.errors import BadInput
 
-Array = NDArray[np.float64]
-TURN = 2 * np.pi
+CYCLE_RAD = 2 * np.pi
+"""Phase of a cycle [rad]."""
 
 
 class Waveform(ABC):
@@ -34,7 +35,7 @@ class Waveform(ABC):
 
 @dataclass(frozen=True)
 class Constant(Waveform):
-    """A DC bias of ``level`` [V]; zero is the drive cut off."""
+    """A DC bias of ``level`` [V]; zero switches the drive off."""
 
     level: float = 0.0
 
@@ -46,8 +47,8 @@ class Constant(Waveform):
 class Sine(Waveform):
     """``offset + amplitude sin(2 pi frequency t + phase)`` [V, Hz, rad].
 
-    An electrostatic drive needs the offset: with none, V^2 holds no component at ``frequency`` and nothing moves
-    (chen2020 eq 16 leaves it out; its Table I says 0 to 60 V).
+    An electrostatic drive needs the offset: without it V^2 has no component at ``frequency``, and no parametric motion
+    starts. Equation 16 of chen2020 omits the offset; its table I states 0 to 60 V.
     """
 
     frequency: float
@@ -56,7 +57,8 @@ class Sine(Waveform):
     phase: float = 0.0
 
     def angle(self, t: ArrayLike) -> Array:
-        return TURN * self.frequency * np.asarray(t, np.float64) + self.phase
+        """Phase at times ``t`` [s]: [rad], of t's shape."""
+        return CYCLE_RAD * self.frequency * np.asarray(t, np.float64) + self.phase
 
     def __call__(self, t: ArrayLike) -> Array:
         return self.offset + self.amplitude * np.sin(self.angle(t))
@@ -64,10 +66,10 @@ class Sine(Waveform):
 
 @dataclass(frozen=True)
 class Sweep(Waveform):
-    """A sine whose frequency runs linearly from ``f0`` to ``f1`` [Hz] in ``duration`` [s], then stays at ``f1``.
+    """A sine whose frequency runs linearly from ``f0`` to ``f1`` [Hz] in ``duration`` [s], then is constant at ``f1``.
 
-    Its phase is the integral of its frequency, so it has no jump at either end: a resonance that is swept up to must
-    not be kicked off its branch by the drive.
+    Its phase is the integral of its frequency. A phase jump at either end could move a resonator to another branch of
+    its response.
     """
 
     f0: float
@@ -81,9 +83,10 @@ class Sweep(Waveform):
         _require(self.duration > 0, f"a sweep lasts {self.duration} s", "give a duration above zero")
 
     def angle(self, t: ArrayLike) -> Array:
+        """Phase at times ``t`` [s]: [rad], of t's shape."""
         t = np.asarray(t, np.float64)
-        gained = np.clip(t, 0.0, self.duration) ** 2 / (2 * self.duration) + np.maximum(t - self.duration, 0.0)
-        return TURN * (self.f0 * t + (self.f1 - self.f0) * gained) + self.phase
+        swept = np.clip(t, 0.0, self.duration) ** 2 / (2 * self.duration) + np.maximum(t - self.duration, 0.0)
+        return CYCLE_RAD * (self.f0 * t + (self.f1 - self.f0) * swept) + self.phase
 
     def __call__(self, t: ArrayLike) -> Array:
         return self.offset + self.amplitude * np.sin(self.angle(t))
@@ -93,8 +96,8 @@ class Sweep(Waveform):
 class Square(Waveform):
     """``high`` [V] for the first ``duty`` of every period, ``low`` for the rest, from ``phase`` [rad] at t = 0 on.
 
-    An edge belongs, up to rounding, to the level that it leads to. An integrator that steps across an edge blurs it,
-    and a relative error of 5e-4 from blurred edges has passed for friction: step to ``switching_times``.
+    At an edge the voltage is, up to rounding, the level that follows. An integration step across an edge blurs it; the
+    relative error of 5e-4 has the same effect as friction. Steps should therefore end at ``switching_times``.
     """
 
     frequency: float
@@ -108,15 +111,16 @@ class Square(Waveform):
         _require(0 < self.duty < 1, f"a square wave has a duty of {self.duty}", "give one between 0 and 1")
 
     def angle(self, t: ArrayLike) -> Array:
-        return TURN * self.frequency * np.asarray(t, np.float64) + self.phase
+        """Phase at times ``t`` [s]: [rad], of t's shape."""
+        return CYCLE_RAD * self.frequency * np.asarray(t, np.float64) + self.phase
 
     def __call__(self, t: ArrayLike) -> Array:
-        return np.where(np.mod(self.angle(t) / TURN, 1.0) < self.duty, self.high, self.low)
+        return np.where(np.mod(self.angle(t) / CYCLE_RAD, 1.0) < self.duty, self.high, self.low)
 
     def switching_times(self, t0: float, t1: float) -> Array:
-        first, last = (int(np.floor(self.angle(t) / TURN)) for t in (t0, t1))
-        turns = np.arange(first, last + 1)[:, None] + np.array([0.0, self.duty])
-        times = (turns.ravel() - self.phase / TURN) / self.frequency
+        first, last = (int(np.floor(self.angle(t) / CYCLE_RAD)) for t in (t0, t1))
+        cycles = np.arange(first, last + 1)[:, None] + np.array([0.0, self.duty])
+        times = (cycles.ravel() - self.phase / CYCLE_RAD) / self.frequency
         return times[(times > t0) & (times < t1)]
 
 
@@ -137,19 +141,19 @@ class Multisine(Waveform):
         t = np.asarray(t, np.float64)
         voltage = np.full(t.shape, self.offset)
         for frequency, amplitude, phase in zip(self.frequencies, self.amplitudes, self.phases, strict=True):
-            voltage += amplitude * np.sin(TURN * frequency * t + phase)
+            voltage += amplitude * np.sin(CYCLE_RAD * frequency * t + phase)
         return voltage
 
 
 @dataclass(frozen=True)
 class Sequence(Waveform):
-    """Waveforms one after another: ``Sequence([(Sine(...), 0.02), (Constant(10.0), 0.08)])`` drives, then lets ring.
+    """Waveforms one after another: ``Sequence([(Sine(...), 0.02), (Constant(10.0), 0.08)])`` drives, then rings down.
 
-    Each part runs on its own clock from its own start. Neighbouring parts that have a phase join without a jump in it,
-    as one generator stepped in frequency does: a part's own ``phase`` adds to the phase where the part before ended.
+    The time of each part counts from its start. Neighbouring periodic parts join without a phase jump, like a generator
+    that is stepped in frequency: the ``phase`` of a part adds to the phase at which the previous part ended.
 
     Args:
-        parts: pairs of waveform and duration [s]. Before t = 0 the first part, after the end the last goes on.
+        parts: pairs of waveform and duration [s]. Before t = 0 the first part continues, after the end the last one.
     """
 
     parts: Ordered[tuple[Waveform, float]]
@@ -182,13 +186,14 @@ class Sequence(Waveform):
     def switching_times(self, t0: float, t1: float) -> Array:
         joints = self.starts[1:]
         times = [joints[(joints > t0) & (joints < t1)]]
-        begins, ends = [-np.inf, *joints], [*joints, np.inf]
-        for begin, end, start, waveform in zip(begins, ends, self.starts, self.joined, strict=True):
+        part_starts, part_ends = [-np.inf, *joints], [*joints, np.inf]
+        for begin, end, start, waveform in zip(part_starts, part_ends, self.starts, self.joined, strict=True):
             if max(begin, t0) < min(end, t1):
                 times.append(start + waveform.switching_times(max(begin, t0) - start, min(end, t1) - start))
         return np.sort(np.concatenate(times))
 
 
-def _require(holds: bool, what: str, hint: str) -> None:
-    if not holds:
+def _require(satisfied: bool, what: str, hint: str) -> None:
+    """Raise BadInput unless the condition is satisfied."""
+    if not satisfied:
         raise BadInput(what, hint=hint)

@@ -1,1 +1,4 @@
-"""From motion and intensities to pictures: mapping, blur, report, pipeline, the command line."""
+"""Reconstruction: from motion and intensity to a picture, its assessment, files, reports and the command line.
+
+It uses all other packages. Estimators do not belong here (``estimation``), nor models of the instrument (``scanner``).
+"""

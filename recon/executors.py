@@ -1,4 +1,4 @@
-"""Where many jobs run: on the machine's cores, or on a Dask cluster."""
+"""Executors for many jobs: processes on this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -13,55 +13,66 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+import estimation.estimators as estimators
+import scanner.terms as terms
 from scanner.errors import BadInput
-from scanner.terms import register, registered
 
 T = TypeVar("T")
 
 
-def executor_of(scheduler: str | None = None, workers: int | None = None) -> AbstractContextManager[Executor]:
-    """An executor, for a ``with`` statement.
+def open_executor(scheduler: str | None = None, workers: int | None = None) -> AbstractContextManager[Executor]:
+    """Return an executor for a ``with`` statement: processes on this machine, or a Dask cluster.
 
     Args:
-        scheduler: address of a Dask scheduler; the machine's own cores without one.
-        workers: processes on this machine; one a core if not given.
+        scheduler: address of a Dask scheduler; None for processes on this machine.
+        workers: number of processes on this machine; None for one per core.
 
     Raises:
         BadInput: Dask is not installed, or no scheduler answers at the address.
     """
-    return _cluster(scheduler) if scheduler else _processes(workers)
+    return _dask_cluster(scheduler) if scheduler else _process_pool(workers)
 
 
-def task(work: Callable[..., T], *given: object) -> Callable[[], T]:
-    """``work(*given)`` for an executor: whoever does it knows the users' term files that this process knows."""
-    return partial(_informed, registered(), work, *given)
+def picklable_task(work: Callable[..., T], *arguments: object) -> Callable[[], T]:
+    """Return ``work(*arguments)`` as a call that an executor can send to a worker.
+
+    The worker first registers the user's files of terms and estimators that are registered in this process.
+    """
+    return partial(_with_registered_files, terms.registered(), estimators.registered(), work, *arguments)
 
 
-def _informed(files: tuple[Path, ...], work: Callable[..., T], *given: object) -> T:
-    for path in files:
-        if path not in registered():
-            register(path)
-    return work(*given)
+def _with_registered_files(
+    term_files: tuple[Path, ...], estimator_files: tuple[Path, ...], work: Callable[..., T], *arguments: object
+) -> T:
+    """Register users' files, then do the work."""
+    for path in term_files:
+        if path not in terms.registered():
+            terms.register(path)
+    for path in estimator_files:
+        if path not in estimators.registered():
+            estimators.register(path)
+    return work(*arguments)
 
 
 @contextmanager
-def _processes(workers: int | None) -> Iterator[Executor]:
-    # Spawned, not forked: a fork of a process with threads (OpenCV's, a test's) can lock up.
+def _process_pool(workers: int | None) -> Iterator[Executor]:
+    """A pool of spawned processes. A fork of a process with threads (of OpenCV, for example) can deadlock."""
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _worker_begins)
+    pool = ProcessPoolExecutor(workers, context, _start_worker)
     try:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _worker_begins() -> None:
-    """A worker leaves the interrupt to its parent, and ends when that is killed."""
+def _start_worker() -> None:
+    """Leave interrupts to the parent process, and end when the parent is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
+    """Wait for the parent process to end, then end this one."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -69,8 +80,8 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
-    """A Dask cluster as an executor: its scheduler gives the jobs of a worker that died to the others."""
+def _dask_cluster(address: str) -> Iterator[Executor]:
+    """A Dask cluster as an executor. Its scheduler reassigns the jobs of a worker that dies."""
     try:
         from distributed import Client
         from distributed.scheduler import KilledWorker

@@ -1,16 +1,16 @@
-"""A recording that is still being written, a frame at a time: ``lissajous reconstruct --follow``.
+"""Reconstruction of a recording that is still being written, frame by frame: ``lissajous reconstruct --follow``.
 
-Each look opens the file anew and takes what is there: HDF5 that another program writes (SWMR), or an instrument's file
-that a reader reads as far as it goes. A frame is reconstructed from its own stretch of the recording and a little
-before it, so that its cost does not grow with the recording. Frames are shown in turn; where more than WAITING are
-whole by then, all but the newest are dropped.
+Each poll opens the file again and reads what is there: HDF5 that another program writes (SWMR), or an instrument's file
+that a reader reads up to its current end. A frame is reconstructed from its own segment of the recording and a short
+lead-in, so its cost does not grow with the recording. Frames are shown in order. If more than ``MAX_PENDING_FRAMES``
+are complete, all but the newest are dropped.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import floor, pi
@@ -21,56 +21,82 @@ import numpy as np
 from tqdm import tqdm
 
 from estimation.estimate import estimate
-from estimation.signals import device_of
-from estimation.tracker.angle import SlowAngle
-from recon import blur
-from recon.convert import convert
-from recon.mapping import Grid, Picture
-from recon.output import check_folder, write_tiff
-from recon.pipeline import Options, field_of, mapped, moved
-from recon.registration import slow_period
-from recon.stopping import heard
-from recon.trouble import samples, troubles, unknown
-from recon.undo import placed, with_light
-from recon.views import save_picture
-from scanner.device import Device
+from recon.imaging import blur
+from recon.imaging.bidirectional_phase import slow_period
+from recon.imaging.intensity_gridding import grid_intensity
+from recon.imaging.picture import Grid, Picture
+from recon.imaging.readout_phase import ReadoutPhase, apply_readout_phase, update_readout_phase
+from recon.interrupts import acknowledge_stop
+from recon.io.convert import convert
+from recon.io.output import check_folder, write_tiff
+from recon.pipeline import Options, estimate_motion, measure_phase_errors, wants_readout_phase
+from recon.preparation import prepare_frame, select_device
+from recon.quality.defects import unrecoverable_intervals
+from recon.report.figures import save_picture
+from recon.sample_ranges import to_sample_ranges
 from scanner.errors import BadInput
 from scanner.files import replacing
 from scanner.hdf5 import check_ends
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
-POLL = 0.05  # s from look to look at the least
-WAITING = 2  # frames that may be whole at once: one that took long delays the next and loses none
-FIRST = 0.01  # s: the stretch in which the scan's repeat is looked for; twice as long each time it is too short
-BEFORE = 30.0  # periods of the slower axis before a frame, in which a motion is found that goes on from the last one
-MOST_TURNS = 4000  # of the slower axis, in which the figure may repeat
-COMPARED = 4096  # samples by which signs are told
-FINISHED = "finished"  # attribute of a file by which its writer says that it is done
+MIN_POLL_INTERVAL_S = 0.05
+"""Shortest time between two polls of the file. It bounds the load, and nobody notices so short a delay."""
+
+MAX_PENDING_FRAMES = 2
+"""Complete frames that may wait. One slow frame then delays the next one and drops none."""
+
+FIRST_REPEAT_SEARCH_S = 0.01
+"""Length of the recording at which the scan's repeat time is first estimated. It doubles after each failure."""
+
+LEAD_IN_PERIODS = 30.0
+"""Periods of the slower axis before a frame, in which its motion connects to the previous frame's."""
+
+MAX_REPEAT_PERIODS = 4000
+"""Periods of the slower axis within which the figure has to repeat."""
+
+SIGN_TEST_SAMPLES = 4096
+"""Samples over which the signs of two motions are compared."""
+
+FINISHED_ATTRIBUTE = "finished"
+"""Attribute of a file by which its writer states that the recording is complete."""
 
 
-class Look(NamedTuple):
-    """What there is of a recording, and why nothing will follow; None where something may."""
+class Snapshot(NamedTuple):
+    """The recording up to its current end.
+
+    Attributes:
+        recording: open while the snapshot is used.
+        ended: why no more samples will come; None while they may.
+    """
 
     recording: Recording
     ended: str | None
 
 
-class Shown(NamedTuple):
-    """The last frame's motion, and the grid that all frames share."""
+class PreviousFrame(NamedTuple):
+    """What the next frame takes over from a frame.
+
+    Attributes:
+        motion: of the mirror in the frame.
+        grid: shared by all frames.
+        readout_phase: phase error of the readout by axis, from all frames so far.
+    """
 
     motion: Motion
     grid: Grid
+    readout_phase: Mapping[str, ReadoutPhase]
 
 
 @dataclass
-class Live:
-    """What following amounted to.
+class FollowSummary:
+    """Summary of a followed recording; its keys in summary.json are the attributes' names.
 
     Attributes:
-        frame_s: length of a frame [s]; NaN as long as it is not known.
-        frames: shown. dropped: not shown, because newer ones were whole by their turn or they could not be tracked.
-        latency_s: of each frame shown, from its last sample's arrival in the file to its picture's [s].
+        frame_s: duration of a frame [s]; NaN until it is known.
+        frames: number of frames shown.
+        dropped: number of frames not shown, because newer ones were complete or their motion could not be estimated.
+        latency_s: time from the arrival of a frame's last sample to its picture, for each frame shown [s].
         ended: why following ended.
     """
 
@@ -81,13 +107,13 @@ class Live:
     ended: str = "interrupted"
 
     def summary(self) -> dict[str, Any]:
-        """For summary.json."""
-        told = np.array(self.latency_s or [np.nan])
-        latency = {"median": float(np.median(told)), "max": float(told.max()), "first": float(told[0])}
+        """Return the part "live" of summary.json."""
+        values = np.array(self.latency_s or [np.nan])
+        latency = {"median": float(np.median(values)), "max": float(values.max()), "first": float(values[0])}
         return {key: getattr(self, key) for key in ("frame_s", "frames", "dropped", "ended")} | {"latency_s": latency}
 
 
-def follow(
+def follow_recording(
     path: Path,
     output: Path,
     options: Options,
@@ -95,136 +121,157 @@ def follow(
     frame_time: float | None = None,
     quiet_time: float = 5.0,
     quiet: bool = False,
-) -> Live:
-    """Show a recording's frames while it is written, as image.tif and image.png in ``output``.
+) -> FollowSummary:
+    """Write the frames of a growing recording as image.tif and image.png into ``output``, each over the previous one.
 
-    It ends when the writer closes the file, when the file's attribute ``finished`` is true, when nothing has come for
-    ``quiet_time``, or at an interrupt.
+    It ends when the writer closes the file, when the file's attribute ``finished`` is true, when the file did not grow
+    for ``quiet_time``, or at an interrupt.
 
     Args:
-        mapping: as for :func:`recon.convert.convert`.
-        frame_time: of a frame [s]; the scan's repeat if not given.
-        quiet_time: [s]. quiet: no progress.
+        path: of the recording.
+        output: folder for the pictures.
+        options: as for :func:`recon.pipeline.reconstruct`.
+        mapping: as for :func:`recon.io.convert.convert`.
+        frame_time: duration of a frame [s]; the repeat time of the scan if None.
+        quiet_time: [s].
+        quiet: show no progress.
 
     Raises:
-        BadInput: there is still no recording after ``quiet_time``, or ``output`` is no place for a folder.
+        BadInput: no recording appears within ``quiet_time``, or ``output`` cannot be a folder.
     """
     check_folder(output)
-    check_ends(path)  # once: a look has to be quick
-    live, shown, turn, wanted = Live(frame_time or np.nan), None, 0, FIRST
-    arrivals: list[tuple[float, float]] = []  # samples up to ... [s on the recording's clock] were there at ... [s]
+    check_ends(path)  # only once, because a poll has to be fast
+    summary, previous, frames_done, needed = FollowSummary(frame_time or np.nan), None, 0, FIRST_REPEAT_SEARCH_S
+    arrivals: list[tuple[float, float]] = []  # end of the recording [s on its clock], and when it was read [s]
     with (
         suppress(KeyboardInterrupt),
         tqdm(desc="follow", unit=" frames", file=sys.stderr, disable=quiet or None) as bar,
     ):
-        for recording, ended in looks(path, mapping, quiet_time):
-            begin, end = common(recording)
+        for recording, ended in poll_recording(path, mapping, quiet_time):
+            begin, end = common_time_span(recording)
             arrivals.append((end, time.monotonic()))
-            if np.isnan(live.frame_s) and end - begin >= wanted:
-                live.frame_s, wanted = _first_repeat(recording, options), 2 * (end - begin)
-            whole = 0 if np.isnan(live.frame_s) else floor((end - begin) / live.frame_s + 1e-9)
-            while whole > turn:
-                due = turn + 1 if whole - turn <= WAITING else whole
-                stop = begin + due * live.frame_s
+            if np.isnan(summary.frame_s) and end - begin >= needed:
+                summary.frame_s, needed = _first_repeat(recording, options), 2 * (end - begin)
+            complete = 0 if np.isnan(summary.frame_s) else floor((end - begin) / summary.frame_s + 1e-9)
+            while complete > frames_done:
+                due = frames_done + 1 if complete - frames_done <= MAX_PENDING_FRAMES else complete
+                stop = begin + due * summary.frame_s
                 try:
-                    shown = show(recording, stop - live.frame_s, stop, shown, output, options)
-                except BadInput:  # no motion in this stretch; the next may have one, and the whole will tell
-                    live.dropped += 1
+                    previous = reconstruct_frame(recording, stop - summary.frame_s, stop, previous, output, options)
+                except BadInput:  # no motion in this frame; the next one may have one
+                    summary.dropped += 1
                 else:
-                    live.frames += 1
-                    live.latency_s.append(time.monotonic() - float(np.interp(stop, *np.array(arrivals).T)))
-                live.dropped += due - 1 - turn
-                turn = due
-                bar.update(live.frames - bar.n)
-                late = f", {live.latency_s[-1]:.2f} s late" if live.latency_s else ""
-                bar.set_postfix_str(f"{live.dropped} dropped{late}")
-            live.ended = ended or live.ended
-    heard()
-    return live
+                    summary.frames += 1
+                    summary.latency_s.append(time.monotonic() - float(np.interp(stop, *np.array(arrivals).T)))
+                summary.dropped += due - 1 - frames_done
+                frames_done = due
+                bar.update(summary.frames - bar.n)
+                late = f", {summary.latency_s[-1]:.2f} s late" if summary.latency_s else ""
+                bar.set_postfix_str(f"{summary.dropped} dropped{late}")
+            summary.ended = ended or summary.ended
+    acknowledge_stop()
+    return summary
 
 
-def looks(path: Path, mapping: Path | None, quiet_time: float) -> Iterator[Look]:
-    """Look at a file again and again until nothing more comes. Each recording is closed before the next look.
+def poll_recording(path: Path, mapping: Path | None, quiet_time: float) -> Iterator[Snapshot]:
+    """Yield snapshots of a growing file until it ends. Each recording is closed before the next poll.
 
     Raises:
-        BadInput: there is no recording there for ``quiet_time`` [s].
+        BadInput: the path holds no readable recording for ``quiet_time`` [s].
     """
-    grown, size, writing = time.monotonic(), -np.inf, False
+    last_growth, size, writing = time.monotonic(), -np.inf, False
     while True:
-        looked = time.monotonic()
+        polled = time.monotonic()
         try:
-            recording, still_written = _opened(path, mapping)
-        except BadInput:  # not there yet, or caught in the middle of a change
-            if time.monotonic() - grown > quiet_time:
+            recording, still_written = _open_growing(path, mapping)
+        except BadInput:  # not there yet, or read during a change
+            if time.monotonic() - last_growth > quiet_time:
                 raise
-            time.sleep(POLL)
+            time.sleep(MIN_POLL_INTERVAL_S)
             continue
         with recording:
-            _, end = common(recording)
+            _, end = common_time_span(recording)
             if end > size:
-                grown, size = time.monotonic(), end
+                last_growth, size = time.monotonic(), end
             ended = None
             if writing and not still_written:
                 ended = "its writer closed the file"
-            elif recording.attrs.get(FINISHED):
+            elif recording.attrs.get(FINISHED_ATTRIBUTE):
                 ended = "the file says that it is finished"
-            elif time.monotonic() - grown > quiet_time:
+            elif time.monotonic() - last_growth > quiet_time:
                 ended = f"nothing came for {quiet_time:g} s"
-            yield Look(recording, ended)
+            yield Snapshot(recording, ended)
         if ended:
             return
         writing = still_written
-        time.sleep(max(0.0, POLL - (time.monotonic() - looked)))  # none after a frame, whose time was enough
+        time.sleep(max(0.0, MIN_POLL_INTERVAL_S - (time.monotonic() - polled)))
 
 
-def show(
-    recording: Recording, start: float, stop: float, before: Shown | None, output: Path, options: Options
-) -> Shown:
-    """Reconstruct the frame from ``start`` to ``stop`` [s] and put its picture into ``output``.
+def reconstruct_frame(
+    recording: Recording, start: float, stop: float, previous: PreviousFrame | None, output: Path, options: Options
+) -> PreviousFrame:
+    """Reconstruct the frame from ``start`` to ``stop`` [s] and write its picture into ``output``.
+
+    Args:
+        recording: up to its current end.
+        start, stop: of the frame [s].
+        previous: None for the first frame.
+        output: folder for the pictures.
+        options: as for :func:`recon.pipeline.reconstruct`.
 
     Raises:
-        BadInput: no motion can be told there.
+        BadInput: the motion of the frame cannot be estimated.
     """
-    device = device_of(recording, Device.load(options.device) if options.device else None)
-    lead = BEFORE * slow_period(before.motion) if before else 0.0
-    part = with_light(recording, device).slice(start - lead, stop)
-    motion, _ = moved(part, device, options, before.motion if before else None)
-    if before:
-        motion = continued(motion, before.motion)
-    grid = before.grid if before else field_of(device, motion, options)[0]
-    intensity = part.require("intensity", "a picture needs it")
-    begin = max(0, round((start - intensity.start) * intensity.sample_rate))
-    beam = placed(motion, device, recording.start)
-    picture = mapped(beam, intensity, grid, samples(unknown(motion, troubles(part)), intensity), begin)
+    device = select_device(recording, options.device)
+    lead_in = LEAD_IN_PERIODS * slow_period(previous.motion) if previous else 0.0
+    prepared = prepare_frame(recording, device, start - lead_in, stop)
+    estimated = estimate_motion(prepared, options, previous.motion if previous else None)
+    if previous:
+        motion = match_signs(estimated.motion, previous.motion)
+        estimated = replace(estimated, motion=motion, grid=previous.grid)
+    known = previous.readout_phase if previous else {}
+    sensed = estimated.motion
+    estimated = replace(estimated, motion=apply_readout_phase(sensed, known))
+    intensity = prepared.intensity
+    first = max(0, round((start - intensity.start) * intensity.sample_rate))
+    unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), intensity)
+    picture = grid_intensity(estimated.beam, intensity, estimated.grid, unlocated, first)
     _replace_pictures(output, picture)
-    return Shown(motion, grid)
+    if wants_readout_phase(sensed, options):  # after the picture, which therefore comes no later
+        known = update_readout_phase(sensed, estimated.motion, measure_phase_errors(estimated), known)
+    return PreviousFrame(sensed, estimated.grid, known)
 
 
-def continued(motion: Motion, before: Motion) -> Motion:
-    """The motion with the signs of the one before it where its own signal cannot tell them."""
+def match_signs(motion: Motion, before: Motion) -> Motion:
+    """Return the motion with the signs of the previous one on axes whose own signal leaves the sign ambiguous."""
     axes = {}
     for name, axis in motion.axes.items():
-        turn = axis.sign == "ambiguous" and _opposed(before.axes[name], axis)
-        axes[name] = axis.turned() if turn else axis
+        invert = axis.sign == "ambiguous" and _is_opposite(before.axes[name], axis)
+        axes[name] = axis.negated() if invert else axis
     return replace(motion, axes=axes)
 
 
 def repeat_time(motion: Motion, bound: float) -> float:
-    """Shortest time after which the figure is back to within ``bound`` [rad] of the faster axis's phase [s]."""
-    slow, fast = sorted(_driven_frequency(axis) for axis in motion.axes.values())
-    turns = np.arange(1, MOST_TURNS + 1)
+    """Return the shortest time [s] after which the figure repeats.
+
+    Args:
+        motion: of the scan.
+        bound: largest difference of the faster axis's phase after that time [rad].
+    """
+    slow, fast = sorted(_reference_frequency(axis) for axis in motion.axes.values())
+    turns = np.arange(1, MAX_REPEAT_PERIODS + 1)
     off = 2 * pi * np.abs(turns * fast / slow - np.round(turns * fast / slow))
     return float(turns[np.argmax(off <= max(bound, off.min()))] / slow)
 
 
-def common(recording: Recording) -> tuple[float, float]:
-    """Begin and end [s] of the time that all channels cover."""
+def common_time_span(recording: Recording) -> tuple[float, float]:
+    """Return begin and end [s] of the time that all channels cover."""
     channels = recording.channels.values()
     return max(channel.start for channel in channels), min(channel.end for channel in channels)
 
 
-def _opened(path: Path, mapping: Path | None) -> tuple[Recording, bool]:
-    """The recording as far as it goes, and whether another program has it open to write."""
+def _open_growing(path: Path, mapping: Path | None) -> tuple[Recording, bool]:
+    """The recording up to its current end, and whether another program has it open for writing."""
     try:
         return (Recording.open(path) if mapping is None else convert(path, mapping)), False
     except BadInput:
@@ -234,32 +281,33 @@ def _opened(path: Path, mapping: Path | None) -> tuple[Recording, bool]:
 
 
 def _first_repeat(recording: Recording, options: Options) -> float:
-    """The scan's repeat [s], NaN where what there is of the recording does not tell it yet."""
+    """The repeat time of the scan [s]; NaN while the recording is too short for it."""
     try:
-        device = device_of(recording, Device.load(options.device) if options.device else None)
+        device = select_device(recording, options.device)
         motion = estimate(recording, device, options.estimator)
     except BadInput:
         return np.nan
-    return repeat_time(motion, min(blur.bound(options.p, n / 2) for n in options.pixels))
+    return repeat_time(motion, min(blur.phase_bound(options.p, n / 2) for n in options.pixels))
 
 
-def _driven_frequency(axis: AxisMotion) -> float:
-    """Of the reference that the phase is told against: unlike the motion's own, it does not drift [Hz]."""
+def _reference_frequency(axis: AxisMotion) -> float:
+    """Frequency of the phase reference [Hz]. It does not drift, unlike that of the motion."""
     return float(np.mean(axis.frequency - np.gradient(axis.phase, axis.time) / (2 * pi)))
 
 
-def _opposed(old: AxisMotion, new: AxisMotion) -> bool:
-    """Whether the new motion, where it begins, runs against the old one."""
-    if isinstance(old.angle, SlowAngle) and isinstance(new.angle, SlowAngle):  # the old one goes on beyond its end
-        time = new.angle.start + np.arange(min(COMPARED, new.angle.size)) / new.angle.sample_rate
-        return float(np.mean(np.cos(old.angle.motion.at(time)[0] - new.angle.motion.at(time)[0]))) < 0.0
+def _is_opposite(old: AxisMotion, new: AxisMotion) -> bool:
+    """Whether the new motion has the opposite sign of the old one at its begin."""
+    before, after = old.angle.phasors(), new.angle.phasors()
+    if before is not None and after is not None:  # phasors can be extrapolated beyond the end of the old motion
+        time = new.angle.start + np.arange(min(SIGN_TEST_SAMPLES, new.angle.size)) / new.angle.sample_rate
+        return float(np.mean(np.cos(before.phase(time) - after.phase(time)))) < 0.0
     first = round((new.angle.start - old.angle.start) * old.angle.sample_rate)
-    shared = min(COMPARED, max(old.angle.size - first, 0), new.angle.size)
+    shared = min(SIGN_TEST_SAMPLES, max(old.angle.size - first, 0), new.angle.size)
     return float(np.nansum(old.angle.read(first, first + shared) * new.angle.read(0, shared))) < 0.0
 
 
 def _replace_pictures(output: Path, picture: Picture) -> None:
-    """image.tif and image.png; an older run's summary would not belong to them."""
+    """Replace image.tif and image.png, and remove the summary.json of an older run."""
     output.mkdir(exist_ok=True)
     (output / "summary.json").unlink(missing_ok=True)
     with replacing(output / "image.tif") as path:

@@ -1,43 +1,48 @@
-"""From a recording to a sharp picture: estimate, map, register, compare."""
+"""From a recording to a picture: prepare, estimate, grid, assess.
+
+Each step is a function that takes what the step before returned (:func:`reconstruct` lists them).
+"""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from estimation.estimate import default_estimator, estimate
-from estimation.signals import device_of
-from estimation.tracker.angle import SlowAngle
-from recon import blur
-from recon.leaps import leaps, longest_stretch, passed
-from recon.lost_light import apart, lost_light, on_time, put_back, torn
-from recon.mapping import Grid, Picture, accumulate, mean_picture
-from recon.picture_phase import refined
-from recon.registration import PhaseError, registered, slow_period
-from recon.score import AxisError, Truth, axis_error
-from recon.slow_mapping import accumulate_slow
-from recon.trouble import Ranges, Trouble, samples, told, troubles, unknown, without
-from recon.undo import placed, with_light
-from scanner.channel import CHANNEL_UNITS, Channel, check_signal
-from scanner.demodulate import plain
-from scanner.device import Device
+from estimation.optics.correction import beam_motion
+from recon.evaluation import AxisEvaluation, Truth, evaluate_axis
+from recon.imaging import blur
+from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
+from recon.imaging.image_phase import refine_motion
+from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
+from recon.imaging.picture import Grid, Picture
+from recon.imaging.pixel_noise import SampleNoise, measure_noise
+from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
+from recon.notes import describe_ambiguous_signs, describe_clock_jumps, describe_outside
+from recon.preparation import DeviceSource, PreparedRecording, prepare, prepare_segment
+from recon.quality.clock_jumps import mark_path_during_jumps
+from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
+from recon.quality.dropped_samples import find_timing_break, first_late_slice, restore_timing, slices_aligned
+from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
+from scanner.channel import Channel
+from scanner.device import AXES, Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import Motion
 from scanner.recording import Recording
 
-Array = NDArray[np.float64]
+MAX_REGISTERED_PERIODS = 200
+"""Periods of the slower axis in which phase errors are measured. A scan of 60 ms has as many; in a longer recording
+three parts of this total length are measured, because the cost grows with the number of samples."""
 
-AXES = ("x", "y")
-REGISTERED = 200  # periods of the slower axis that are registered at the most: as many as a scan of 60 ms has
-CHUNK = 1 << 22  # samples mapped at a time
+ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor")
+"""Estimators whose motion is corrected by the phase error that the picture shows. ``picture`` has its phase from the
+picture already; the other estimators serve for comparison, as their papers describe them."""
 
 
 @dataclass(frozen=True)
@@ -45,61 +50,83 @@ class Options:
     """What a user may ask of a reconstruction.
 
     Attributes:
-        device: TOML file in place of the recording's own device.
-        estimator: by name; by what was recorded where None.
-        pixels: width, height. p: pixels of shift that are tolerated.
-        flips: axes whose sign is turned.
-        fill_radius: holes up to this many pixels are filled, and marked as fill; 0 fills none.
-        spot: standard deviation of the beam's spot [px], for the blur's account; the recording does not tell it.
-        frames: pictures of successive parts of the scan, as many; None for none. frame_time: or one for so long [s].
+        device: in place of the recording's own: a device, the path of its TOML file, or the name of a device that
+            comes with the program.
+        estimator: name of an estimator; None chooses one by the channels that were recorded.
+        pixels: width and height of the picture.
+        p: tolerated displacement [px], for the phase bound p/m.
+        flips: axes whose sign is inverted.
+        fill_radius: holes up to this many pixels are filled and marked as filled; 0 fills none.
+        spot: standard deviation of the beam's spot [px] for the account of the blur. A recording does not contain it.
+        sense_only: keep the phase of the estimator, without the correction by the phase error that the picture shows.
+        frames: number of frames to write; None for none.
+        frame_time: duration of a frame to write [s], instead of ``frames``.
     """
 
-    device: Path | None = None
+    device: DeviceSource | None = None
     estimator: str | None = None
     pixels: tuple[int, int] = (400, 400)
     p: float = 1.0
     flips: Mapping[str, bool] = field(default_factory=dict)
     fill_radius: int = 0
     spot: float | None = None
+    sense_only: bool = False
     frames: int | None = None
     frame_time: float | None = None
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """One recording's picture and all that was found on the way.
+    """The picture of a recording, its motion, and the assessment of both.
 
     Attributes:
-        motion, picture: the result.
-        p: pixels tolerated. spot: as in ``Options``.
-        seen: phase error of each time slice as forward and backward sweeps show it.
-        errors: estimate against truth by axis; empty without a truth.
-        truth: None without one.
-        trouble: what is wrong with the recording. dropped: samples of which no one can say where they belong.
-        affected: pixels that hold samples from a stretch of trouble, shape (height, width).
+        motion: of the mirror.
+        beam: motion of the beam over the sample, which the picture is made with.
+        picture: mean intensity and sample count of each pixel.
+        sample_noise: noise of a sample by detector; None where too few pixels were visited twice to measure it.
+        p, spot: as in ``Options``.
+        phase_errors: phase error of each time slice that forward and backward half-periods show.
+        readout_phase: phase error of the readout that the picture showed and that was removed, by axis; without the
+            axes of which nothing determined it.
+        evaluation: estimate against the truth, by axis; empty without a truth.
+        truth: of a simulation; None without one.
+        defects: clock jumps, gaps, clipping and missing parts of the recording.
+        unlocated_samples: number of samples left out because the mirror's angle is unknown there.
+        affected: pixels that hold samples from defects, shape (height, width).
         notes: what a reader has to know, a line each.
-        intensity: as it was mapped: its light undone, and between leaps of the clock.
+        intensity: the channel that was gridded: the segment in use, corrected for the device's optics.
         name: of the recording.
-        seconds: taken, without writing.
+        seconds: computing time without writing [s].
     """
 
     motion: Motion
+    beam: Motion
     picture: Picture
+    sample_noise: Sequence[SampleNoise | None]
     p: float
     spot: float | None
-    seen: list[PhaseError]
-    errors: Mapping[str, AxisError]
+    phase_errors: list[PhaseError]
+    readout_phase: Mapping[str, ReadoutPhase]
+    evaluation: Mapping[str, AxisEvaluation]
     truth: Truth | None
-    trouble: list[Trouble]
-    dropped: int
+    defects: list[Defect]
+    unlocated_samples: int
     affected: NDArray[np.bool_]
     notes: list[str]
     intensity: Channel
     name: str
     seconds: float = 0.0
 
+    def __repr__(self) -> str:
+        lines = [f"Reconstruction of {self.name!r}: {self.picture!r}", repr(self.motion)]
+        lines += [
+            f"  {axis}: phase error against the truth {np.degrees(error.phase_rmse):.4f}° rms"
+            for axis, error in self.evaluation.items()
+        ]
+        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
+
     @property
-    def recorded(self) -> float:
+    def duration(self) -> float:
         """Length of the intensity [s]."""
         return self.intensity.size / self.intensity.sample_rate
 
@@ -107,145 +134,229 @@ class Reconstruction:
         """Pixels of the picture along an axis."""
         return self.picture.grid.width if axis == "x" else self.picture.grid.height
 
-    def bound(self, axis: str) -> float:
+    def phase_bound(self, axis: str) -> float:
         """p/m of an axis [rad] (chen2020 eq 7)."""
-        return blur.bound(self.p, self.pixels(axis) / 2)
+        return blur.phase_bound(self.p, self.pixels(axis) / 2)
+
+
+@dataclass(frozen=True)
+class EstimatedMotion:
+    """The motion of a prepared recording, and the pixels that it is mapped to.
+
+    Attributes:
+        prepared: the recording.
+        motion: of the mirror.
+        grid: the pixels over the device's field of view, else over the range of the motion.
+        field_notes, motion_notes: what a reader has to know of the field and of the motion, a line each.
+        phase_errors: of the motion, as the picture shows them; None where they were not measured.
+        readout_phase: as in ``Reconstruction``.
+    """
+
+    prepared: PreparedRecording
+    motion: Motion
+    grid: Grid
+    field_notes: list[str]
+    motion_notes: list[str]
+    phase_errors: list[PhaseError] | None = None
+    readout_phase: Mapping[str, ReadoutPhase] = field(default_factory=dict)
+
+    @property
+    def beam(self) -> Motion:
+        """Motion of the beam over the sample: the mirror's, corrected for the optics terms of the device."""
+        return beam_motion(self.motion, self.prepared.device, self.prepared.origin)
+
+
+@dataclass(frozen=True)
+class GriddedScan:
+    """The picture of an estimated motion.
+
+    Attributes:
+        estimated: the motion.
+        picture: mean intensity and sample count of each pixel.
+        unlocated: samples left out because the mirror's angle is unknown there.
+        affected: pixels that hold samples from defects, or were missed through a clock jump, shape (height, width).
+    """
+
+    estimated: EstimatedMotion
+    picture: Picture
+    unlocated: SampleRanges
+    affected: NDArray[np.bool_]
 
 
 def reconstruct(
     recording: Recording, options: Options, truth: Truth | None = None, quiet: bool = False
 ) -> Reconstruction:
-    """Track the motion, map the intensity, register forward against backward, compare with the truth if there is one.
+    """Prepare a recording, estimate its motion, grid its intensity and assess the result.
+
+    Args:
+        recording: with an intensity and the channels that the estimator needs.
+        options: what the user asks for.
+        truth: of a simulation, for the evaluation.
+        quiet: show no progress.
 
     Raises:
-        BadInput: the recording or the device does not serve.
+        BadInput: the recording or the device lacks what is needed.
     """
     began = time.perf_counter()
-    check_signal(recording.require("intensity", "a picture needs it"), gaps_ok=True)
-    device = device_of(recording, Device.load(options.device) if options.device else None)
-    jumped = leaps(recording)
-    begin, end = longest_stretch(recording, jumped)
-    if jumped:
-        recording = recording.slice(begin, end)
-
-    def once(recording: Recording) -> Reconstruction:
-        return _reconstruct(recording, device, options, truth, quiet, jumped)
-
-    result = _put_right(once, recording, once(recording))
-    if jumped:
-        cut = (
-            f"a phase leaps as where samples were lost: {begin:.6g} s to {end:.6g} s are used, the longest stretch "
-            "between leaps; cut the recording there to see the rest"
-        )
-        result = replace(result, notes=[*result.notes, cut])
+    prepared = prepare(recording, options.device)
+    result = _reconstruct_prepared(prepared, options, truth, quiet)
+    result = _repair_dropped_samples(prepared, result, options, truth, quiet)
+    if prepared.clock_jumps:
+        result = replace(result, notes=[*result.notes, describe_clock_jumps(recording, prepared)])
     return replace(result, seconds=time.perf_counter() - began)
 
 
-def _put_right(
-    once: Callable[[Recording], Reconstruction], recording: Recording, result: Reconstruction
+def _reconstruct_prepared(
+    prepared: PreparedRecording, options: Options, truth: Truth | None, quiet: bool
 ) -> Reconstruction:
-    """``result``; where the picture shows that samples of the intensity were lost, once more with room for them."""
-    if len(_windows(result.motion, result.intensity)) > 1:  # slices with stretches between them that no one looked at
-        return result
-    channel, slices = recording["intensity"], len(result.seen)
-    mapping = result.motion, result.intensity, result.picture.grid
-    if on_time(result.seen, result.motion).all():
-        return result
-    torn_at = torn(apart(*mapping, slices), result.motion)
-    if torn_at is None:
-        return result
-    loss = lost_light(*mapping, slices, torn_at)
-    again = None if loss is None else once(put_back(recording, loss))
-    if loss is None or again is None or not on_time(again.seen, again.motion).all():
-        when = channel.start + torn_at * channel.size / slices / channel.sample_rate
-        doubt = (
-            f"from about {when:.4g} s on forward and backward sweeps agree no more: the phase drifted away, samples of "
-            "the intensity were lost, or the sample changed"
-        )
-        return replace(result, notes=[*result.notes, doubt])
-    start, stop = (channel.start + at / channel.sample_rate for at in (loss.first, loss.stop))
-    number = f"{abs(loss.missing)} sample{'s' if abs(loss.missing) > 1 else ''}"
-    what = f"{number} lost" if loss.missing > 0 else f"{number} too many"
-    note = f"intensity: {what} at {start:.6g} s, as the picture shows; what comes later was put back in time"
-    leap = Trouble("intensity", "leap", start, stop)
-    return replace(again, trouble=[*again.trouble, leap], notes=[*again.notes, note])
-
-
-def _reconstruct(
-    recording: Recording,
-    device: Device,
-    options: Options,
-    truth: Truth | None,
-    quiet: bool,
-    jumped: Sequence[Trouble],
-) -> Reconstruction:
-    """:func:`reconstruct` of a stretch between leaps of the phase."""
+    """Estimate, grid and assess, with a progress bar."""
     with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=quiet or None) as progress:
-        recording = with_light(recording, device)
-        intensity = recording["intensity"]
-        for axis in AXES:
-            device.axis(axis)
-        options = replace(options, estimator=options.estimator or default_estimator(recording, device))
-        progress.set_postfix_str(f"{options.estimator} (compiled once, at the first run)")
-        motion, told_of_motion = moved(recording, device, options)
-        progress.update()
-        progress.set_postfix_str("mapping")
-        grid, notes = field_of(device, motion, options)
-        beam = placed(motion, device, recording.start)
-        trouble = [*jumped, *troubles(recording)]
-        lost = samples(unknown(motion, trouble), intensity)
-        picture = mapped(beam, intensity, grid, lost)
-        touched = samples(((each.start, each.stop) for each in trouble), intensity)
-        affected = _visited(beam, without(touched, lost), grid) | passed(beam, jumped, grid)
-        if not picture.coverage.any():
-            raise DeviceInvalid(
-                "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"
-            )
+        estimator = options.estimator or default_estimator(prepared.recording, prepared.device)
+        progress.set_postfix_str(f"{estimator} (compiled once, at the first run)")
+        estimated = estimate_motion(prepared, replace(options, estimator=estimator))
         progress.update()
         progress.set_postfix_str("registration")
-        windows = _windows(motion, intensity)
-        seen = registered(beam, intensity, grid, windows)
+        estimated = correct_readout_phase(estimated, options)
         progress.update()
-        errors = {axis: axis_error(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles} if truth else {}
+        progress.set_postfix_str("gridding")
+        gridded = grid_scan(estimated)
         progress.update()
-    notes += [*unused(recording, device), *told_of_motion]
-    for axis in AXES:
-        if motion.axes[axis].sign == "ambiguous":
-            notes.append(f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it")
-    notes += told(trouble)
+        progress.set_postfix_str("assessment")
+        result = assess(gridded, options, truth)
+        progress.update()
+    return result
+
+
+def estimate_motion(prepared: PreparedRecording, options: Options, before: Motion | None = None) -> EstimatedMotion:
+    """Estimate the motion, and refine it by the phase errors that the picture shows where that helps.
+
+    Args:
+        prepared: the recording.
+        options: estimator, flips and pixels.
+        before: motion of an earlier segment of the same scan, which shortens the tracker's tuning.
+
+    Raises:
+        BadInput: no such estimator, or the recording lacks what it needs.
+    """
+    recording, device = prepared.recording, prepared.device
+    motion = estimate(recording, device, options.estimator, options.flips, before)
+    grid, _ = _picture_grid(device, motion, options)
+    motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)
+    grid, field_notes = _picture_grid(device, motion, options)
+    return EstimatedMotion(prepared, motion, grid, field_notes, [*notes, *motion.notes])
+
+
+def wants_readout_phase(motion: Motion, options: Options) -> bool:
+    """Return whether the motion is to be corrected by the phase error that the picture shows."""
+    return motion.estimator in ESTIMATORS_WITH_READOUT_PHASE and not options.sense_only
+
+
+def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
+    """Return the phase errors that forward and backward half-periods show in slices of the scan."""
+    segments = _registration_segments(estimated.motion, estimated.prepared.intensity)
+    return measure_motion_phase_errors(estimated.beam, estimated.prepared.intensity, estimated.grid, segments)
+
+
+def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
+    """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
+
+    A picture that changes its timing at some moment is left as it is, because dropped samples are to be restored first.
+    """
+    motion = estimated.motion
+
+    def register(corrected: Motion) -> list[PhaseError]:
+        return measure_phase_errors(replace(estimated, motion=corrected))
+
+    errors = register(motion)
+    if not wants_readout_phase(motion, options) or first_late_slice(errors, motion) is not None:
+        return replace(estimated, phase_errors=errors)
+    motion, errors, readout_phase = remove_readout_phase(motion, errors, register)
+    notes = [*describe_readout_phase(motion, readout_phase), *estimated.motion_notes]
+    return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
+
+
+def grid_scan(estimated: EstimatedMotion) -> GriddedScan:
+    """Grid the intensity, and mark the pixels that defects affect.
+
+    Raises:
+        DeviceInvalid: no sample lies in the field of view.
+    """
+    prepared, beam, grid = estimated.prepared, estimated.beam, estimated.grid
+    unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
+    picture = grid_intensity(beam, prepared.intensity, grid, unlocated)
+    if not picture.coverage.any():
+        raise DeviceInvalid(
+            "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"
+        )
+    defective = to_sample_ranges(((defect.start, defect.stop) for defect in prepared.defects), prepared.intensity)
+    affected = find_visited_pixels(beam, subtract_ranges(defective, unlocated), grid)
+    affected |= mark_path_during_jumps(beam, prepared.clock_jumps, grid)
+    return GriddedScan(estimated, picture, unlocated, affected)
+
+
+def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Reconstruction:
+    """Compare the motion with the truth if there is one, and collect the notes."""
+    estimated, prepared = gridded.estimated, gridded.estimated.prepared
+    motion, intensity = estimated.motion, prepared.intensity
     return Reconstruction(
         motion=motion,
-        picture=picture,
+        beam=estimated.beam,
+        picture=gridded.picture,
+        sample_noise=measure_noise(estimated.beam, intensity, estimated.grid),
         p=options.p,
         spot=options.spot,
-        seen=seen,
-        errors=errors,
+        phase_errors=estimated.phase_errors or [],
+        readout_phase=estimated.readout_phase,
+        evaluation={axis: evaluate_axis(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles}
+        if truth
+        else {},
         truth=truth,
-        trouble=trouble,
-        dropped=sum(stop - first for first, stop in lost),
-        affected=affected,
-        notes=notes,
+        defects=list(prepared.defects),
+        unlocated_samples=sum(stop - first for first, stop in gridded.unlocated),
+        affected=gridded.affected,
+        notes=[
+            *estimated.field_notes,
+            *describe_outside(gridded.picture, motion),
+            *prepared.unknown_entries,
+            *estimated.motion_notes,
+            *describe_ambiguous_signs(motion),
+            *describe_defects(prepared.defects),
+        ],
         intensity=intensity,
-        name=recording.name,
+        name=prepared.recording.name,
     )
 
 
-def moved(
-    recording: Recording, device: Device, options: Options, before: Motion | None = None
-) -> tuple[Motion, list[str]]:
-    """The estimator's motion, refined by the picture where that helps, and what a reader has to know of it.
+def _repair_dropped_samples(
+    prepared: PreparedRecording, result: Reconstruction, options: Options, truth: Truth | None, quiet: bool
+) -> Reconstruction:
+    """Reconstruct again with the timing restored if the picture shows that samples of the intensity were dropped."""
+    if len(_registration_segments(result.motion, result.intensity)) > 1:  # the slices do not cover the whole scan
+        return result
+    timing_break = find_timing_break(result.phase_errors, result.motion, result.intensity, result.picture.grid)
+    if timing_break is None:
+        return result
+    dropped, recorded = timing_break.dropped, prepared.uncorrected["intensity"]
+    if dropped is not None:
+        restored = prepare_segment(restore_timing(prepared.uncorrected, dropped), prepared.device, prepared.clock_jumps)
+        repaired = _reconstruct_prepared(restored, options, truth, quiet)
+        if slices_aligned(repaired.phase_errors, repaired.motion).all():
+            start, stop = (recorded.start + at / recorded.sample_rate for at in (dropped.first, dropped.stop))
+            number = f"{abs(dropped.missing)} sample{'s' if abs(dropped.missing) > 1 else ''}"
+            what = f"{number} lost" if dropped.missing > 0 else f"{number} too many"
+            note = f"intensity: {what} at {start:.6g} s, as the picture shows; later samples were shifted back"
+            defect = Defect("intensity", PHASE_JUMP, start, stop)
+            return replace(repaired, defects=[*repaired.defects, defect], notes=[*repaired.notes, note])
+    when = recorded.start + timing_break.sample / recorded.sample_rate
+    doubt = (
+        f"from about {when:.4g} s on the forward and backward half-periods disagree: the phase drifted away, samples "
+        "of the intensity were lost, or the specimen changed"
+    )
+    return replace(result, notes=[*result.notes, doubt])
 
-    Args:
-        before: as in ``estimate``.
-    """
-    motion = estimate(recording, device, options.estimator, options.flips, before)
-    grid, _ = field_of(device, motion, options)
-    motion, notes = refined(recording, device, motion, recording["intensity"], grid, options.flips)
-    return motion, notes + list(motion.notes)
 
-
-def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
-    """The pixels over the device's field of view, else over the motion's own, which a note then says."""
+def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
+    """The pixels over the device's field of view, else over the range of the motion, with a note that says so."""
     if device.scan is not None:
         scan = device.scan
         return Grid(*options.pixels, scan.half_angle_x, scan.half_angle_y, scan.metres_per_radian), []
@@ -256,63 +367,9 @@ def field_of(device: Device, motion: Motion, options: Options) -> tuple[Grid, li
     return Grid(*options.pixels, half["x"], half["y"]), [note]
 
 
-def mapped(
-    motion: Motion, intensity: Channel, grid: Grid, lost: Ranges, begin: int = 0, end: int | None = None
-) -> Picture:
-    """The picture, a chunk at a time: memory does not grow with the recording.
-
-    Args:
-        motion: its angles on the intensity's clock.
-        lost: samples (first, stop) that belong to no pixel. begin, end: samples that are mapped.
-    """
-    x, y = (motion.axes[axis].angle for axis in AXES)
-    sums = np.zeros((grid.height, grid.width, *intensity.shape[1:]))
-    counts = np.zeros((grid.height, grid.width), np.uint32)
-    for low, high in without([(begin, intensity.size if end is None else end)], lost):
-        for first in range(low, high, CHUNK):
-            stop = min(first + CHUNK, high)
-            seen = plain(intensity.stored(first, stop))
-            if seen.dtype.kind == "f" and not np.isfinite(seen).all():
-                seen = np.where(np.isinf(seen), np.nan, seen)  # which is left out
-            if isinstance(x, SlowAngle) and isinstance(y, SlowAngle) and seen.ndim == 1:
-                accumulate_slow(x, y, first, seen, grid, sums, counts)
-            else:
-                accumulate(x.read(first, stop), y.read(first, stop), seen, grid, sums, counts)
-    shown = counts if sums.ndim == 2 else counts[..., None]
-    return mean_picture(intensity.gain * sums + intensity.offset * shown, counts, grid)
-
-
-def _visited(motion: Motion, ranges: Ranges, grid: Grid) -> NDArray[np.bool_]:
-    """Pixels that the beam passed over during ranges of samples, shape (height, width)."""
-    x, y = (motion.axes[axis].angle for axis in AXES)
-    counts = np.zeros((grid.height, grid.width), np.uint32)
-    for low, high in ranges:
-        for first in range(low, high, CHUNK):
-            part = first, min(first + CHUNK, high)
-            accumulate(x.read(*part), y.read(*part), np.zeros(part[1] - part[0]), grid, counts=counts)
-    return counts > 0
-
-
-def unused(recording: Recording, device: Device) -> list[str]:
-    """A line for every channel and every key of the device that nothing here knows: most of them are slips."""
-    channels = [name for name in recording.channels if name not in CHANNEL_UNITS and name != "intensity"]
-    keys = _leaves({**device.extra, **{name: axis.extra for name, axis in device.axes.items()}})
-    told = [f"{name}: a channel of this name is not used" for name in channels]
-    return [*told, *(f"{key}: is no key of a device, and not used" for key in keys)]
-
-
-def _leaves(table: Mapping[str, Any], where: str = "") -> Iterator[str]:
-    """Dotted keys of all values in tables within tables."""
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{where}{key}.")
-        else:
-            yield where + key
-
-
-def _windows(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
-    """Samples (first, stop) in which sweeps are registered: all of a short recording, three parts of a long one."""
-    whole = round(REGISTERED * slow_period(motion) * intensity.sample_rate)
+def _registration_segments(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
+    """Samples (first, stop) in which phase errors are measured: all of a short recording, three parts of a long one."""
+    whole = round(MAX_REGISTERED_PERIODS * slow_period(motion) * intensity.sample_rate)
     if intensity.size <= whole:
         return [(0, intensity.size)]
     part = whole // 3

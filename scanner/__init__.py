@@ -1,1 +1,4 @@
-"""What the instrument is: the device, its physics stage by stage, the recording. Knows no other package."""
+"""The instrument: device, physics by stage, channels, recording and motion.
+
+It imports none of the other packages: nothing in here estimates, simulates experiments or makes pictures.
+"""

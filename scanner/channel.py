@@ -11,36 +11,41 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.arrays import Array
 from scanner.errors import BadInput, UnitUnknown
 from scanner.hdf5 import DAMAGE
 
-Array = NDArray[np.float64]
+READ_CHUNK_SAMPLES = 1 << 17
+"""Samples read at a time where a whole channel is processed: 1 MB of doubles, which fits the second-level cache."""
 
-CHUNK = 1 << 17
-"""Samples that are looked at in one go where a whole channel has to pass by: they stay in the cache."""
+MIN_SAMPLE_RATE_HZ, MAX_SAMPLE_RATE_HZ = 1e-6, 1e15
+"""Accepted sample rates: from one sample in twelve days to one in a femtosecond. Others are errors of unit."""
 
-SLOWEST, FASTEST = 1e-6, 1e15
-"""Sample rates that a clock can have [Hz]."""
+MAX_MAGNITUDE = 1e100
+"""Largest accepted magnitude of a sample: no measurement reaches it, and sums of its square do not overflow."""
 
-LARGEST = 1e100
-"""Values beyond are no measurement, and their squares no numbers."""
+MIN_CLIPPED_RUN_SAMPLES = 8
+"""Length of a run of equal samples at an extreme value from which they count as clipped [samples].
+
+Noise makes so many equal samples in a row improbable as long as its standard deviation is about a converter's step.
+"""
 
 CHANNEL_UNITS = {
     "drive_x": "V", "drive_y": "V", "bias_x": "V", "bias_y": "V",
     "sense_x": "V", "sense_y": "V", "sense": "V",
     "angle_x": "rad", "angle_y": "rad",
 }  # fmt: skip
-"""Unit in which a channel is handed out; channels that do not stand here keep the unit they were recorded in."""
+"""Unit of the samples that a channel returns, by its name. Other channels keep the unit that they were recorded in."""
 
 CONVERSIONS = {
     "V": {"V": 1.0, "mV": 1e-3, "uV": 1e-6},
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": pi / 180},
 }
-"""Units accepted for each unit handed out, and what to multiply by."""
+"""Accepted units for each unit of ``CHANNEL_UNITS``, with the factor that converts to it."""
 
 
-class Samples(Protocol):
-    """Where a channel's samples are: numpy's array, HDF5's dataset, or another that reads when it is sliced."""
+class SampleSource(Protocol):
+    """Storage of samples: a numpy array, an HDF5 dataset, or another object that reads when it is sliced."""
 
     @property
     def dtype(self) -> np.dtype[Any]: ...
@@ -52,8 +57,13 @@ class Samples(Protocol):
 
 
 @dataclass(frozen=True)
-class Lazy:
-    """Samples that ``fetch(first, stop)`` reads, along the first axis."""
+class LazySamples:
+    """Samples that are read by a function when they are sliced along the first axis.
+
+    Attributes:
+        shape, dtype: of all samples.
+        fetch: (first, stop) -> samples ``first`` up to ``stop``.
+    """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -77,8 +87,9 @@ class Channel:
         unit: of what :meth:`read` returns.
         sample_rate: [Hz].
         start: time of the first sample on the recording's clock [s].
-        raw: where the samples are; ``first`` and ``stop`` bound this channel's part of them.
-        gain, offset: what turns raw samples into the unit.
+        raw: storage of the samples.
+        first, stop: range of ``raw`` that belongs to this channel.
+        gain, offset: conversion of raw samples to the unit.
         file: where the channel came from, for messages.
     """
 
@@ -86,7 +97,7 @@ class Channel:
     unit: str
     sample_rate: float
     start: float
-    raw: Samples
+    raw: SampleSource
     first: int
     stop: int
     gain: float = 1.0
@@ -105,21 +116,21 @@ class Channel:
 
     @property
     def end(self) -> float:
-        """One sample after the last one [s]."""
+        """Time one sample after the last one [s]."""
         return self.start + self.size / self.sample_rate
 
     def read(self, first: int = 0, stop: int | None = None) -> Array:
-        """Samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) or (n, detectors), in ``unit``.
+        """Return samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) or (n, detectors), in ``unit``.
 
-        Reads no more of the file than that.
+        Only these samples are read from the file.
 
         Raises:
-            BadInput: the file does not give the samples back (truncated, damaged, a filter that is not installed).
+            BadInput: the samples cannot be read (truncated or damaged file, HDF5 filter that is not installed).
         """
         return self.scaled(self.stored(first, stop))
 
     def scaled(self, stored: NDArray[Any]) -> Array:
-        """Samples as they are stored, in ``unit``: gain * stored + offset, of the same shape."""
+        """Return stored samples converted to ``unit``: gain * stored + offset, of the same shape."""
         values = stored.astype(np.float64)
         if self.gain != 1.0:
             values *= self.gain
@@ -128,7 +139,7 @@ class Channel:
         return values
 
     def stored(self, first: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """The same samples in the type and scale they are stored in; not to be written to. Raises as :meth:`read`."""
+        """Return the samples that :meth:`read` converts, as stored. The caller must not change them. Raises as that."""
         low, high, _ = slice(first, stop).indices(self.size)
         try:
             return self.raw[self.first + low : self.first + max(low, high)]
@@ -139,13 +150,13 @@ class Channel:
             raise BadInput(f"samples cannot be read: {error}", file=self.file, channel=self.name, hint=hint) from None
 
     def time(self, first: int = 0, stop: int | None = None) -> Array:
-        """Times of the samples that :meth:`read` gives, shape (n,) [s]."""
+        """Return the times of the samples that :meth:`read` returns, shape (n,) [s]."""
         return self.start + np.arange(*slice(first, stop).indices(self.size)) / self.sample_rate
 
 
-def checked_channel(
+def make_channel(
     name: str,
-    raw: Samples,
+    raw: SampleSource,
     *,
     unit: object,
     sample_rate: object,
@@ -154,11 +165,20 @@ def checked_channel(
     offset: object = 0.0,
     file: str | None = None,
 ) -> Channel:
-    """A channel, once everything said about it has been checked, in the unit that its name stands for.
+    """Return a channel after checking everything stated about it, in the unit that belongs to its name.
+
+    Args:
+        name: of the channel.
+        raw: real samples, shape (n,); (n, detectors) is accepted for names outside ``CHANNEL_UNITS``.
+        unit: of ``gain * raw + offset``.
+        sample_rate: [Hz].
+        start: time of the first sample [s].
+        gain, offset: conversion of raw samples to ``unit``.
+        file: for messages.
 
     Raises:
-        UnitUnknown: a unit that the channel's name does not go with.
-        BadInput: no samples, not numbers, wrong shape, or a clock that is not one.
+        UnitUnknown: the unit is missing or cannot be converted to that of the channel.
+        BadInput: no samples, samples that are not real numbers, a wrong shape, or an impossible rate, start or gain.
     """
 
     def bad(what: str, hint: str) -> BadInput:
@@ -166,10 +186,10 @@ def checked_channel(
 
     if raw.dtype.kind not in "iuf":
         raise bad(f"holds {raw.dtype}, not real numbers", "store integers or floats")
-    most = 1 if name in CHANNEL_UNITS else 2
-    if not 1 <= raw.ndim <= most:
-        wanted = "(n,)" if most == 1 else "(n,) or (n, detectors)"
-        raise bad(f"has shape {raw.shape}", f"store it as {wanted}")
+    max_dimensions = 1 if name in CHANNEL_UNITS else 2
+    if not 1 <= raw.ndim <= max_dimensions:
+        expected = "(n,)" if max_dimensions == 1 else "(n,) or (n, detectors)"
+        raise bad(f"has shape {raw.shape}", f"store it as {expected}")
     if 0 in raw.shape:
         raise bad("holds no samples", "record it again or leave the channel out")
     numbers = {"sample_rate": sample_rate, "start": start, "gain": gain, "offset": offset}
@@ -178,33 +198,35 @@ def checked_channel(
             state = "is missing" if value is None else f"is {value!r}, not a finite number"
             raise bad(f"{key} {state}", f"state {key} as a number")
     rate, first_time, slope, zero = (float(value) for value in numbers.values())  # type: ignore[arg-type]
-    if not SLOWEST <= rate <= FASTEST:
-        raise bad(f"sample_rate is {rate:g} Hz", f"state a rate from {SLOWEST:g} to {FASTEST:g} Hz")
+    if not MIN_SAMPLE_RATE_HZ <= rate <= MAX_SAMPLE_RATE_HZ:
+        raise bad(
+            f"sample_rate is {rate:g} Hz", f"state a rate from {MIN_SAMPLE_RATE_HZ:g} to {MAX_SAMPLE_RATE_HZ:g} Hz"
+        )
     if (abs(first_time) + raw.shape[0] / rate) * rate > 2**52:
         raise bad(f"starts at {first_time:g} s, where its samples have one and the same time", "state start near 0")
     if slope == 0:
         raise bad("gain is 0, which leaves nothing of the samples", "state value = gain * raw + offset")
-    own, factor = _own_unit(name, unit, file)
-    return Channel(name, own, rate, first_time, raw, 0, raw.shape[0], slope * factor, zero * factor, file)
+    channel_unit, factor = _channel_unit(name, unit, file)
+    return Channel(name, channel_unit, rate, first_time, raw, 0, raw.shape[0], slope * factor, zero * factor, file)
 
 
 def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = False) -> None:
-    """Look through a whole channel, chunk by chunk, for what no estimator can work with.
+    """Check a whole channel, chunk by chunk, for samples that no estimator can use.
 
     Args:
-        signal: a channel of one or more columns.
-        constant_ok: a channel that never changes is fine (a bias).
-        gaps_ok: samples that are not finite are missing, and that is fine.
+        signal: a channel with one or more columns.
+        constant_ok: accept a channel that never changes (a bias).
+        gaps_ok: accept samples that are not finite as missing.
 
     Raises:
-        BadInput: a sample that is not finite (with the time of the first one) or no measurement, no sample at all that
-            is, or a signal that never changes.
+        BadInput: a sample is not finite (the message states its time) or larger than ``MAX_MAGNITUDE``, no sample is
+            finite, or the signal never changes.
     """
     low, high = np.inf, -np.inf
-    for first in range(0, signal.size, CHUNK):
-        values = signal.stored(first, first + CHUNK)
-        least, most = float(values.min()), float(values.max())
-        if not (isfinite(least) and isfinite(most)):  # the least of samples of which one is NaN is NaN
+    for first in range(0, signal.size, READ_CHUNK_SAMPLES):
+        values = signal.stored(first, first + READ_CHUNK_SAMPLES)
+        lowest, highest = float(values.min()), float(values.max())
+        if not (isfinite(lowest) and isfinite(highest)):  # the minimum of samples with a NaN is NaN
             finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
             if not gaps_ok:
                 index = first + int(np.argmin(finite))
@@ -213,13 +235,13 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
                 raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
             if not finite.any():
                 continue
-            least, most = float(values[finite].min()), float(values[finite].max())
-        low, high = min(low, least), max(high, most)
+            lowest, highest = float(values[finite].min()), float(values[finite].max())
+        low, high = min(low, lowest), max(high, highest)
     if low > high:
         hint = "check that it was recorded"
         raise BadInput("holds no sample that can be used", file=signal.file, channel=signal.name, hint=hint)
     low, high = sorted((signal.gain * low + signal.offset, signal.gain * high + signal.offset))
-    if max(-low, high) > LARGEST:
+    if max(-low, high) > MAX_MAGNITUDE:
         what = f"reaches {max(-low, high):.3g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:
@@ -230,18 +252,18 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
 def _is_number(value: object) -> bool:
     if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
         return False
-    with suppress(OverflowError):  # TOML's integers have no limit, a float has one
+    with suppress(OverflowError):  # an integer of TOML may be too large for a float
         return isfinite(value)
     return False
 
 
-def _own_unit(name: str, unit: object, file: str | None) -> tuple[str, float]:
-    """The unit a channel is handed out in and the factor that gets it there."""
+def _channel_unit(name: str, unit: object, file: str | None) -> tuple[str, float]:
+    """The unit of the samples that the channel returns, and the factor that converts to it."""
     if name not in CHANNEL_UNITS:
         return (unit if isinstance(unit, str) else ""), 1.0
-    own = CHANNEL_UNITS[name]
-    if unit not in CONVERSIONS[own]:
+    channel_unit = CHANNEL_UNITS[name]
+    if unit not in CONVERSIONS[channel_unit]:
         what = "unit is missing" if unit is None else f"unit {unit!r} is unknown"
-        hint = f"accepted units: {', '.join(CONVERSIONS[own])}"
+        hint = f"accepted units: {', '.join(CONVERSIONS[channel_unit])}"
         raise UnitUnknown(what, file=file, channel=name, hint=hint)
-    return own, CONVERSIONS[own][str(unit)]
+    return channel_unit, CONVERSIONS[channel_unit][str(unit)]

@@ -1,4 +1,4 @@
-"""Channels of different rate and start on one clock, by their time stamps."""
+"""A uniform clock, and channels of different rate and start on a common one."""
 
 from __future__ import annotations
 
@@ -8,33 +8,35 @@ from math import ceil, floor
 
 import numpy as np
 
-from scanner.channel import Array, Channel
+from scanner.arrays import Array
+from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
-SAME_SAMPLE = 1e-6
-"""Two times are the same sample when they are closer than this fraction of a sample: rounding, not a delay."""
+SAME_TIME_SAMPLES = 1e-6
+"""Two times closer than this fraction of a sample are the same: the rounding of times after 1e9 samples, well below any
+delay between channels."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Sample ``i`` of ``n`` is at ``start + i / rate`` [s]."""
+    """A uniform clock of ``size`` samples: sample ``i`` is at ``start + i / rate`` [s]."""
 
     start: float
     rate: float
-    n: int
+    size: int
 
     @property
     def time(self) -> Array:
-        """Times of all samples, shape (n,) [s]."""
-        return self.start + np.arange(self.n) / self.rate
+        """Times of all samples, shape (size,) [s]."""
+        return self.start + np.arange(self.size) / self.rate
 
 
 def on_clock(recording: Recording, names: Iterable[str], rate: float | None = None) -> tuple[Clock, dict[str, Array]]:
-    """The named channels on one clock over the time that all of them cover.
+    """Return the named channels on one clock over the time that all of them cover.
 
-    A channel that already has the clock's rate and whose samples fall on it is cut, not touched; any other is
-    interpolated linearly. Nothing is low-passed before its rate is reduced.
+    A channel whose samples fall on the clock is cut and otherwise unchanged. Any other channel is interpolated
+    linearly, without a low-pass where its rate is reduced.
 
     Args:
         recording: holds the channels.
@@ -54,27 +56,27 @@ def on_clock(recording: Recording, names: Iterable[str], rate: float | None = No
     last_time = min(channel.end - 1 / channel.sample_rate for channel in channels)
     if rate is None or rate == fastest.sample_rate:
         rate = fastest.sample_rate
-        first = ceil((first_time - fastest.start) * rate - SAME_SAMPLE)
+        first = ceil((first_time - fastest.start) * rate - SAME_TIME_SAMPLES)
         first_time = fastest.start + first / rate
-    n = floor((last_time - first_time) * rate + SAME_SAMPLE) + 1
+    n = floor((last_time - first_time) * rate + SAME_TIME_SAMPLES) + 1
     if n < 1:
         spans = ", ".join(f"{c.name} {c.start:.9g} to {c.end:.9g} s" for c in channels)
         what = f"the channels have no time in common: {spans}"
         raise BadInput(what, file=recording.path, hint="check their start times and rates")
     clock = Clock(first_time, rate, n)
-    return clock, {channel.name: _on(clock, channel) for channel in channels}
+    return clock, {channel.name: _read_on_clock(clock, channel) for channel in channels}
 
 
-def _on(clock: Clock, channel: Channel) -> Array:
+def _read_on_clock(clock: Clock, channel: Channel) -> Array:
     lag = (clock.start - channel.start) * channel.sample_rate
     step = channel.sample_rate / clock.rate
-    last_lag = lag + (clock.n - 1) * step
+    last_lag = lag + (clock.size - 1) * step
     first = round(lag)
-    if max(abs(lag - first), abs(last_lag - (first + clock.n - 1))) < SAME_SAMPLE:
-        return channel.read(first, first + clock.n)
+    if max(abs(lag - first), abs(last_lag - (first + clock.size - 1))) < SAME_TIME_SAMPLES:
+        return channel.read(first, first + clock.size)
     first = max(floor(lag), 0)
     values = channel.read(first, ceil(last_lag) + 1)
-    at, samples = lag - first + step * np.arange(clock.n), np.arange(len(values))
+    position, samples = lag - first + step * np.arange(clock.size), np.arange(len(values))
     if values.ndim == 1:
-        return np.interp(at, samples, values)
-    return np.stack([np.interp(at, samples, column) for column in values.T], axis=1)
+        return np.interp(position, samples, values)
+    return np.stack([np.interp(position, samples, column) for column in values.T], axis=1)

@@ -1,8 +1,7 @@
-"""The nominal device: what its maker or its calibration says of every stage, as text (TOML) and as values.
+"""The nominal device: the values of every stage from design or calibration, as text (TOML) and as dataclasses.
 
-A device file holds one table an axis, SI units, mechanical angles in radians. What a table may hold is what the
-dataclasses here have as fields; a key nobody knows is kept in ``extra`` and written back, so that a file survives
-a round trip through a program that is older than it.
+A device file holds one table for each axis, in SI units and mechanical angles. The fields of the dataclasses are the
+keys of the tables. Unknown keys are kept in ``extra`` and written back, so that an older program does not lose them.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from scanner.files import parse_toml, read_toml
 
 AXES = ("x", "y")
 DEFAULT_TOLERANCE = 0.02
-"""Relative standard uncertainty of a nominal value that states none."""
+"""Relative standard uncertainty of a nominal value for which the device states none: typical of a data sheet."""
 
 
 class Checked:
-    """A table of the device file: its values are checked, and turned into floats, when it is made."""
+    """A table of the device file. Its values are checked and converted to float when it is made."""
 
     def __post_init__(self) -> None:
         device_toml.check_values(self)
@@ -62,9 +61,9 @@ class Capacitance(Checked):
     """``C(theta) = C0 exp(-((theta - theta_th) / theta0)^2) + Cb`` (chen2020 eq 9).
 
     Attributes:
-        C0: height of the bell [F].
-        Cb: what does not move with the mirror [F].
-        theta0: width of the bell [rad].
+        C0: amplitude of the Gaussian part [F].
+        Cb: part that does not depend on the angle [F].
+        theta0: half width of the Gaussian part at 1/e [rad].
         theta_th: angle of the largest capacitance [rad].
     """
 
@@ -76,11 +75,11 @@ class Capacitance(Checked):
 
 @dataclass(frozen=True)
 class Drive(Checked):
-    """How a voltage turns the mirror.
+    """Conversion of voltage to torque.
 
     Attributes:
         kind: ``"electrostatic"``, torque ``C'(theta) V^2 / 2``, or ``"linear"``, torque ``torque_per_volt V``.
-        torque_per_volt: of a linear drive [N m / V].
+        torque_per_volt: torque per volt of a linear drive, which needs it [N m / V].
     """
 
     KINDS: ClassVar[tuple[str, ...]] = ("electrostatic", "linear")
@@ -100,11 +99,11 @@ class Amdm(Checked):
     """Amplitude modulation and demodulation: ``V = a_cir C + b_cir`` through first-order sections (chen2020 II-C).
 
     Attributes:
-        a_cir: gain [V / F].
-        b_cir: offset [V].
+        a_cir: gain of the circuit [V / F].
+        b_cir: offset of the circuit [V].
         lpf_hz: corner frequency of every low-pass section [Hz].
         noise_var: variance of the output's noise [V^2].
-        bits: of the converter.
+        bits: resolution of the converter.
     """
 
     kind: ClassVar[str] = "amdm"
@@ -127,9 +126,9 @@ class Transimpedance(Checked):
 
     Attributes:
         R_s: feedback resistor [ohm].
-        V_bias: [V].
+        V_bias: bias voltage on the comb [V].
         noise_sd: standard deviation of the output's noise [V].
-        bits: of the converter.
+        bits: resolution of the converter.
     """
 
     kind: ClassVar[str] = "transimpedance"
@@ -145,10 +144,10 @@ class Position(Checked):
     """A position sensor: ``V = gain theta + offset``.
 
     Attributes:
-        gain: [V / rad].
+        gain: volts per radian of mechanical angle [V / rad].
         noise_sd: standard deviation of the output's noise [V].
         offset: output at rest [V].
-        bits: of the converter.
+        bits: resolution of the converter.
     """
 
     kind: ClassVar[str] = "position"
@@ -164,7 +163,8 @@ class Scan(Checked):
     """Field of view that fills the picture, as mechanical half angles [rad].
 
     Attributes:
-        metres_per_radian: by which the beam moves over the sample [m/rad]; where it is told pictures are to scale.
+        half_angle_x, half_angle_y: half the field of view [rad].
+        metres_per_radian: displacement of the beam on the sample [m/rad]; where it is stated, pictures are to scale.
     """
 
     half_angle_x: float = field(metadata=POSITIVE)
@@ -178,12 +178,13 @@ READOUTS: dict[str, type[Readout]] = {readout.kind: readout for readout in (Amdm
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis, stage by stage; a stage the file does not speak of is None.
+    """One axis, stage by stage. A stage that the file does not state is None.
 
     Attributes:
         tolerance: stated relative standard uncertainties, by the name of the value.
-        terms: physics beyond the nominal laws, effect -> parameter -> value [SI].
-        extra: what the file holds beyond that, nested as in the file.
+        terms: physics beyond the nominal laws, effect -> parameter -> value [SI]. ``measured-law`` also has text and
+            lists, see ``scanner.terms.measured_law``.
+        extra: unknown keys, nested as in the file.
         name: ``"x"`` or ``"y"``, for messages.
         source: where the axis came from, for messages.
     """
@@ -193,7 +194,7 @@ class Axis:
     drive: Drive | None = None
     readout: Readout | None = None
     tolerance: Mapping[str, float] = field(default_factory=dict)
-    terms: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    terms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
     name: str = field(default="", compare=False)
     source: str | None = field(default=None, compare=False)
@@ -209,25 +210,25 @@ class Axis:
         return self.require_mechanics().quality
 
     def require_mechanics(self) -> Mechanics:
-        """The mechanics; DeviceInvalid where the device states none."""
+        """Return the mechanics; DeviceInvalid where the device states none."""
         if self.mechanics is None:
             raise self._missing("mechanics", "J, b and k")
         return self.mechanics
 
     def require_capacitance(self) -> Capacitance:
-        """The capacitance; DeviceInvalid where the device states none."""
+        """Return the capacitance; DeviceInvalid where the device states none."""
         if self.capacitance is None:
             raise self._missing("capacitance", "C0, Cb and theta0")
         return self.capacitance
 
     def require_drive(self) -> Drive:
-        """The drive; DeviceInvalid where the device states none."""
+        """Return the drive; DeviceInvalid where the device states none."""
         if self.drive is None:
             raise self._missing("drive", "kind")
         return self.drive
 
     def require_readout(self) -> Readout:
-        """The axis's own readout; DeviceInvalid where the device states none."""
+        """Return the readout of the axis; DeviceInvalid where the device states none."""
         if self.readout is None:
             raise self._missing("readout", "kind and its values")
         return self.readout
@@ -245,10 +246,10 @@ class Device:
     Attributes:
         name: of the device.
         axes: ``"x"``, ``"y"`` or both.
-        readout: the one readout that sees ``C_x + C_y`` where all combs share an electrode, else None.
+        readout: the one readout that senses ``C_x + C_y`` where all combs share an electrode, else None.
         scan: field of view, None where the file states none.
         shared_tolerance: stated relative uncertainties of the shared readout.
-        extra: what the file holds beyond that, nested as in the file.
+        extra: unknown keys, nested as in the file.
         source: where the device came from, for messages.
     """
 
@@ -260,9 +261,25 @@ class Device:
     extra: Mapping[str, Any] = field(default_factory=dict)
     source: str | None = field(default=None, compare=False)
 
+    def __repr__(self) -> str:
+        return "\n".join([f"Device {self.name!r}", *(f"  {line}" for line in self._summary_lines())])
+
+    def _summary_lines(self) -> list[str]:
+        """One line each for axes, shared readout and field of view."""
+        lines = []
+        for name, axis in self.axes.items():
+            parts = [f"{axis.resonance:.6g} Hz, Q {axis.quality:.4g}"] if axis.mechanics else []
+            parts += [f"{axis.drive.kind} drive"] if axis.drive else []
+            parts += [f"{axis.readout.kind} readout"] if axis.readout else []
+            parts += [f"terms {', '.join(axis.terms)}"] if axis.terms else []
+            lines.append(f"{name}: {'; '.join(parts) or 'nothing stated'}")
+        lines += [f"shared {self.readout.kind} readout"] if self.readout else []
+        lines += [f"field ±{self.scan.half_angle_x:.4g} x ±{self.scan.half_angle_y:.4g} rad"] if self.scan else []
+        return lines
+
     @classmethod
     def load(cls, path: str | Path) -> Device:
-        """The device in the TOML file at ``path``.
+        """Return the device in the TOML file at ``path``.
 
         Raises:
             BadInput: the file cannot be read, or is not TOML.
@@ -272,17 +289,17 @@ class Device:
 
     @classmethod
     def from_toml(cls, text: str, source: str | None = None) -> Device:
-        """The device that ``text`` describes.
+        """Return the device that a TOML text describes.
 
         Raises:
             BadInput: the text is not TOML.
-            DeviceInvalid: with ``source``, the key (``x.mechanics.k``), what is wrong and what to do.
+            DeviceInvalid: it lacks a needed key or holds a value that is not physical; the message names the key.
         """
         return cls.from_table(parse_toml(text, source), source)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], source: str | None = None) -> Device:
-        """The device in a table already parsed from TOML; raises as :meth:`from_toml`."""
+        """Return the device in a table parsed from TOML. Raises as :meth:`from_toml`."""
         rest = device_toml.Table(dict(table), "", source)
         name = rest.take_text("name", default="unnamed")
         axes = {axis: _axis(axis, sub) for axis in AXES if (sub := rest.take_table(axis)) is not None}
@@ -299,7 +316,7 @@ class Device:
         )
 
     def to_toml(self) -> str:
-        """The device as text; :meth:`from_toml` of it equals this device."""
+        """Return the device as TOML text, from which :meth:`from_toml` makes an equal device."""
         table: dict[str, Any] = {"name": self.name}
         for name, axis in self.axes.items():
             stages = {stage: getattr(axis, stage) for stage in ("mechanics", "capacitance", "drive", "readout")}
@@ -315,33 +332,37 @@ class Device:
         return tomli_w.dumps(device_toml.merged(table, self.extra))
 
     def axis(self, name: str) -> Axis:
-        """One axis; DeviceInvalid where the device has none of that name."""
+        """Return one axis; DeviceInvalid where the device has none of that name."""
         if name not in self.axes:
             hint = f"add the table [{name}]; the device holds {', '.join(self.axes)}"
             raise DeviceInvalid("is missing and needed here", file=self.source, channel=name, hint=hint)
         return self.axes[name]
 
     def sensed_axis(self, name: str) -> Axis:
-        """One axis with the readout that sees it, its own or the shared one; raises as :meth:`axis`."""
+        """Return one axis with the readout that senses it, its own or the shared one. Raises as :meth:`axis`."""
         axis = self.axis(name)
         return axis if self.readout is None else replace(axis, readout=self.readout)
 
     def require_scan(self) -> Scan:
-        """The field of view; DeviceInvalid where the device states none."""
+        """Return the field of view; DeviceInvalid where the device states none."""
         if self.scan is None:
             hint = "add [scan] with half_angle_x and half_angle_y to the device"
             raise DeviceInvalid("is missing and needed here", file=self.source, channel="scan", hint=hint)
         return self.scan
 
     def tolerance(self, axis: str, key: str) -> float:
-        """Relative standard uncertainty of ``key`` (``"k"``, ``"a_cir"``, ...) of one axis."""
+        """Return the relative standard uncertainty of ``key`` (``"k"``, ``"a_cir"``, ...) of one axis."""
         return self.axis(axis).tolerance.get(key, self.shared_tolerance.get(key, DEFAULT_TOLERANCE))
 
 
 def _axis(name: str, table: device_toml.Table) -> Axis:
     terms = {}
     if (effects := table.take_table("terms")) is not None:
-        terms = {key: effect.take_numbers() for key in list(effects.rest) if (effect := effects.take_table(key))}
+        terms = {
+            key: effect.take_rest() if key == "measured-law" else effect.take_numbers()
+            for key in list(effects.rest)
+            if (effect := effects.take_table(key))
+        }
     return Axis(
         mechanics=table.take_as(Mechanics, "mechanics"),
         capacitance=table.take_as(Capacitance, "capacitance"),

@@ -1,4 +1,4 @@
-"""Between TOML tables and dataclasses: reads key by key, so that every complaint names its key and nothing is lost."""
+"""Conversion between TOML tables and dataclasses, key by key: errors name their key, and unknown keys are preserved."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from scanner.errors import DeviceInvalid
 
-# What a field's number must be: kept as the field's metadata, checked when the dataclass is made.
+# Conditions on the number in a field: stored as the field's metadata, checked when the dataclass is made.
 FINITE = {"must": "be a finite number"}
 POSITIVE = {"must": "be a number greater than 0"}
 NOT_NEGATIVE = {"must": "be a number, 0 or greater"}
@@ -18,7 +18,7 @@ NONZERO = {"must": "be a number other than 0"}
 WHOLE = {"must": "be a whole number greater than 0"}
 CAN_BE_OFF = {"optional": True}
 
-_HOLDS: dict[str, Callable[[Any], bool]] = {
+_CONDITIONS: dict[str, Callable[[Any], bool]] = {
     FINITE["must"]: lambda number: True,
     POSITIVE["must"]: lambda number: number > 0,
     NOT_NEGATIVE["must"]: lambda number: number >= 0,
@@ -30,14 +30,14 @@ T = TypeVar("T")
 
 
 def checked_number(value: object, must: str, key: str) -> float | int:
-    """``value`` as a number that fulfils ``must``; true and false are no numbers.
+    """Return ``value`` as a number that satisfies ``must``. true and false are not numbers.
 
     Raises:
-        DeviceInvalid: naming ``key``.
+        DeviceInvalid: it does not; the error names ``key``.
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool):
-        with suppress(OverflowError):  # TOML's integers have no limit, a float has one
-            if isfinite(value) and _HOLDS[must](value):
+        with suppress(OverflowError):  # an integer of TOML may be too large for a float
+            if isfinite(value) and _CONDITIONS[must](value):
                 return value if must == WHOLE["must"] else float(value)
     raise DeviceInvalid(f"is {value!r} and must {must}", channel=key)
 
@@ -58,20 +58,24 @@ def check_values(record: object) -> None:
 
 
 def check_kind(kind: object, known: Iterable[str]) -> str:
-    """``kind`` if it is one of the known ones; else DeviceInvalid with their list."""
+    """Return ``kind`` if it is one of the known ones.
+
+    Raises:
+        DeviceInvalid: it is not; the error lists the known ones.
+    """
     if kind not in (known := tuple(known)):
         raise DeviceInvalid(f"{kind!r} is unknown", channel="kind", hint=f"known kinds: {', '.join(known)}")
     return str(kind)
 
 
 def to_table(record: Any) -> dict[str, Any]:
-    """A dataclass as a TOML table, without what is None; a class that has a ``kind`` writes it first."""
+    """Return a dataclass as a TOML table, without values that are None. A ``kind`` comes first."""
     kind = {"kind": record.kind} if hasattr(record, "kind") else {}
     return kind | {item.name: v for item in fields(record) if (v := getattr(record, item.name)) is not None}
 
 
 def merged(table: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """``table`` with the keys of ``extra`` added, table into table."""
+    """Return ``table`` with the keys of ``extra`` added, also in nested tables."""
     out = dict(table)
     for key, value in extra.items():
         out[key] = merged(out[key], value) if isinstance(value, Mapping) and key in out else value
@@ -80,11 +84,11 @@ def merged(table: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]
 
 @dataclass
 class Table:
-    """A table being read: what is taken is gone, what is left is extra.
+    """A table that is being read. Reading a key removes it; the keys that remain are unknown ones.
 
     Attributes:
-        rest: what nobody took yet.
-        where: dotted key of the table, empty for the file itself.
+        rest: keys that have not been read.
+        where: dotted key of the table, empty for the whole file.
         source: the file, for messages.
     """
 
@@ -97,7 +101,7 @@ class Table:
         return ".".join(part for part in (self.where, name) if part)
 
     def wrong(self, error: DeviceInvalid) -> DeviceInvalid:
-        """The same complaint with the file and the whole key."""
+        """Return the same error with the file and the whole key."""
         return DeviceInvalid(error.what, file=self.source, channel=self.key(error.channel), hint=error.hint)
 
     def take_text(self, name: str, default: str) -> str:
@@ -127,7 +131,7 @@ class Table:
             raise self.wrong(error) from None
 
     def take_numbers(self, must: Mapping[str, Any] = FINITE) -> dict[str, float]:
-        """All numbers of the table; text, lists and tables stay behind."""
+        """Read all numbers of the table, and leave texts, lists and tables."""
         names = [name for name, value in self.rest.items() if not isinstance(value, (str, list, dict))]
         try:
             return {name: checked_number(self.rest.pop(name), must["must"], name) for name in names}
@@ -139,7 +143,7 @@ class Table:
         return None if table is None else table.made(cls)
 
     def made(self, cls: type[T]) -> T:
-        """An object of the dataclass ``cls`` from this table's keys."""
+        """Return an object of the dataclass ``cls`` made from the keys of this table."""
         known = fields(cls)  # type: ignore[arg-type]
         for item in known:
             if item.default is MISSING and item.name not in self.rest:
@@ -151,7 +155,7 @@ class Table:
             raise self.wrong(error) from None
 
     def take_rest(self) -> dict[str, Any]:
-        """What nobody took, here and in the tables taken from here, nested as in the file."""
+        """Return the keys that have not been read, of this table and the tables in it, nested as in the file."""
         inner = {name: rest for name, table in self.tables.items() if (rest := table.take_rest())}
         rest, self.rest, self.tables = self.rest | inner, {}, {}
         return rest

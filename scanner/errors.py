@@ -1,4 +1,4 @@
-"""Errors a person can act on: what is wrong, where, and what to do, in one line."""
+"""Errors that a user can act on: what is wrong, where, and what to do, in one line."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class BadInput(ValueError):
         if self.hint:
             line += f"; {self.hint}"
         line = " ".join(line.split())
-        # what a damaged or hostile file calls itself must not steer the terminal, nor break its encoding
+        # a name in a damaged or hostile file may hold control characters, which must not reach the terminal
         return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
 
 
 def line_of(error: OSError, place: object) -> str:
-    """What the system said, in one line; ``place`` where it names no file."""
+    """Return the message of a system error in one line; ``place`` stands for the file where the error names none."""
     return " ".join(f"{error.filename or place}: {error.strerror or ' '.join(map(str, error.args))}".split())
 
 
@@ -37,8 +37,8 @@ class ChannelMissing(BadInput, KeyError):
 
 
 class DeviceInvalid(BadInput):
-    """The device lacks a value that is needed, or holds one that is not physical."""
+    """The device lacks a value that is needed, or states one that is not physical."""
 
 
 class UnitUnknown(BadInput):
-    """A unit that is not the channel's own and that nobody said how to convert."""
+    """A unit that cannot be converted to that of the channel."""

@@ -1,4 +1,4 @@
-"""Reading TOML with errors that name the file, and writing a file so that nobody ever meets half of one."""
+"""Reading TOML with errors that name the file, and writing files that appear only when they are complete."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from typing import Any
 
 from scanner.errors import BadInput
 
-_DEFLATE_MOST = 1032  # bytes out of one byte: https://zlib.net/zlib_tech.html
-_HARMLESS = 1 << 26
+_MAX_DEFLATE_RATIO = 1032
+"""Largest compression ratio of deflate (https://zlib.net/zlib_tech.html)."""
+
+_MIN_CHECKED_BYTES = 1 << 26
+"""Sizes below 64 MB are not checked: even if they are wrong, any computer can allocate them."""
 
 
 def check_place(path: Path) -> None:
-    """Refuse a file for output where it could not be written; for before the work whose result it is to hold.
+    """Check that an output file can be written, before the work whose result it will hold.
 
     Raises:
         BadInput: the folder of ``path`` does not exist or may not be written into, or ``path`` is a folder.
@@ -30,7 +33,11 @@ def check_place(path: Path) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Refuse a folder in which nothing can be made (BadInput)."""
+    """Check that files can be made in a folder.
+
+    Raises:
+        BadInput: they cannot.
+    """
     try:
         with TemporaryFile(dir=folder):
             pass
@@ -40,7 +47,7 @@ def check_writable(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A path to write to, beside ``path``: it takes ``path``'s place when the block ends and vanishes when it fails.
+    """Yield a path beside ``path`` to write to. It replaces ``path`` when the block ends and is deleted when it fails.
 
     Raises:
         BadInput: as :func:`check_place`.
@@ -52,7 +59,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield beside
         beside.replace(path)
     except OSError as error:
-        # Where writing failed nothing names the file, or else the hidden one, which tells nobody anything.
+        # The error names no file, or the temporary one, which the user does not know.
         error.filename = str(error.filename or path).replace(str(beside), str(path))
         raise
     finally:
@@ -60,18 +67,23 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def check_claim(claimed: int, stored: int, *, file: object, channel: str | None = None) -> None:
-    """Refuse a size [bytes] that what is ``stored`` [bytes] cannot hold, however well it was compressed.
+    """Check a size that a file states against what its stored bytes can hold, however well they are compressed.
+
+    Args:
+        claimed: stated size [bytes].
+        stored: bytes in the file.
+        file, channel: for messages.
 
     Raises:
-        BadInput: the claim is beyond what deflate can shrink, and large enough to do harm.
+        BadInput: the stated size is beyond the compression of deflate, and large enough to exhaust the memory.
     """
-    if claimed > max(_HARMLESS, _DEFLATE_MOST * stored):
+    if claimed > max(_MIN_CHECKED_BYTES, _MAX_DEFLATE_RATIO * stored):
         hint = "the file is damaged or truncated; copy it again"
         raise BadInput(f"claims {claimed} bytes and stores {stored}", file=file, channel=channel, hint=hint)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """The table in a TOML file.
+    """Return the table in a TOML file.
 
     Raises:
         BadInput: the file cannot be read, or is not TOML.
@@ -86,10 +98,14 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, source: object) -> dict[str, Any]:
-    """The table that ``text`` holds; BadInput, naming ``source``, where it is not TOML."""
+    """Return the table in a TOML text.
+
+    Raises:
+        BadInput: it is not TOML; the message names ``source``.
+    """
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"is not TOML: {error}", file=source, hint="correct the place it names") from None
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits, brackets in brackets
+        raise BadInput(f"is not TOML: {error}", file=source, hint="correct the line that it names") from None
+    except (ValueError, RecursionError) as error:  # thousands of digits, or too deeply nested brackets
         raise BadInput(f"is not TOML that can be read: {error}", file=source, hint="write it simpler") from None

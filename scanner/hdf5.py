@@ -1,4 +1,4 @@
-"""Opening other people's HDF5: what stands in the file is read, and nothing that only points elsewhere."""
+"""Reading HDF5 files from unknown sources: checks against damage, links and external storage; safe writing."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from scanner.errors import BadInput
 from scanner.files import check_claim
 
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
-"""How h5py says that HDF5 cannot make sense of a file."""
+"""Exceptions by which h5py reports a damaged file."""
 
 
-MOST_VALUES = 1 << 16
-"""Values that an attribute holds where HDF5 stores it with its object, a byte each."""
+MAX_ATTRIBUTE_VALUES = 1 << 16
+"""Largest accepted number of values in an attribute: HDF5 stores up to 64 kB with its object. h5py reads the
+values of a larger one separately, which does not end where a damaged file states a huge number."""
 
 
-DEEPEST = 8
-"""Groups within groups that are looked into."""
+MAX_GROUP_DEPTH = 8
+"""Levels of groups that are checked; a recording has three, and a damaged file may hold a cycle."""
 
-CPU_SECONDS, SECONDS = 5, 60
-"""What HDF5 may take, of a processor and in all, to tell what a file holds: milliseconds where it is not damaged."""
+CHECK_CPU_TIME_S, CHECK_WALL_TIME_S = 5, 60
+"""Time that HDF5 may take to list the content of a file, of the processor and in all. An undamaged file takes
+milliseconds; the longer wall time allows for a busy computer or a slow network drive."""
 
 
 @contextmanager
 def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
-    """For reading from a file that is open: what HDF5 cannot make sense of becomes BadInput."""
+    """Turn the errors of h5py on a damaged file into BadInput within the block."""
     try:
         yield
     except BadInput:
@@ -44,7 +46,7 @@ def undamaged(path: object, channel: str | None = None) -> Iterator[None]:
 
 
 def is_hdf5(path: Path) -> bool:
-    """Whether there is a file that begins as HDF5 does, and may be read."""
+    """Whether the path is a readable file with the signature of HDF5."""
     try:
         return path.is_file() and h5py.is_hdf5(path)
     except OSError:
@@ -52,47 +54,47 @@ def is_hdf5(path: Path) -> bool:
 
 
 def check_ends(path: Path) -> None:
-    """Refuse a file on which HDF5 runs for ever, as it does on some that are damaged, or comes to grief.
+    """Check that HDF5 does not hang or crash on a file, as it does on some damaged ones.
 
-    Nothing stops the library once it does, so a fork of this process looks at all groups and attributes first, and is
-    ended by a timer. What else is wrong with the file is left to whoever opens it. Opening does not do this by itself:
-    a program with threads, or on a system without ``fork``, may not want it.
+    The library cannot be interrupted once it hangs. Therefore a fork of this process reads all groups and attributes
+    first, and a timer ends it. Other faults of the file are reported by the function that opens it. Opening does not
+    call this check, because a program with threads, or on a system without ``fork``, cannot use it.
 
     Raises:
-        BadInput: the fork did not come back.
+        BadInput: the fork was ended by the timer or crashed.
     """
     if not hasattr(os, "fork") or not is_hdf5(path):
         return
-    looking = os.fork()
-    if not looking:
+    child_pid = os.fork()
+    if not child_pid:
         with suppress(BaseException):
             for which, number, limit in (
-                (signal.ITIMER_PROF, signal.SIGPROF, CPU_SECONDS),
-                (signal.ITIMER_REAL, signal.SIGALRM, SECONDS),
+                (signal.ITIMER_PROF, signal.SIGPROF, CHECK_CPU_TIME_S),
+                (signal.ITIMER_REAL, signal.SIGALRM, CHECK_WALL_TIME_S),
             ):
                 signal.signal(number, signal.SIG_DFL)
                 signal.setitimer(which, limit)
             with h5py.File(path, "r") as file:
-                _look(file)
+                _read_all(file)
         os._exit(0)
-    _, status = os.waitpid(looking, 0)
+    _, status = os.waitpid(child_pid, 0)
     if os.WIFSIGNALED(status):
         ended = "runs without end" if os.WTERMSIG(status) in (signal.SIGPROF, signal.SIGALRM) else "fails"
         raise BadInput(f"HDF5 {ended} on it: the file is damaged", file=path, hint="copy it again")
 
 
-def _look(group: h5py.Group, depth: int = DEEPEST) -> None:
+def _read_all(group: h5py.Group, depth: int = MAX_GROUP_DEPTH) -> None:
     attributes(group)
     for name in group:
         with suppress(*DAMAGE):
             item = child(group, name, h5py.HLObject)
             attributes(item)
             if isinstance(item, h5py.Group) and depth:
-                _look(item, depth - 1)
+                _read_all(item, depth - 1)
 
 
 def open_hdf5(path: Path, growing: bool = False) -> h5py.File:
-    """The file, for reading.
+    """Open a file for reading.
 
     Args:
         growing: another program may be writing it at the same time (HDF5's single writer, multiple readers).
@@ -119,10 +121,10 @@ def open_hdf5(path: Path, growing: bool = False) -> h5py.File:
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """A file to write into, whole when the block ends well.
+    """Yield a new file to write into; it is complete when the block ends without error.
 
-    HDF5 2.0 crashes where it finds out while closing that the disk is full. So it keeps no samples back, and writes
-    everything else before it is asked to close.
+    HDF5 2.0 crashes if it detects a full disk while it closes a file. Therefore samples are not buffered, and
+    everything else is flushed before the file is closed.
 
     Raises:
         OSError: the disk is full, or may not be written to.
@@ -139,19 +141,23 @@ def new_hdf5(path: Path) -> Iterator[h5py.File]:
         finally:
             file.close()
     except (OSError, RuntimeError) as error:
-        told = re.search(r"(?:write failed|extend file|create file).*?errno = (\d+)", str(error), re.DOTALL)
-        if told is None:
+        error_number = re.search(r"(?:write failed|extend file|create file).*?errno = (\d+)", str(error), re.DOTALL)
+        if error_number is None:
             raise
-        raise OSError(int(told[1]), os.strerror(int(told[1])), str(path)) from None
+        raise OSError(int(error_number[1]), os.strerror(int(error_number[1])), str(path)) from None
 
 
 def child(group: h5py.Group, name: str, kind: type) -> Any:
-    """The group or dataset ``name`` stored in ``group`` itself, None where there is none.
+    """Return the group or dataset ``name`` that is stored in ``group`` itself; None where there is none.
+
+    Args:
+        group: of an open file.
+        name: of the item.
+        kind: h5py.Group, h5py.Dataset, or h5py.HLObject for either.
 
     Raises:
-        BadInput: it is a link (whatever a link points to, another program put it there: the recording must be whole
-            without it), its samples are kept in another file, it claims more of them than it stores, or it is not of
-            the ``kind`` h5py.Group or h5py.Dataset.
+        BadInput: it is a link (a recording must not depend on what a link points to), its samples are stored in another
+            file, it states more of them than it stores, or it is of another kind.
     """
     where = f"{group.name.rstrip('/')}/{name}"
     path = group.file.filename
@@ -181,11 +187,15 @@ def _check_samples(item: h5py.Dataset, path: str, where: str) -> None:
 
 
 def attributes(item: h5py.HLObject) -> dict[str, Any]:
-    """Attributes as Python values: text as str, arrays of one element as that element; BadInput where damaged."""
+    """Return attributes as Python values: text as str, arrays of one element as that element.
+
+    Raises:
+        BadInput: they are damaged, or state more than ``MAX_ATTRIBUTE_VALUES`` values.
+    """
     with undamaged(item.file.filename, item.name):
         for key in item.attrs:
             shape = item.attrs.get_id(key).shape or ()
-            if prod(shape) > MOST_VALUES:  # h5py would read them one by one
+            if prod(shape) > MAX_ATTRIBUTE_VALUES:
                 what = f"attribute {key} claims {prod(shape)} values"
                 raise BadInput(what, file=item.file.filename, channel=item.name, hint="copy the file again")
         return {key: _plain(value) for key, value in item.attrs.items()}

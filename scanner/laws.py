@@ -1,6 +1,6 @@
-"""The physical laws of one axis, each defined once for simulator, estimators and diagnosis alike.
+"""The physical laws of one axis, defined once for simulator, estimators and diagnosis.
 
-Every function is compiled by numba and takes scalars or arrays. Angles [rad], SI units throughout.
+Every function is compiled by numba and takes scalars or arrays. Angles are in rad, other values in SI units.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ def capacitance(theta, C0, Cb, theta0, theta_th):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy")
-def bell_slope(u, bell, C0, theta0):  # type: ignore[no-untyped-def]
-    """dC/dtheta [F/rad] for those who have bell = exp(-u^2) already."""
-    return -2.0 * u / theta0 * C0 * bell
+def gaussian_slope(u, gaussian, C0, theta0):  # type: ignore[no-untyped-def]
+    """dC/dtheta [F/rad] from u = (theta - theta_th)/theta0 and gaussian = exp(-u^2)."""
+    return -2.0 * u / theta0 * C0 * gaussian
 
 
 @njit(cache=True)
 def capacitance_slope(theta, C0, theta0, theta_th):  # type: ignore[no-untyped-def]
     """dC/dtheta [F/rad]."""
     u = (theta - theta_th) / theta0
-    return bell_slope(u, np.exp(-u * u), C0, theta0)
+    return gaussian_slope(u, np.exp(-u * u), C0, theta0)
 
 
 @njit(cache=True)
@@ -38,7 +38,7 @@ def capacitance_curvature(theta, C0, theta0, theta_th):  # type: ignore[no-untyp
 
 @njit(cache=True, error_model="numpy")
 def electrostatic_torque(slope, voltage):  # type: ignore[no-untyped-def]
-    """Torque 1/2 C'(theta) V^2 [N m] (chen2020 eq 8); it pulls towards the largest capacitance."""
+    """Torque 1/2 C'(theta) V^2 [N m] (chen2020 eq 8), towards the largest capacitance."""
     return 0.5 * slope * voltage * voltage
 
 
@@ -56,7 +56,7 @@ def transimpedance_voltage(slope, omega, R_s, V_bias):  # type: ignore[no-untype
 
 @njit(cache=True)
 def amdm_voltage(filtered_capacitance, a_cir, b_cir):  # type: ignore[no-untyped-def]
-    """Demodulated readout a_cir C + b_cir [V] of the capacitance behind the low-pass sections (chen2020 eq 25)."""
+    """Demodulated readout a_cir C + b_cir [V] of the capacitance after the low-pass sections (chen2020 eq 25)."""
     return a_cir * filtered_capacitance + b_cir
 
 

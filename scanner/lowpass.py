@@ -1,8 +1,8 @@
 """The demodulator's first-order low-pass sections: their response and their exact step.
 
-chen2020 calls their phase a constant that calibration removes (section II-C). Two sections near 41 kHz turn the
-sense signal by 0.0018 degrees a hertz at 31 kHz, so over the paper's sweep it is not: every user of a readout asks
-for the response at the frequency of the moment, or carries the sections as states.
+chen2020 (section II-C) treats their phase as a constant that calibration removes. Two sections near 41 kHz change the
+phase of the sense signal by 0.0018 degrees a hertz at 31 kHz, so over the paper's sweep the phase is not constant.
+Users of a readout therefore evaluate the response at the present frequency, or carry the sections as states.
 """
 
 from __future__ import annotations
@@ -15,17 +15,24 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from scanner.arrays import Array, Complex
 
-def response(frequency: NDArray[Any] | float, cutoffs: Sequence[float]) -> NDArray[np.complex128]:
-    """Complex gain at ``frequency`` [Hz] of first-order sections in series, cut-offs [Hz]. Same shape as frequency."""
+
+def lowpass_response(frequency: NDArray[Any] | float, cutoffs: Sequence[float]) -> Complex:
+    """Return the complex gain of first-order sections in series, in the shape of ``frequency``.
+
+    Args:
+        frequency: [Hz].
+        cutoffs: cut-off frequency of each section [Hz].
+    """
     gain = np.ones(np.shape(frequency), dtype=np.complex128)
     for cutoff in cutoffs:
         gain = gain / (1.0 + 1j * np.asarray(frequency) / cutoff)
     return gain
 
 
-def step_coefficients(cutoff: float, step: float) -> tuple[float, float, float]:
-    """Exact step of u' = w (x - u) for an input that is linear between samples.
+def section_coefficients(cutoff: float, step: float) -> tuple[float, float, float]:
+    """Return the coefficients of the exact step of u' = w (x - u) for an input that is linear between samples.
 
     Args:
         cutoff: w / 2 pi [Hz].
@@ -41,8 +48,8 @@ def step_coefficients(cutoff: float, step: float) -> tuple[float, float, float]:
 
 
 @njit(cache=True)
-def lowpass(signal, e, p, q, u, x):  # type: ignore[no-untyped-def]
-    """Run one section over ``signal`` (n,) in place, from output ``u`` and last input ``x``; returns the new two."""
+def run_section(signal, e, p, q, u, x):  # type: ignore[no-untyped-def]
+    """Filter ``signal`` (n,) in place, after an output ``u`` and an input ``x``. Returns the last output and input."""
     for i in range(signal.size):
         new = signal[i]
         u = e * u + p * x + q * new
@@ -51,13 +58,25 @@ def lowpass(signal, e, p, q, u, x):  # type: ignore[no-untyped-def]
     return u, x
 
 
-def low_passed(signal: NDArray[np.float64], cutoff: float, step: float) -> NDArray[np.float64]:
-    """One section over samples ``step`` apart of a smooth signal (n,), settled at its first value.
+def apply_lowpass(signal: Array, cutoff: float, step: float) -> Array:
+    """Return a smooth signal after one first-order section that has settled at the signal's first value.
 
-    A step that is exact for an input linear in between weakens a tone w by (w step)^2 / 12, which at a few tens of
-    samples a turn passes for a lag of its own. A twelfth of the second differences, taken off first, undoes it.
+    The exact step is for an input that is linear between samples. It attenuates a tone of angular frequency w by
+    (w step)^2 / 12, which at a few tens of samples a cycle acts like an additional lag. Subtracting a twelfth of the
+    second differences first corrects for that.
+
+    Args:
+        signal: shape (n,).
+        cutoff: cut-off frequency [Hz]. A negative one adds what a positive one of the same magnitude removes, so
+            that a fit can pass through zero lag. An infinite one returns the signal itself.
+        step: sampling interval [s].
+
+    Returns:
+        Shape (n,).
     """
-    bent = signal.copy()
-    bent[1:-1] -= (signal[2:] - 2.0 * signal[1:-1] + signal[:-2]) / 12.0
-    lowpass(bent, *step_coefficients(cutoff, step), bent[0], bent[0])
-    return bent
+    if not np.isfinite(cutoff):
+        return signal
+    filtered = signal.copy()
+    filtered[1:-1] -= (signal[2:] - 2.0 * signal[1:-1] + signal[:-2]) / 12.0
+    run_section(filtered, *section_coefficients(abs(cutoff), step), filtered[0], filtered[0])
+    return filtered if cutoff > 0 else 2.0 * signal - filtered

@@ -1,19 +1,92 @@
-"""Motion: what every estimator returns and every reconstruction takes."""
+"""Motion: the result of every estimator and the input of every reconstruction."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from scanner.arrays import Array, Complex
+from scanner.interpolation import shift_samples
+
+
+class AngleTrack(Protocol):
+    """Mechanical angle of one axis on a uniform clock.
+
+    Every angle in a :class:`Motion` has these attributes and methods. Implementations: :class:`SampledAngle` (stored
+    samples), ``estimation.tracker.angle_synthesis.PhasorAngle`` (synthesised from slow phase and amplitude) and
+    ``estimation.optics.correction.BeamAngle`` (a track after the device's optics terms).
+    """
+
+    @property
+    def sample_rate(self) -> float:
+        """Sample rate [Hz]."""
+
+    @property
+    def start(self) -> float:
+        """Time of the first sample on the recording's clock [s]."""
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+
+    def read(self, first: int = 0, stop: int | None = None) -> Array:
+        """Return the angles of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
+
+    def negated(self) -> AngleTrack:
+        """Return the same motion with the opposite sign."""
+
+    def advanced(self, time: Array, phase: Array, frequency: Array) -> AngleTrack:
+        """Return the motion whose phase is ahead of this one.
+
+        Args:
+            time: increasing, shape (n,) [s].
+            phase: lead at these times, interpolated between them, shape (n,) [rad].
+            frequency: of the motion, shape (n,) [Hz].
+        """
+
+    def phasors(self) -> PhasorTrack | None:
+        """Return the phasors that the angles are synthesised from; None for a track that is not made from any."""
+
+
+class PhasorTrack(Protocol):
+    """Phasors from which angles are synthesised. Kernels that take them need no sine for each sample."""
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+
+    def cut_segments(self, first: int, stop: int) -> PhasorSegments:
+        """Return segments that begin with sample ``first`` and cover the samples up to ``stop``."""
+
+    def phase(self, time: Array) -> Array:
+        """Return the phase u of the motion at ``time`` (n,) [s], also outside the track, shape (n,) [rad]."""
+
+    def delayed(self, delay: float) -> AngleTrack:
+        """Return the track that starts ``delay`` [s] earlier: its sample i is the angle ``delay`` before this one's."""
 
 
 @dataclass(frozen=True)
-class AngleTrack:
-    """Mechanical angle on a uniform clock.
+class PhasorSegments:
+    """Phasors of a run of samples, segment by segment: the input of the compiled kernels.
+
+    Attributes:
+        first_phasor: exp(i u) at each segment's first sample, shape (segments,).
+        step_phasor: exp(i du) from one sample to the next, shape (segments,).
+        harmonics, harmonic_steps: c_n at the first sample and its change a sample, shape (segments, harmonics) [rad].
+    """
+
+    first_phasor: Complex
+    step_phasor: Complex
+    harmonics: Complex
+    harmonic_steps: Complex
+
+
+@dataclass(frozen=True)
+class SampledAngle:
+    """An angle track that is stored sample by sample.
 
     Attributes:
         values: angle, shape (n,) [rad].
@@ -31,12 +104,21 @@ class AngleTrack:
         return self.values.size
 
     def read(self, first: int = 0, stop: int | None = None) -> Array:
-        """Angles of samples ``first`` up to ``stop``, shape (n,) [rad]; what a long recording is gone through by."""
+        """Return the angles of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
         return self.values[first:stop]
 
-    def turned(self) -> AngleTrack:
-        """The same motion with the other sign."""
+    def negated(self) -> SampledAngle:
+        """Return the same motion with the opposite sign."""
         return replace(self, values=-self.values)
+
+    def advanced(self, time: Array, phase: Array, frequency: Array) -> SampledAngle:
+        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``AngleTrack``)."""
+        lead = phase / (2.0 * np.pi * frequency)
+        own_time = self.start + np.arange(self.size) / self.sample_rate
+        return replace(self, values=shift_samples(self.values, np.interp(own_time, time, lead) * self.sample_rate))
+
+    def phasors(self) -> None:
+        """Return None: samples are not synthesised from phasors."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +147,21 @@ class AxisMotion:
     reference: str = "half-drive"
     sign: str = "ambiguous"
 
-    def turned(self) -> AxisMotion:
-        """The same motion with the other sign."""
-        return replace(self, phase=self.phase + np.pi, angle=self.angle.turned())
+    def __repr__(self) -> str:
+        sd = np.degrees(np.sqrt(np.mean(np.square(self.phase_sd))))
+        return (
+            f"{np.median(self.frequency):.6g} Hz, amplitude {np.median(self.amplitude):.4g} rad, "
+            f"phase sd {sd:.3g}° rms, {self.time.size} times, sign {self.sign}"
+        )
+
+    def negated(self) -> AxisMotion:
+        """Return the same motion with the opposite sign."""
+        return replace(self, phase=self.phase + np.pi, angle=self.angle.negated())
+
+    def advanced(self, phase: Array) -> AxisMotion:
+        """Return the motion whose phase is ahead by ``phase`` at ``time``, shape (n,) [rad]."""
+        ahead = self.angle.advanced(self.time, phase, self.frequency)
+        return replace(self, phase=self.phase + phase, angle=ahead)
 
 
 @dataclass(frozen=True)
@@ -85,3 +179,7 @@ class Motion:
     estimator: str
     info: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        lines = [f"Motion by {self.estimator!r}", *(f"  {name}: {axis!r}" for name, axis in self.axes.items())]
+        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])

@@ -1,57 +1,83 @@
-"""From the mirror's angles to the intensity, and back: what a device's optics terms make of place and light."""
+"""The device's optics terms: from mirror angles to beam positions, and from light to the recorded intensity."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scanner.arrays import Array
 from scanner.device import Device
-from scanner.response import Added, added_terms, by_stage
-from scanner.terms import View
+from scanner.forward_model import ActiveTerm, in_stage_order, stated_terms
+from scanner.terms import SignalContext
 
-Array = NDArray[np.float64]
-_NOTHING = np.empty(0)
-LONG = 4096
-"""Samples after which a detector has settled."""
+_EMPTY = np.empty(0)
+
+DELAY_TEST_SAMPLES = 4096
+"""Samples of the ramp that measures a delay. Half of them are the time for a detector to settle: 0.4 ms at 5 MHz, about
+a hundred time constants of the slowest useful detector."""
 
 
-def acting(device: Device, channel: str, axis: str | None = None) -> list[Added]:
-    """The device's terms that act on ``channel``, on one axis or on all, in the order of their stages."""
+def terms_on_channel(device: Device, channel: str, axis: str | None = None) -> list[ActiveTerm]:
+    """Return the terms that the device states for a channel, of one axis or of all, in the order of their stages.
+
+    Raises:
+        DeviceInvalid: the device has no such axis.
+        BadInput: as :func:`scanner.forward_model.stated_terms`.
+    """
     axes = device.axes.values() if axis is None else (device.axis(axis),)
-    return by_stage(each for one in axes for each in added_terms(one) if each.channel == channel)
+    return in_stage_order(term for one in axes for term in stated_terms(one) if term.channel == channel)
 
 
-def through(added: Iterable[Added], signal: Array, time: Array) -> Array:
-    """``signal`` (n,) after the output laws of ``added``; ``time`` (n,) is even, from the recording's start on [s]."""
+def apply_terms(terms: Iterable[ActiveTerm], signal: Array, time: Array) -> Array:
+    """Return a signal (n,) after the output laws of ``terms``.
+
+    Args:
+        terms: in the order in which they act.
+        signal: shape (n,).
+        time: uniform, from the start of the recording, shape (n,) [s].
+    """
     step = float(time[1] - time[0]) if time.size > 1 else 1.0
-    view = View(time, step, None, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
-    for each in added:
-        if each.term.output is not None:
-            signal = each.term.output(signal, each.values, view)
+    context = SignalContext(time, step, None, _EMPTY, _EMPTY, _EMPTY, _EMPTY)
+    for active in terms:
+        if active.term.output is not None:
+            signal = active.term.output(signal, active.values, context)
     return signal
 
 
-def place(device: Device, axis: str, angle: Array, time: Array) -> Array:
-    """Where on the sample the beam stands (n,), told as an angle [rad], when the mirror stands at ``angle`` (n,)."""
-    return through(acting(device, "place", axis), angle, time)
+def beam_position(device: Device, axis: str, angle: Array, time: Array) -> Array:
+    """Return the position of the beam on the sample, as the mirror angle that would put it there, shape (n,) [rad].
+
+    Args:
+        device: states the terms.
+        axis: name of the axis.
+        angle: of the mirror, shape (n,) [rad].
+        time: as in :func:`apply_terms`.
+    """
+    return apply_terms(terms_on_channel(device, "place", axis), angle, time)
 
 
-def recorded(device: Device, light: Array, time: Array) -> Array:
-    """What becomes of the light (n,) on its way to the intensity channel, noise apart."""
-    return through(acting(device, "intensity"), light, time)
+def apply_intensity_terms(device: Device, light: Array, time: Array) -> Array:
+    """Return the noiseless intensity channel for light (n,) on the detector; ``time`` as in :func:`apply_terms`."""
+    return apply_terms(terms_on_channel(device, "intensity"), light, time)
 
 
-def delay(device: Device, step: float) -> float:
-    """How late the intensity is [s]: what its laws make of a ramp against what they make of a constant."""
-    time = step * np.arange(LONG, dtype=np.float64)
-    added = acting(device, "intensity")
-    ramp, gain = through(added, time, time), through(added, np.ones(LONG), time)
-    middle = LONG // 2  # behind the start's transient, before the end, where a delay has nothing to look at
+def intensity_delay(device: Device, step: float) -> float:
+    """Return the delay of the intensity channel against the light [s], measured with a ramp.
+
+    Args:
+        device: states the terms.
+        step: sampling interval of the channel [s].
+    """
+    time = step * np.arange(DELAY_TEST_SAMPLES, dtype=np.float64)
+    terms = terms_on_channel(device, "intensity")
+    ramp, gain = apply_terms(terms, time, time), apply_terms(terms, np.ones(DELAY_TEST_SAMPLES), time)
+    middle = (
+        DELAY_TEST_SAMPLES // 2
+    )  # after the transient of the start, and before the samples that a shift runs out of
     return float(time[middle] - ramp[middle] / gain[middle])
 
 
-def gain(device: Device, time: Array) -> Array:
-    """What the intensity's laws make of a steady light of 1 at ``time`` (n,) [s]."""
-    return through(acting(device, "intensity"), np.ones_like(time), time)
+def intensity_gain(device: Device, time: Array) -> Array:
+    """Return the intensity for constant light of 1, shape (n,); ``time`` as in :func:`apply_terms`."""
+    return apply_terms(terms_on_channel(device, "intensity"), np.ones_like(time), time)

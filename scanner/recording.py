@@ -1,7 +1,7 @@
-"""The recording: one front door for the files that hold a scanner's signals.
+"""The recording: the signals of a scanner, read from one HDF5 file or given as arrays.
 
-A recording is lazy (opening reads no samples) and immutable (slicing gives a new one over the same file).
-What a simulation knows beyond its signals, ``/truth``, is not part of it: :func:`scanner.truth.read_truth` reads that.
+A recording is lazy (opening reads no samples) and immutable (slicing gives a new one over the same file). The true
+values of a simulation, ``/truth``, are not part of it: :func:`scanner.truth.read_truth` reads them.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any, Protocol
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from scanner.channel import CHUNK, Channel, checked_channel
+from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
 from scanner.device import Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.files import replacing
@@ -28,7 +28,7 @@ from scanner.truth import Truth, write_truth
 FORMAT = "lissajous-recording"
 VERSIONS = (1,)
 
-# A sample that rounding has put this fraction of a sample before a cut still belongs behind it.
+# A sample less than this fraction of a sample before a cut belongs to the part after it: rounding of times moved it.
 _ROUNDING = 1e-6
 
 
@@ -44,7 +44,7 @@ class Recording:
 
     Attributes:
         channels: by name.
-        attrs: what the file says of itself (``name``, ``notes``, ``acquired``, ...).
+        attrs: attributes of the file (``name``, ``notes``, ``acquired``, ...).
         path: of the file, None for a recording in memory.
         device_toml: the nominal device as text, None where there is none.
     """
@@ -57,15 +57,15 @@ class Recording:
 
     @classmethod
     def open(cls, path: str | Path, growing: bool = False) -> Recording:
-        """The recording in an HDF5 file; close it, or use it in a ``with`` statement.
+        """Return the recording in an HDF5 file. Close it, or use it in a ``with`` statement.
 
         Args:
             path: of the file.
-            growing: another program may be writing it; what it has written by now is the recording.
+            growing: another program may be writing the file; the recording is what it has written so far.
 
         Raises:
             BadInput: no such file, no HDF5, truncated, another format or version, no channels, or a channel that
-                :func:`scanner.channel.checked_channel` refuses. Links and storage outside the file are refused too.
+                :func:`scanner.channel.make_channel` refuses. Links and storage outside the file are refused too.
         """
         path = Path(path)
         file = open_hdf5(path, growing)
@@ -86,32 +86,56 @@ class Recording:
     @classmethod
     def from_arrays(
         cls,
-        channels: Mapping[str, tuple[ArrayLike, str, float, float]],
+        channels: Mapping[str, tuple[ArrayLike, str, float] | tuple[ArrayLike, str, float, float]],
         device: Device | None = None,
         name: str | None = None,
         **attrs: Any,
     ) -> Recording:
-        """A recording in memory.
+        """Return a recording in memory.
+
+        Example::
+
+            volts = np.load("sense.npy")  # shape (n,), sampled at 5 MHz
+            channels = {"sense_x": (volts, "V", 5e6), "drive_x": (drive, "V", 1e6, 0.002)}  # the drive starts at 2 ms
+            recording = Recording.from_arrays(channels, device)
 
         Args:
-            channels: name -> (values, unit, sample rate [Hz], start [s]).
+            channels: name -> (values, unit, sample rate [Hz]) or (values, unit, sample rate [Hz], start [s]). Values
+                have the shape (n,), or (n, detectors) for ``intensity``; start is the time of the first sample, 0
+                where it is left out. Channels may differ in sample rate, start and length.
             device: the nominal device.
             name: of the recording.
-            attrs: more of what a file would say of itself (``notes``, ``acquired``).
+            attrs: further attributes of the recording (``notes``, ``acquired``).
 
         Raises:
-            BadInput: no channels, or a channel that :func:`scanner.channel.checked_channel` refuses.
+            BadInput: no channels, a channel that is not such a tuple, or one that
+                :func:`scanner.channel.make_channel` refuses: values of another shape, an unknown unit, no clock.
         """
         if not channels:
             raise BadInput("holds no channels", hint="give at least one")
         made = {}
-        for key, (values, unit, sample_rate, start) in channels.items():
-            raw = np.asarray(values).view()
+        for key, channel in channels.items():
+            if not isinstance(channel, tuple) or len(channel) not in (3, 4):
+                raise BadInput(
+                    "is not a tuple of 3 or 4 items", channel=key, hint="give (values, unit, sample rate[, start])"
+                )
+            values, unit, sample_rate, *start = channel
+            raw = _as_numbers(values, key).view()
             raw.flags.writeable = False
-            made[key] = checked_channel(key, raw, unit=unit, sample_rate=sample_rate, start=start)
+            made[key] = make_channel(key, raw, unit=unit, sample_rate=sample_rate, start=start[0] if start else 0.0)
         attrs = ({} if name is None else {"name": name}) | attrs
         text = None if device is None else device.to_toml()
         return cls(MappingProxyType(made), MappingProxyType(attrs), device_toml=text)
+
+    def __repr__(self) -> str:
+        device = "no device" if self.device_toml is None else "with a device"
+        lines = [f"Recording {self.name!r}: {self.duration:.6g} s from {self.start:.6g} s, {device}"]
+        lines += [
+            f"  {channel.name}: {' x '.join(map(str, channel.shape))} samples [{channel.unit}] "
+            f"at {channel.sample_rate:.9g} Hz from {channel.start:.6g} s"
+            for channel in self.channels.values()
+        ]
+        return "\n".join(lines)
 
     def __enter__(self) -> Recording:
         return self
@@ -122,7 +146,7 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the file; channels not read by then, those of slices too, can no longer be read."""
+        """Close the file. Channels of this recording and of its slices can then no longer be read."""
         if self._file is not None:
             self._file.close()
 
@@ -133,10 +157,14 @@ class Recording:
         return self.require(name)
 
     def require(self, name: str, why: str | None = None) -> Channel:
-        """The channel ``name``; ``why`` says who needs it, for the message.
+        """Return a channel.
+
+        Args:
+            name: of the channel.
+            why: what it is needed for, for the message.
 
         Raises:
-            ChannelMissing: with the channels that there are.
+            ChannelMissing: it is not in the recording; the message lists the channels.
         """
         if name not in self.channels:
             what = "is not in the recording" + (f" and {why}" if why else "")
@@ -157,12 +185,12 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """What the recording calls itself, else its file's name."""
+        """Name that the recording states, else the name of its file."""
         return str(self.attrs.get("name") or (self.path.stem if self.path else "recording"))
 
     @property
     def notes(self) -> str:
-        """What was noted with it, else nothing."""
+        """Notes that the recording states, else an empty text."""
         return str(self.attrs.get("notes", ""))
 
     @property
@@ -172,7 +200,7 @@ class Recording:
 
     @property
     def end(self) -> float:
-        """One sample after the last one of the channel that goes on longest [s]."""
+        """Time one sample after the last sample of any channel [s]."""
         return max(channel.end for channel in self.channels.values())
 
     @property
@@ -181,22 +209,22 @@ class Recording:
         return self.end - self.start
 
     def slice(self, t0: float, t1: float) -> Recording:
-        """The samples with ``t0 <= t < t1`` [s], on the same clock; a channel with none of them is left out.
+        """Return the samples with ``t0 <= t < t1`` [s], on the same clock, without channels that have none.
 
         Raises:
             BadInput: the interval holds no sample of any channel.
         """
         cuts = {name: _cut(channel, t0, t1) for name, channel in self.channels.items()}
-        kept = {name: channel for name, channel in cuts.items() if channel.size}
-        if not kept:
+        nonempty = {name: channel for name, channel in cuts.items() if channel.size}
+        if not nonempty:
             what = f"holds nothing from {t0:g} s to {t1:g} s"
             raise BadInput(what, file=self.path, hint=f"it runs from {self.start:g} s to {self.end:g} s")
-        return replace(self, channels=MappingProxyType(kept))
+        return replace(self, channels=MappingProxyType(nonempty))
 
     def write(self, path: str | Path, truth: Truth | None = None) -> None:
-        """Write a file that :meth:`open` reads; it appears at ``path`` when it is complete.
+        """Write a file that :meth:`open` reads. It appears at ``path`` when it is complete.
 
-        Integer samples stay integers, with their gain and offset; others are stored in the unit they are read in.
+        Integer samples are stored as integers with gain and offset, others in the unit in which they are read.
 
         Args:
             path: of the new file.
@@ -205,12 +233,20 @@ class Recording:
         with replacing(path) as beside, new_hdf5(beside) as file:
             file.attrs.update({**self.attrs, "format": FORMAT, "version": VERSIONS[-1]})
             group = file.create_group("channels")
-            for each in self.channels.values():
-                _write_channel(group, each)
+            for channel in self.channels.values():
+                _write_channel(group, channel)
             if self.device_toml is not None:
                 file.create_group("device").attrs["toml"] = self.device_toml
             if truth is not None:
                 write_truth(file.create_group("truth"), truth)
+
+
+def _as_numbers(values: ArrayLike, name: str) -> NDArray[Any]:
+    """The values as an array; BadInput where rows differ in length, so that they form none."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise BadInput("is no array: its rows differ in length", channel=name, hint="give shape (n,)") from None
 
 
 def _check_format(name: object, version: object, path: Path) -> None:
@@ -235,10 +271,10 @@ def _open_channel(group: h5py.Group, name: str, path: Path) -> Channel:
     dataset = child(group, name, h5py.Dataset)
     if dataset is None:
         raise BadInput("is listed and not there", file=path, channel=name, hint="copy the file again")
-    known = attributes(dataset)
-    needed = {key: known.get(key) for key in ("unit", "sample_rate")}
-    said = {key: known[key] for key in ("start", "gain", "offset") if key in known}
-    return checked_channel(name, dataset, file=str(path), **needed, **said)
+    stated = attributes(dataset)
+    required = {key: stated.get(key) for key in ("unit", "sample_rate")}
+    optional = {key: stated[key] for key in ("start", "gain", "offset") if key in stated}
+    return make_channel(name, dataset, file=str(path), **required, **optional)
 
 
 def _cut(channel: Channel, t0: float, t1: float) -> Channel:
@@ -257,8 +293,8 @@ def _write_channel(group: h5py.Group, channel: Channel) -> None:
     plain = channel.gain == 1.0 and channel.offset == 0.0
     dtype = channel.raw.dtype if whole or plain else np.float64
     dataset = group.create_dataset(channel.name, channel.shape, dtype)
-    for first in range(0, channel.size, CHUNK):
-        stop = min(first + CHUNK, channel.size)
+    for first in range(0, channel.size, READ_CHUNK_SAMPLES):
+        stop = min(first + READ_CHUNK_SAMPLES, channel.size)
         if whole or plain:
             dataset[first:stop] = channel.raw[channel.first + first : channel.first + stop]
         else:

@@ -1,6 +1,6 @@
-"""What a simulation knows and no estimator may: ``/truth`` of a simulated recording.
+"""The true values in a simulated recording, ``/truth``, which no estimator may read.
 
-It is kept out of :class:`scanner.recording.Recording` so that nothing that works from a recording can look at it.
+They are not part of :class:`scanner.recording.Recording`, so that code that works from a recording cannot read them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def write_truth(group: h5py.Group, truth: Truth) -> None:
 
 
 def read_truth(path: str | Path) -> dict[str, Any] | None:
-    """The truth in a recording's file as :func:`write_truth` was given it, None where there is none.
+    """Return the truth in the file of a recording, as given to :func:`write_truth`; None where there is none.
 
     Datasets with attributes come back as ``(array, attributes)``.
 

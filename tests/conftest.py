@@ -1,4 +1,4 @@
-"""Shared by all tests."""
+"""Settings of every test run, and the fixture of measured data."""
 
 import os
 import signal
@@ -9,19 +9,19 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
 import hypothesis
 import pytest
 
-# A shell that starts a job in the background has it, and all that it starts, ignore interrupts.
+from tests.support.measured_data import MEASURED_DATA
+
+# A shell makes its background jobs, and their children, ignore SIGINT. The interrupt tests need the default.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The first call of a compiled function takes seconds; examples are the same in every run.
-hypothesis.settings.register_profile("house", deadline=None, derandomize=True, max_examples=50)
-hypothesis.settings.load_profile("house")
-
-DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+# The first call of a compiled function takes seconds, so there is no deadline. Examples are the same in every run.
+hypothesis.settings.register_profile("lissajous", deadline=None, derandomize=True, max_examples=50)
+hypothesis.settings.load_profile("lissajous")
 
 
 @pytest.fixture(scope="session")
 def measured_data() -> Path:
-    """Folder of measured data; a test that asks for it is skipped, and says so, where the folder is absent."""
-    if not DATA.is_dir():
-        pytest.skip(f"no measured data at {DATA}")
-    return DATA
+    """Folder of measured data. Where it is absent, tests that use it are skipped with that reason."""
+    if not MEASURED_DATA.is_dir():
+        pytest.skip(f"no measured data at {MEASURED_DATA}")
+    return MEASURED_DATA

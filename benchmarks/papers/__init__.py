@@ -1,1 +1,1 @@
-"""Every table and figure of chen2020, chen2019 and wang2019, reproduced and beaten: ``make papers``."""
+"""Reproduction of the tables and figures of chen2020, chen2019 and wang2019, beside this program's results."""

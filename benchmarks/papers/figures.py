@@ -1,4 +1,4 @@
-"""Results and pictures in the form of the papers' own."""
+"""Entries of ``results.json``, and figures drawn like those of the papers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Results = dict[str, dict[str, Any]]
 
 
 def entry(paper: float | None, ours: float, n: int, seed: int, **more: Any) -> dict[str, Any]:
-    """One figure of a paper: its number, ours, over how many trials, from which seed on."""
+    """One entry: the paper's number, ours, the number of trials, and the first seed."""
     return {
         "paper": paper,
         "ours": round(float(ours), 7) if abs(ours) < 100 else float(ours),

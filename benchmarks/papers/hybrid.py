@@ -1,8 +1,8 @@
-"""chen2019 Tables I and III, figs 7 to 10: EKF and HYB on ten free decays, in four segments of falling
+"""chen2019 Tables I and III, figs 7 to 10: EKF and HYB on ten free decays, in four segments of decreasing
 signal-to-noise ratio.
 
-Truth is integrated by Runge-Kutta on four times the recording's clock; the filters' device differs from the true one by
-``ERRORS``, drawn for each trial.
+The truth is integrated by Runge-Kutta at four times the recording's rate. The filters' device differs from the true one
+by ``ERRORS``, drawn for each trial.
 """
 
 from __future__ import annotations
@@ -15,37 +15,38 @@ from numpy.typing import NDArray
 from benchmarks.papers.figures import Results, entry, figure
 from benchmarks.papers.phase import rms
 from benchmarks.papers.threshold import lilliefors, sensing_axis
-from estimation.filters import Problem, prepare, tuned_heights
-from estimation.hybrid import SIGMA_CYCLES, detector_for, run_hybrid
-from estimation.threshold import Detector, crossing_law, crossings
-from phantoms.forward import Plan, Start, quantised, trajectory
+from estimation.filters.hybrid import SIGMA_CYCLES, make_detector, run_hybrid
+from estimation.filters.inputs import FilterInput, prepare_filter_inputs
+from estimation.filters.run import tune_torque_noise
+from estimation.filters.threshold import CrossingDetector, calibrate_crossings, find_crossings
+from phantoms.forward import InitialState, Plan, quantise, simulate_trajectory
 from phantoms.waveforms import Constant
+from scanner.arrays import Array
 from scanner.device import Axis, Device
+from scanner.forward_model import sense_signal
 from scanner.recording import Recording
-from scanner.response import sense
-
-Array = NDArray[np.float64]
 
 RATE, DURATION, BIAS, AMPLITUDE = 500e3, 0.08, 10.0, 0.15
 SEGMENTS = ("snr85", "snr22", "snr5", "snr1")
 TRIALS, SEED = 10, 2019
-AFTER = 50  # samples after a crossing
+SAMPLES_AFTER_CROSSING = 50  # samples after a crossing
 PAPER_SIGMA = 15.0
 
 ERRORS = {"k": 0.0045, "b": 0.05, "C0": 0.02, "theta0": 0.02}
-"""Relative standard deviation of what the filter is told; theta_th is off by 0.2 mrad. ``k``: the decay's frequency is
-fitted once and depends on amplitude; the bell is fitted to the position detector."""
-THRESHOLD_ERROR = 2e-4
+"""Relative standard deviation of the filter's nominal values; theta_th has 0.2 mrad. ``k``: the decay's frequency is
+fitted once although it depends on amplitude. C0 and theta0: from a fit to the position detector."""
+THRESHOLD_SD_RAD = 2e-4
 
-HEIGHT = 3e7
-"""Process noise Q_theta [(rad/s2)^2]. The paper prints none; with this one its EKF has its overall RMSE, 3.4 mrad."""
+PROCESS_NOISE = 3e7
+"""Process noise Q_theta [(rad/s2)^2]. The paper states none; with this value the EKF has the paper's overall RMSE of
+3.4 mrad."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One decay, as a filter's problem, and the true angle [rad] at its samples."""
+    """One decay: the filter's input, and the true angle [rad] at its samples."""
 
-    problem: Problem
+    problem: FilterInput
     axis: Axis
     angle: Array
     tuned_height: float
@@ -56,16 +57,16 @@ def trial(seed: int) -> Trial:
     true = sensing_axis()
     phase, w = rng.uniform(0, 2 * np.pi), 2 * np.pi * true.resonance
     plan = Plan({"x": Constant(BIAS)}, DURATION, RATE, substeps=4)
-    start = Start(AMPLITUDE * np.cos(phase), -AMPLITUDE * w * np.sin(phase))
-    path = trajectory(true, plan, start, 0.0, DURATION)
+    start = InitialState(AMPLITUDE * np.cos(phase), -AMPLITUDE * w * np.sin(phase))
+    path = simulate_trajectory(true, plan, start, 0.0, DURATION)
     readout, angle = true.require_readout(), path.angle[:-1:4]
-    signal = sense(readout, [path])[:-1:4]
-    signal = quantised(signal + rng.normal(0.0, readout.noise_sd, signal.size), readout.bits, 10.0)
-    told = miscalibrated(true, rng)
+    signal = sense_signal(readout, [path])[:-1:4]
+    signal = quantise(signal + rng.normal(0.0, readout.noise_sd, signal.size), readout.bits, 10.0)
+    nominal = miscalibrated(true, rng)
     channels = {"sense_x": (signal, "V", RATE, 0.0), "bias_x": (np.full(signal.size, BIAS), "V", RATE, 0.0)}
-    recording = Recording.from_arrays(channels, Device("told", {"x": told}))
-    (problem,) = prepare(recording, recording.device)  # type: ignore[arg-type]
-    return Trial(problem, told, angle, float(tuned_heights(problem)[0]))
+    recording = Recording.from_arrays(channels, Device("nominal", {"x": nominal}))
+    (problem,) = prepare_filter_inputs(recording, recording.device)  # type: ignore[arg-type]
+    return Trial(problem, nominal, angle, float(tune_torque_noise(problem)[0]))
 
 
 def miscalibrated(axis: Axis, rng: np.random.Generator) -> Axis:
@@ -78,62 +79,64 @@ def miscalibrated(axis: Axis, rng: np.random.Generator) -> Axis:
             comb,
             C0=comb.C0 * off["C0"],
             theta0=comb.theta0 * off["theta0"],
-            theta_th=comb.theta_th + THRESHOLD_ERROR * rng.standard_normal(),
+            theta_th=comb.theta_th + THRESHOLD_SD_RAD * rng.standard_normal(),
         ),
     )
 
 
-def quarters(values: Array) -> list[Array]:
+def segments_of(values: Array) -> list[Array]:
     """The four segments, 20 ms each."""
     return np.array_split(values, len(SEGMENTS))
 
 
-def angle_errors(of: Trial, detector: Detector, full_jacobian: bool, events: bool, tuned: bool = False) -> Array:
+def angle_errors(
+    of: Trial, detector: CrossingDetector, full_jacobian: bool, events: bool, tuned: bool = False
+) -> Array:
     """Error of the estimated angle at every sample, shape (n,) [rad]; ``tuned``: process noise by likelihood."""
-    height = of.tuned_height if tuned else HEIGHT
-    found = run_hybrid(
-        of.problem, of.axis, height, detector, full_jacobian=full_jacobian, events=events, floor=THRESHOLD_ERROR
+    height = of.tuned_height if tuned else PROCESS_NOISE
+    result = run_hybrid(
+        of.problem, of.axis, height, detector, full_jacobian=full_jacobian, events=events, floor=THRESHOLD_SD_RAD
     )
-    return found.theta[0] - of.angle
+    return result.theta[0] - of.angle
 
 
-def after_crossings(of: Trial, detector: Detector) -> NDArray[np.bool_]:
-    """Samples within ``AFTER`` of a detected crossing."""
+def after_crossings(of: Trial, detector: CrossingDetector) -> NDArray[np.bool_]:
+    """Samples within ``SAMPLES_AFTER_CROSSING`` of a detected crossing."""
     mask = np.zeros(of.angle.size, dtype=bool)
-    for at in np.round(crossings(of.problem.signal, detector)).astype(int):
-        mask[at : at + AFTER] = True
+    for at in np.round(find_crossings(of.problem.signal, detector)).astype(int):
+        mask[at : at + SAMPLES_AFTER_CROSSING] = True
     return mask
 
 
-def crossing_errors(of: Trial, detector: Detector) -> list[Array]:
-    """Error of the angle that each detected crossing tells, by segment [rad]: what the filter takes for R_theta,th."""
-    found = crossings(of.problem.signal, detector)
-    true = np.interp(found, np.arange(of.angle.size), of.angle)
-    rate = np.abs(np.interp(found, np.arange(of.angle.size), np.gradient(of.angle, 1 / RATE)))
-    law = crossing_law(sensing_axis(), detector, sensing_axis().resonance, 1 / RATE)
+def crossing_errors(of: Trial, detector: CrossingDetector) -> list[Array]:
+    """Error of the angle of each detected crossing, by segment [rad]; its variance is the filter's R_theta,th."""
+    crossings = find_crossings(of.problem.signal, detector)
+    true = np.interp(crossings, np.arange(of.angle.size), of.angle)
+    rate = np.abs(np.interp(crossings, np.arange(of.angle.size), np.gradient(of.angle, 1 / RATE)))
+    law = calibrate_crossings(sensing_axis(), detector, sensing_axis().resonance, 1 / RATE)
     error = np.interp(rate, law.rates, law.angles) - true
     edges = np.arange(1, len(SEGMENTS)) * of.angle.size / len(SEGMENTS)
-    return np.split(error, np.searchsorted(found, edges))
+    return np.split(error, np.searchsorted(crossings, edges))
 
 
 def table(
     trials: list[Trial], sigma: float | None, full_jacobian: bool, tuned: bool = False
 ) -> dict[str, tuple[list[float], list[float]]]:
-    """RMSE of EKF and HYB [rad]: over the four segments and overall; and the same after crossings."""
+    """RMSE of EKF and HYB [rad]: over the four segments and overall, for all samples and after crossings."""
     out = {}
     for name, events in (("ekf", False), ("hyb", True)):
         parts: list[list[Array]] = [[] for _ in SEGMENTS]
         near: list[list[Array]] = [[] for _ in SEGMENTS]
         for of in trials:
-            detector = detector_for(of.problem, sigma)
+            detector = make_detector(of.problem, sigma)
             error, mask = angle_errors(of, detector, full_jacobian, events, tuned), after_crossings(of, detector)
-            for i, (part, kept) in enumerate(zip(quarters(error), quarters(mask), strict=True)):
+            for i, (part, kept) in enumerate(zip(segments_of(error), segments_of(mask), strict=True)):
                 parts[i].append(part)
                 near[i].append(part[kept])
         columns = []
         for kind in (parts, near):
-            each = [np.concatenate(values) for values in kind]
-            columns.append([rms(values) if values.size else np.nan for values in (*each, np.concatenate(each))])
+            pooled = [np.concatenate(values) for values in kind]
+            columns.append([rms(values) if values.size else np.nan for values in (*pooled, np.concatenate(pooled))])
         out[name] = (columns[0], columns[1])
     return out
 
@@ -150,7 +153,7 @@ SIGMAS = (1.5, 5.0, 10.0, 15.0, 22.0, 30.0, 45.0, 70.0, 96.0, 120.0)
 
 
 def results() -> Results:
-    """Entries of ``results.json``, and figs 7 to 10."""
+    """Entries of ``results.json``; draws figs 7 to 10."""
     trials = [trial(SEED + i) for i in range(TRIALS)]
     reduced, full = table(trials, None, False), table(trials, None, True)
     tuned, printed = table(trials, None, True, True), table(trials, PAPER_SIGMA, False)
@@ -168,16 +171,20 @@ def results() -> Results:
         out[f"sigma15.reduction.{segment}"] = entry(
             PAPER["reduction"][i], 1 - printed["hyb"][0][i] / printed["ekf"][0][i], TRIALS, SEED
         )
-    best = detector_for(trials[0].problem)
-    told = [np.concatenate(parts) for parts in zip(*(crossing_errors(of, best) for of in trials), strict=True)]
+    best = make_detector(trials[0].problem)
+    crossing_angle_errors = [
+        np.concatenate(parts) for parts in zip(*(crossing_errors(of, best) for of in trials), strict=True)
+    ]
     rng = np.random.default_rng(SEED)
-    signals = [quarters(of.problem.signal) for of in trials]
+    signals = [segments_of(of.problem.signal) for of in trials]
     for i, segment in enumerate(SEGMENTS):
         power = float(np.mean([np.var(s[i]) for s in signals])) / 0.0435**2 - 1.0
         out[f"segment.snr.{segment}"] = entry(float(segment[3:]), power, TRIALS, SEED)
-        out[f"fig7.lilliefors_p.{segment}"] = entry(0.05, lilliefors(told[i], rng), told[i].size, SEED)
-    spread = {sigma: [rms(v) for v in by_sigma(trials, sigma)] for sigma in SIGMAS}
-    nrmse = {sigma: normalised(trials[:5], sigma) for sigma in SIGMAS}
+        out[f"fig7.lilliefors_p.{segment}"] = entry(
+            0.05, lilliefors(crossing_angle_errors[i], rng), crossing_angle_errors[i].size, SEED
+        )
+    spread = {sigma: [rms(v) for v in crossing_errors_by_segment(trials, sigma)] for sigma in SIGMAS}
+    nrmse = {sigma: normalised_rmse(trials[:5], sigma) for sigma in SIGMAS}
     for i, segment in enumerate(SEGMENTS):
         out[f"fig10.nrmse_at_sigma_45_over_1.5.{segment}"] = entry(None, nrmse[45.0][i] / nrmse[1.5][i], 5, SEED)
         out[f"fig8.variance_at_sigma_45_over_15.{segment}"] = entry(
@@ -185,27 +192,29 @@ def results() -> Results:
         )
     out["sigma_dog_samples"] = entry(PAPER_SIGMA, SIGMA_CYCLES * RATE / sensing_axis().resonance, 1, 0)
     out["causal.latency_of_hyb_ms"] = entry(None, 1e3 * best.latency / RATE, 1, 0)
-    draw(trials[0], told, spread, nrmse)
+    draw(trials[0], crossing_angle_errors, spread, nrmse)
     return {f"chen2019.{key}": value for key, value in out.items()}
 
 
-def by_sigma(trials: list[Trial], sigma: float) -> list[Array]:
+def crossing_errors_by_segment(trials: list[Trial], sigma: float) -> list[Array]:
     """Crossing-angle errors of all trials in each segment [rad]."""
-    found = [crossing_errors(of, detector_for(of.problem, sigma)) for of in trials]
-    joined = [np.concatenate(parts) for parts in zip(*found, strict=True)]
+    errors = [crossing_errors(of, make_detector(of.problem, sigma)) for of in trials]
+    joined = [np.concatenate(parts) for parts in zip(*errors, strict=True)]
     return [part if part.size else np.array([np.nan]) for part in joined]
 
 
-def normalised(trials: list[Trial], sigma: float) -> list[float]:
+def normalised_rmse(trials: list[Trial], sigma: float) -> list[float]:
     """RMSE of HYB over the segment's mean amplitude (eq 15)."""
-    parts = [quarters(angle_errors(of, detector_for(of.problem, sigma), False, True)) for of in trials]
-    size = [np.sqrt(2.0) * rms(part) for part in quarters(trials[0].angle)]
+    parts = [segments_of(angle_errors(of, make_detector(of.problem, sigma), False, True)) for of in trials]
+    size = [np.sqrt(2.0) * rms(part) for part in segments_of(trials[0].angle)]
     return [rms(np.concatenate([p[i] for p in parts])) / size[i] for i in range(len(SEGMENTS))]
 
 
-def draw(of: Trial, told: list[Array], spread: dict[float, list[float]], nrmse: dict[float, list[float]]) -> None:
+def draw(
+    of: Trial, crossing_angle_errors: list[Array], spread: dict[float, list[float]], nrmse: dict[float, list[float]]
+) -> None:
     with figure("chen2019_fig7", columns=4, size=(10.0, 2.6)) as axes:
-        for drawn, values, segment in zip(axes[0], told, SEGMENTS, strict=True):
+        for drawn, values, segment in zip(axes[0], crossing_angle_errors, SEGMENTS, strict=True):
             drawn.hist(1e3 * values, 30, density=True)
             x = np.linspace(*drawn.get_xlim(), 200)
             sd = 1e3 * values.std()
@@ -218,7 +227,7 @@ def draw(of: Trial, told: list[Array], spread: dict[float, list[float]], nrmse: 
         axes[0, 0].set(xlabel=r"$\sigma_{DOG}$ [samples]", ylabel="variance of the crossing's angle [rad$^2$]")
         axes[0, 1].set(xlabel=r"$\sigma_{DOG}$ [samples]", ylabel="normalised RMSE of HYB")
         axes[0, 0].legend(fontsize=7)
-    detector = detector_for(of.problem)
+    detector = make_detector(of.problem)
     time = 1e3 * np.arange(of.angle.size) / RATE
     with figure("chen2019_fig9", 2, 4, (11.0, 4.6)) as axes:
         for i, segment in enumerate(SEGMENTS):
@@ -228,7 +237,7 @@ def draw(of: Trial, told: list[Array], spread: dict[float, list[float]], nrmse: 
                 estimate = of.angle + angle_errors(of, detector, False, events)
                 axes[0, i].plot(time[cut], estimate[cut], lw=0.8, label=name)
             axes[1, i].plot(time[cut], of.problem.signal[cut], lw=0.4)
-            inside = [p for p in crossings(of.problem.signal, detector) if cut.start <= p < cut.stop]
+            inside = [p for p in find_crossings(of.problem.signal, detector) if cut.start <= p < cut.stop]
             for position in inside:
                 axes[1, i].axvline(1e3 * position / RATE, color="r", lw=0.8)
             axes[0, i].set(title=segment.upper())

@@ -1,8 +1,8 @@
 """wang2019, figs 4 to 10: the sine-UKF on CW1012 (piezoresistive bridge) and on A7M20.1 (transfer function).
 
-Truth is the equation of motion by Runge-Kutta under the drive. The reference (LDV) sees it with its own noise and
-with the low-frequency vibration that the paper names; the sensor chain is late by ``late`` and the periodic error
-that this leaves is the paper's own: sqrt(2) times the deviation that its UKF keeps, over the motion's largest rate.
+Truth is the equation of motion by Runge-Kutta under the drive. The reference (LDV) adds noise and the low-frequency
+vibration that the paper mentions. The sensor chain has a delay. The delay's periodic error is the paper's: sqrt(2)
+times the deviation of its UKF, over the motion's largest rate.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.papers.figures import Results, entry, figure
-from estimation.sine_ukf import delay, noise_and_wander, sine_ukf
-from phantoms.forward import Plan, Start, trajectory
+from estimation.filters.sine_ukf import estimate_delay, measure_noise_and_phase_walk, track_sine_phase
+from phantoms.forward import InitialState, Plan, simulate_trajectory
 from phantoms.waveforms import Sine
+from scanner.arrays import Array
 from scanner.device import Axis, Drive, Mechanics
-from scanner.drift import Drift, settling
-from scanner.trajectory import integrate, thirds
-
-Array = NDArray[np.float64]
+from scanner.drift import Drift, exponential
+from scanner.integrator.nodes import to_nodes
+from scanner.integrator.trajectories import integrate
 
 RATE = 1e6  # the oscilloscope's
 SEED = 2019
@@ -30,7 +29,7 @@ DEG = np.pi / 180
 
 @dataclass(frozen=True)
 class Record:
-    """True angle and what sensor and reference make of it, at the same samples [rad]; the motion's frequency [Hz]."""
+    """True angle, sensor and reference at the same samples [rad]; the motion's frequency [Hz]."""
 
     angle: Array
     sensor: Array
@@ -39,7 +38,7 @@ class Record:
 
 
 def linear_axis(resonance: float, quality: float, name: str = "x") -> Axis:
-    """A mirror with a linear drive of 1 N m / V on unit inertia: the angle under 1 V follows from its response."""
+    """A mirror of unit inertia with a linear drive of 1 N m / V."""
     w = 2 * np.pi * resonance
     return Axis(Mechanics(1.0, w / quality, w * w), drive=Drive("linear", 1.0), name=name)
 
@@ -48,24 +47,24 @@ def driven(axis: Axis, frequency: float, amplitude: float, duration: float, drif
     """Angle at the samples under a sine drive that gives ``amplitude``, settled, and the drive."""
     m = axis.require_mechanics()
     w = 2 * np.pi * frequency
-    answer = 1.0 / (m.k - w * w * m.J + 1j * w * m.b)
+    response = 1.0 / (m.k - w * w * m.J + 1j * w * m.b)
     plan = Plan(
-        {axis.name: Sine(frequency, amplitude / abs(answer))}, duration, RATE, substeps=4, drift={axis.name: drift}
+        {axis.name: Sine(frequency, amplitude / abs(response))}, duration, RATE, substeps=4, drift={axis.name: drift}
     )
-    turn = np.angle(answer)
-    start = Start(amplitude * np.sin(turn), amplitude * w * np.cos(turn))
-    return trajectory(axis, plan, start, 0.0, duration).angle[:-1:4], plan.drives[axis.name]  # type: ignore[return-value]
+    turn = np.angle(response)
+    start = InitialState(amplitude * np.sin(turn), amplitude * w * np.cos(turn))
+    return simulate_trajectory(axis, plan, start, 0.0, duration).angle[:-1:4], plan.drives[axis.name]  # type: ignore[return-value]
 
 
-def later(values: Array, seconds: float) -> Array:
-    """The signal ``seconds`` late, by cubic interpolation."""
+def delayed(values: Array, seconds: float) -> Array:
+    """The signal delayed by ``seconds``, with cubic interpolation."""
     from scipy.interpolate import CubicSpline
 
     n = np.arange(values.size)
     return np.asarray(CubicSpline(n, values)(np.clip(n - seconds * RATE, 0, values.size - 1)))
 
 
-def ldv(angle: Array, noise: float, vibration: float, rng: np.random.Generator) -> Array:
+def measure_by_ldv(angle: Array, noise: float, vibration: float, rng: np.random.Generator) -> Array:
     """The reference: noise [rad] and a building's vibration near 30 Hz [rad]."""
     time = np.arange(angle.size) / RATE
     shake = vibration * np.sin(2 * np.pi * 30.0 * time + rng.uniform(0, 2 * np.pi))
@@ -80,16 +79,14 @@ def cw1012(seed: int, duration: float = 0.05) -> Record:
     from scipy.signal import butter, sosfiltfilt
 
     rng = np.random.default_rng(seed)
-    fast, _ = driven(linear_axis(14510.0, 300.0), 14510.0, 5 * DEG, duration, Drift(stiffness=settling(2e-5, 0.02)))
+    fast, _ = driven(linear_axis(14510.0, 300.0), 14510.0, 5 * DEG, duration, Drift(stiffness=exponential(2e-5, 0.02)))
     slow, _ = driven(linear_axis(1000.0, 30.0, "y"), 200.0, 5 * DEG, duration, Drift())
-    bridge = (
-        later(fast, 14.5e-9) + 0.7 * slow
-    )  # in units of the fast axis's angle; the slow one bends with its own gain
+    bridge = delayed(fast, 14.5e-9) + 0.7 * slow  # in units of the fast axis's angle; the slow axis has another gain
     band = 9e3, 23e3
     white = 0.0151 * DEG * np.sqrt(0.5 * RATE / (band[1] - band[0])) * rng.standard_normal(fast.size)
     sensor = sosfiltfilt(butter(2, band, "bandpass", fs=RATE, output="sos"), bridge + white)
     edge = round(2e-3 * RATE)
-    reference = ldv(fast, 1e-3 * DEG, 0.0, rng)
+    reference = measure_by_ldv(fast, 1e-3 * DEG, 0.0, rng)
     return Record(*(v[edge:-edge] for v in (fast, sensor, reference)), 14510.0)  # type: ignore[arg-type]
 
 
@@ -102,16 +99,16 @@ def a7m20(seed: int, duration: float = 0.3) -> Record:
     """
     rng = np.random.default_rng(seed)
     axis = linear_axis(1300.0, 10.0)
-    angle, drive = driven(axis, 800.0, 1.3 * DEG, duration, Drift(stiffness=settling(1e-4, 0.1)))
+    angle, drive = driven(axis, 800.0, 1.3 * DEG, duration, Drift(stiffness=exponential(1e-4, 0.1)))
     m = axis.require_mechanics()
     half_steps = np.arange(2 * angle.size + 1) / (2 * RATE)
     volt = drive(half_steps - 7.6e-6)
     volt[::2] += 0.48 * drive.amplitude * rng.standard_normal(angle.size + 1)
     volt[1::2] = 0.5 * (volt[:-1:2] + volt[2::2])
-    told = replace(axis, mechanics=replace(m, k=1.004 * m.k))
-    modelled, _ = integrate(told, (angle[0], 0.0), thirds(volt), 1 / RATE)
+    nominal = replace(axis, mechanics=replace(m, k=1.004 * m.k))
+    modelled, _ = integrate(nominal, (angle[0], 0.0), to_nodes(volt), 1 / RATE)
     edge = round(0.02 * RATE)
-    reference = ldv(angle, 2e-3 * DEG, 5e-3 * DEG, rng)
+    reference = measure_by_ldv(angle, 2e-3 * DEG, 5e-3 * DEG, rng)
     return Record(*(v[edge:-1] if v is modelled else v[edge:] for v in (angle, modelled, reference)), 800.0)
 
 
@@ -126,7 +123,7 @@ class Outcome:
 
 
 def outcome(record: Record) -> tuple[Outcome, Array, Array]:
-    """Sensor, UKF, and UKF with the delay and the amplitude that the first half shows against the reference put right.
+    """Errors of the sensor, of the UKF, and of the UKF with delay and amplitude corrected by the first half.
 
     Returns:
         the outcome on the second half, and the errors there of the UKF and of the corrected one [rad].
@@ -135,14 +132,14 @@ def outcome(record: Record) -> tuple[Outcome, Array, Array]:
     turn = 2 * np.pi * record.frequency * np.arange(n) / RATE
     basis = np.stack([np.sin(turn), np.cos(turn)], axis=1)
     half, rest = slice(0, n // 2), slice(n // 2, None)
-    fitted, *_ = np.linalg.lstsq(basis[half], record.sensor[half], rcond=None)
-    amplitude = float(np.hypot(*fitted))
-    noise, wander = noise_and_wander(record.sensor, turn, amplitude, RATE / record.frequency)
-    phase = sine_ukf(record.sensor, turn, amplitude, noise, wander)
+    sensor_fit, *_ = np.linalg.lstsq(basis[half], record.sensor[half], rcond=None)
+    amplitude = float(np.hypot(*sensor_fit))
+    noise, phase_walk = measure_noise_and_phase_walk(record.sensor, turn, amplitude, RATE / record.frequency)
+    phase = track_sine_phase(record.sensor, turn, amplitude, noise, phase_walk)
     estimate = amplitude * np.sin(phase)
-    late = delay(record.reference[half], estimate[half], RATE)
-    shown, *_ = np.linalg.lstsq(basis[half], record.reference[half], rcond=None)
-    corrected = float(np.hypot(*shown)) * np.sin(phase + 2 * np.pi * record.frequency * late)
+    late = estimate_delay(record.reference[half], estimate[half], RATE)
+    reference_fit, *_ = np.linalg.lstsq(basis[half], record.reference[half], rcond=None)
+    corrected = float(np.hypot(*reference_fit)) * np.sin(phase + 2 * np.pi * record.frequency * late)
     errors = [v[rest] - record.angle[rest] for v in (record.sensor, estimate, corrected)]
     variances = [float(np.var(e)) / DEG**2 for e in errors]
     return Outcome(*variances, late), errors[1], errors[2]
@@ -153,12 +150,12 @@ DEVICES = {"cw1012": cw1012, "a7m20": a7m20}
 
 
 def results() -> Results:
-    """Entries of ``results.json``, and figs 7 to 10."""
+    """Entries of ``results.json``; draws figs 7 to 10."""
     out: Results = {}
     for name, make in DEVICES.items():
-        found = [outcome(make(SEED + i))[0] for i in range(TRIALS)]
+        outcomes = [outcome(make(SEED + i))[0] for i in range(TRIALS)]
         before, after, corrected = (
-            float(np.mean([getattr(o, k) for o in found])) for k in ("sensor", "ukf", "corrected")
+            float(np.mean([getattr(o, k) for o in outcomes])) for k in ("sensor", "ukf", "corrected")
         )
         paper = PAPER[name]
         numbers = {
@@ -167,7 +164,7 @@ def results() -> Results:
             "variance_ratio_as_printed": (paper[0] / paper[1], before / after),
             "corrected_variance_deg2": (paper[1], corrected),
             "variance_ratio": (paper[0] / paper[1], before / corrected),
-            "delay_found_us": (None, 1e6 * float(np.mean([o.late for o in found]))),
+            "delay_found_us": (None, 1e6 * float(np.mean([o.late for o in outcomes]))),
         }
         out |= {f"wang2019.{name}.{key}": entry(p, value, TRIALS, SEED) for key, (p, value) in numbers.items()}
         draw(name, make(SEED))

@@ -1,8 +1,8 @@
 """chen2020 Table III, figs 8 and 9: phase and angle of ACM, EKF and UKF over the sustained band.
 
-Truth is the circuit itself on a 40 MHz clock (``phantoms.amdm``), never the estimators' equations. The estimator's
-device differs from the true one by the errors of ``ERRORS``, drawn anew for each trial; every second drive frequency
-is used to identify what the paper identifies (gain, offset, filter phase), the others are scored.
+The truth is the circuit simulated at 40 MHz (``phantoms.amdm``), not the estimators' equations. The estimator's device
+differs from the true one by ``ERRORS``, drawn for each trial. Every second drive frequency serves to identify what the
+paper identifies (gain, offset, filter phase); the others are scored.
 """
 
 from __future__ import annotations
@@ -11,38 +11,43 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.papers.figures import Results, entry, figure
 from benchmarks.papers.phase import demodulated_error_deg, peak_error_deg, rms
-from estimation.filters import PRINTED_TORQUE_NOISE, Problem, prepare, run_compiled
-from estimation.identify import Driven, ReadoutFit, mechanics_from_driven, readout_features, readout_from_driven
-from phantoms.amdm import digitised, recorded
+from estimation.filters.inputs import FilterInput, prepare_filter_inputs
+from estimation.filters.run import PUBLISHED_ACCELERATION_VARIANCE, run_compiled
+from estimation.identification.fits import (
+    DrivenRecord,
+    ReadoutFit,
+    fit_mechanics,
+    fit_readout,
+    readout_features,
+)
+from phantoms.amdm import digitise, record_through_circuit
+from phantoms.circuit import AmdmCircuit, envelope_section, match_gain
 from phantoms.waveforms import Sine
-from scanner.circuit import AmdmCircuit, envelope_section, matched
-from scanner.demodulate import block_length, block_phasors
+from scanner.arrays import Array
 from scanner.device import Axis, Device, Mechanics
 from scanner.devices import load
 from scanner.errors import BadInput
 from scanner.laws import capacitance
+from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
 
-Array = NDArray[np.float64]
-
 RATE = 5e6
-SCORED_FROM = 0.008  # s: twice the mirror's 4 ms, so that the model alone has forgotten where it started
-PSD_NOISE = 2e-4  # rad, of the position detector that calibrates
+SCORED_FROM = 0.008  # s. Twice the mirror's 4 ms, after which the model does not depend on its initial state
+PSD_NOISE = 2e-4  # rad, of the position detector used for calibration
 
-MOVED = 0.002
-"""Stiffness by which the lag-modelled identification is put out again: the resonance has moved since, by 0.1 %."""
+RESONANCE_SHIFT = 0.002
+"""Relative change of stiffness after the lag-modelled identification: a shift of the resonance by 0.1 %."""
 
-FOLLOWING = 1e16
-"""Process noise with which a filter follows its measurement whatever its resonance [(rad/s2)^2]."""
+MEASUREMENT_FOLLOWING_NOISE = 1e16
+"""Process noise with which a filter follows its measurement independently of its resonance [(rad/s2)^2]."""
 
 ERRORS = {"scale": 0.05, "k": 0.002, "b": 0.05, "C0": 0.01, "theta0": 0.01, "lpf_hz": 0.02}
-"""Relative standard deviation of what the estimator is told. ``scale`` is on J, b and k alike: the ringdown fixes their
-ratios and J comes from drawn dimensions. ``k``: the resonance has moved by 0.1 % since, as a few degrees of warming
-do."""
+"""Relative standard deviation of the estimator's nominal values. ``scale`` applies to J, b and k together: a ringdown
+determines their ratios, and J comes from dimensions of the design. ``k``: a shift of the resonance by 0.1 % after the
+calibration, which a few degrees of warming cause."""
 
 
 @dataclass(frozen=True)
@@ -56,17 +61,17 @@ class Scene:
 
 
 def scene(count: int = 15, duration: float = 0.016, low: float = 31400.0, high: float = 31580.0) -> Scene:
-    """The band in which a miscalibrated device keeps moving too; the true one does from 31.26 to 31.68 kHz."""
+    """Recordings over the band of a miscalibrated device; the true one oscillates from 31.26 to 31.68 kHz."""
     axis = load("chen2020-driven").axis("x")
     readout, comb = axis.require_readout(), axis.require_capacitance()
-    circuit = matched(AmdmCircuit(), comb, 0.15, readout.a_cir, readout.b_cir)
+    circuit = match_gain(AmdmCircuit(), comb, 0.15, readout.a_cir, readout.b_cir)
     frequencies = np.linspace(low, high, count)
-    records = [recorded(axis, circuit, Sine(f, 30.0, 30.0), duration) for f in frequencies]
+    records = [record_through_circuit(axis, circuit, Sine(f, 30.0, 30.0), duration) for f in frequencies]
     return Scene(frequencies, records, axis, circuit)
 
 
 def miscalibrated(axis: Axis, rng: np.random.Generator) -> Axis:
-    """The axis as its calibration has it: every value off by a draw of ``ERRORS``."""
+    """The axis with errors of calibration: every value changed by a draw of ``ERRORS``."""
     off = {key: 1.0 + sd * rng.standard_normal() for key, sd in ERRORS.items()}
     m, comb, readout = axis.require_mechanics(), axis.require_capacitance(), axis.require_readout()
     return replace(
@@ -79,35 +84,35 @@ def miscalibrated(axis: Axis, rng: np.random.Generator) -> Axis:
 
 @dataclass(frozen=True)
 class Trial:
-    """One draw: noisy recordings and the device as told."""
+    """One draw: noisy recordings and the nominal axis."""
 
     scene: Scene
     axis: Axis
     senses: Sequence[Array]
-    references: Sequence[Driven]
+    references: Sequence[DrivenRecord]
 
 
 def trial(of: Scene, seed: int) -> Trial:
     rng = np.random.default_rng(seed)
     axis = miscalibrated(of.axis, rng)
     readout = of.axis.require_readout()
-    senses = [digitised(sense, readout.noise_sd, readout.bits, rng) for sense, _, _ in of.records]
+    senses = [digitise(sense, readout.noise_sd, readout.bits, rng) for sense, _, _ in of.records]
     references = [
-        Driven(angle + PSD_NOISE * rng.standard_normal(angle.size), drive, f / 2, RATE)
+        DrivenRecord(angle + PSD_NOISE * rng.standard_normal(angle.size), drive, f / 2, RATE)
         for f, (_, angle, drive) in zip(of.frequencies, of.records, strict=True)
     ]
     return Trial(of, axis, senses, references)
 
 
-def problem_of(axis: Axis, sense: Array, drive: Array, late: float = 0.0) -> Problem:
-    """A filter's problem; the sense signal is ``late`` [s] against the drive and is put back by so much."""
+def filter_input(axis: Axis, sense: Array, drive: Array, late: float = 0.0) -> FilterInput:
+    """A filter's input. The sense signal's delay ``late`` [s] against the drive is removed."""
     first = int(np.ceil(max(late, 0.0) * RATE))
     channels = {
         "sense_x": (sense[first:], "V", RATE, first / RATE - late),
         "drive_x": (drive, "V", RATE, 0.0),
     }
-    recording = Recording.from_arrays(channels, Device("told", {"x": axis}))
-    (problem,) = prepare(recording, recording.device)
+    recording = Recording.from_arrays(channels, Device("nominal", {"x": axis}))
+    (problem,) = prepare_filter_inputs(recording, recording.device)
     return replace(problem, model=replace(problem.model, offset=axis.require_readout().b_cir))
 
 
@@ -123,15 +128,15 @@ def constant_phase(of: Trial, half: Sequence[int]) -> tuple[Axis, float]:
         f = of.scene.frequencies[i]
         block = block_length(f, RATE, 40.0)
         C = capacitance(of.references[i].angle, comb.C0, comb.Cb, comb.theta0, comb.theta_th)
-        seen, true = (block_phasors(v, RATE, 0.0, f, block)[1] for v in (-of.senses[i], C))
-        delays.append(-np.angle(np.sum(seen * true.conj())) / (2 * np.pi * f))
+        observed, true = (block_phasors(v, RATE, 0.0, f, block)[1] for v in (-of.senses[i], C))
+        delays.append(-np.angle(np.sum(observed * true.conj())) / (2 * np.pi * f))
     late = float(np.mean(delays))
     shift = late * RATE
     shifted = [
         replace(r, angle=np.interp(np.arange(r.angle.size) - shift, np.arange(r.angle.size), r.angle))
         for r in of.references
     ]
-    fit = readout_from_driven(comb, [shifted[i] for i in half], [of.senses[i] for i in half], (), ("a_cir", "b_cir"))
+    fit = fit_readout(comb, [shifted[i] for i in half], [of.senses[i] for i in half], (), ("a_cir", "b_cir"))
     return with_readout(of.axis, fit, ()), late
 
 
@@ -140,16 +145,16 @@ def with_readout(axis: Axis, fit: ReadoutFit, sections: tuple[float, ...]) -> Ax
     return replace(axis, readout=replace(axis.require_readout(), lpf_hz=sections, **values))
 
 
-def euler(problem: Problem, axis: Axis) -> Problem:
-    """The printed first-order step (eq 10): its flow I + A Ts feeds in energy at w^2 Ts / 2."""
+def with_euler_step(problem: FilterInput, axis: Axis) -> FilterInput:
+    """The first-order step as printed (eq 10). Its transition I + A Ts adds energy at the rate w^2 Ts / 2."""
     m, h = axis.require_mechanics(), problem.model.step
     parameters = problem.model.parameters.copy()
     parameters[0, :4] = 1.0, h, -h * m.k / m.J, 1.0 - h * m.b / m.J
     return replace(problem, model=replace(problem.model, parameters=parameters))
 
 
-def theta(problem: Problem, method: str, height: float) -> Array:
-    """The filter's angle at the recording's own samples, from its first on; empty where the filter breaks down."""
+def filtered_angle(problem: FilterInput, method: str, height: float) -> Array:
+    """The filter's angle at the recording's samples; empty where the filter fails."""
     try:
         result = run_compiled(
             problem, "ekf" if method == "acm" else method, np.array([height]), measured=method != "acm"
@@ -162,7 +167,7 @@ def theta(problem: Problem, method: str, height: float) -> Array:
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of one estimate at one drive frequency, [deg] all."""
+    """Errors of one estimate at one drive frequency [deg]."""
 
     peak: Array
     demodulated: Array
@@ -170,16 +175,16 @@ class Score:
 
     @classmethod
     def of(cls, estimate: Array, truth: Array, f: float) -> Score:
-        """Against the truth, from ``SCORED_FROM`` on; the sign, which the comb cannot know, is given."""
+        """The errors after ``SCORED_FROM``. A symmetric comb cannot determine the sign: it is the truth's."""
         first = round(SCORED_FROM * RATE)
-        found, true = estimate[first:], truth[first : estimate.size]
-        if found.size == 0 or np.abs(found).max() < 0.2 * np.abs(true).max():
-            return cls(np.array([90.0]), np.array([90.0]), float(np.rad2deg(rms(truth))))  # no motion, no phase
-        found = found * np.sign(found @ true)
+        estimated, true = estimate[first:], truth[first : estimate.size]
+        if estimated.size == 0 or np.abs(estimated).max() < 0.2 * np.abs(true).max():
+            return cls(np.array([90.0]), np.array([90.0]), float(np.rad2deg(rms(truth))))  # no motion has no phase
+        estimated = estimated * np.sign(estimated @ true)
         return cls(
-            peak_error_deg(found, true, RATE, f),
-            demodulated_error_deg(found, true, RATE, f),
-            float(np.rad2deg(rms(found - true))),
+            peak_error_deg(estimated, true, RATE, f),
+            demodulated_error_deg(estimated, true, RATE, f),
+            float(np.rad2deg(rms(estimated - true))),
         )
 
 
@@ -187,12 +192,15 @@ Scores = dict[str, list[Score]]
 HEIGHTS = 10.0 ** np.arange(11, 17)
 
 
-def tuned(problems: Mapping[int, Problem], references: Sequence[Driven], frequencies: Array) -> float:
-    """The process noise, to a decade, with the least phase error on the half that identifies: tuning by hand."""
+def tune_process_noise(
+    problems: Mapping[int, FilterInput], references: Sequence[DrivenRecord], frequencies: Array
+) -> float:
+    """The process noise, to a decade, with the least phase error at the identification frequencies."""
 
     def error(height: float) -> float:
         scores = [
-            Score.of(theta(p, "ekf", height), references[i].angle, frequencies[i] / 2) for i, p in problems.items()
+            Score.of(filtered_angle(p, "ekf", height), references[i].angle, frequencies[i] / 2)
+            for i, p in problems.items()
         ]
         return rms(np.concatenate([s.peak for s in scores]))
 
@@ -200,45 +208,47 @@ def tuned(problems: Mapping[int, Problem], references: Sequence[Driven], frequen
 
 
 def run_trial(of: Trial) -> tuple[Scores, dict[str, float]]:
-    """All estimators on the scored half, after identification on the other; and the process noise each was tuned to."""
+    """Scores of all estimators after identification at the other frequencies, and the tuned process noises."""
     scene, count = of.scene, len(of.scene.frequencies)
     identifying, scored = range(0, count, 2), range(1, count, 2)
     constant, late = constant_phase(of, identifying)
     modelled, linearise = lag_modelled(of, identifying)
 
-    def problems(axis: Axis, half: Sequence[int], late: float = 0.0, linear: bool = False) -> dict[int, Problem]:
+    def problems(axis: Axis, half: Sequence[int], late: float = 0.0, linear: bool = False) -> dict[int, FilterInput]:
         made = {}
         for i in half:
             drive = of.references[i].voltage
-            made[i] = problem_of(axis, of.senses[i], drive, late)
+            made[i] = filter_input(axis, of.senses[i], drive, late)
             if linear:
-                first = theta(made[i], "ekf", FOLLOWING)
-                made[i] = problem_of(axis, linearise(of.senses[i], first, drive), drive)
+                first = filtered_angle(made[i], "ekf", MEASUREMENT_FOLLOWING_NOISE)
+                made[i] = filter_input(axis, linearise(of.senses[i], first, drive), drive)
         return made
 
     few = identifying[::3]
     heights = {
-        "constant": tuned(problems(constant, few, late), of.references, scene.frequencies),
-        "lag": tuned(problems(modelled, few, linear=True), of.references, scene.frequencies),
+        "constant": tune_process_noise(problems(constant, few, late), of.references, scene.frequencies),
+        "lag": tune_process_noise(problems(modelled, few, linear=True), of.references, scene.frequencies),
     }
-    told, paper = problems(of.axis, scored), problems(constant, scored, late)
+    nominal, paper = problems(of.axis, scored), problems(constant, scored, late)
     ours = problems(modelled, scored, linear=True)
     m = modelled.require_mechanics()
-    stale = replace(modelled, mechanics=replace(m, k=m.k * (1.0 + MOVED)))
-    printed = {i: euler(p, constant) for i, p in paper.items()}
+    shifted = replace(modelled, mechanics=replace(m, k=m.k * (1.0 + RESONANCE_SHIFT)))
+    printed = {i: with_euler_step(p, constant) for i, p in paper.items()}
     variants = {
-        "acm": (told, "acm", PRINTED_TORQUE_NOISE),
+        "acm": (nominal, "acm", PUBLISHED_ACCELERATION_VARIANCE),
         "ekf": (paper, "ekf", heights["constant"]),
         "ukf": (paper, "ukf", heights["constant"]),
-        "ekf_printed_noise": (paper, "ekf", PRINTED_TORQUE_NOISE),
-        "ukf_printed_noise": (paper, "ukf", PRINTED_TORQUE_NOISE),
-        "ekf_euler": (printed, "ekf", PRINTED_TORQUE_NOISE),
+        "ekf_printed_noise": (paper, "ekf", PUBLISHED_ACCELERATION_VARIANCE),
+        "ukf_printed_noise": (paper, "ukf", PUBLISHED_ACCELERATION_VARIANCE),
+        "ekf_euler": (printed, "ekf", PUBLISHED_ACCELERATION_VARIANCE),
         "lag_ekf": (ours, "ekf", heights["lag"]),
         "lag_ukf": (ours, "ukf", heights["lag"]),
-        "lag_moved": (problems(stale, scored, linear=True), "ukf", FOLLOWING),
+        "lag_moved": (problems(shifted, scored, linear=True), "ukf", MEASUREMENT_FOLLOWING_NOISE),
     }
     scores = {
-        name: [Score.of(theta(ps[i], method, q), scene.records[i][1], scene.frequencies[i] / 2) for i in scored]
+        name: [
+            Score.of(filtered_angle(ps[i], method, q), scene.records[i][1], scene.frequencies[i] / 2) for i in scored
+        ]
         for name, (ps, method, q) in variants.items()
     }
     return scores, heights
@@ -249,16 +259,16 @@ def lag_modelled(of: Trial, half: Sequence[int]) -> tuple[Axis, Callable[[Array,
     feedthrough.
 
     Returns:
-        the axis as identified, and what turns a sense signal, a first estimate of the angle and the drive into the
-        signal that the formula a_cir C + b_cir would have given at that angle.
+        the identified axis, and a function of sense signal, first estimate of the angle and drive that returns the
+        signal of the formula a_cir C + b_cir at that angle.
     """
     comb = of.axis.require_capacitance()
     sections = (*of.axis.require_readout().lpf_hz, envelope_section(AmdmCircuit()))
     records, senses = [of.references[i] for i in half], [of.senses[i] for i in half]
-    mechanics = mechanics_from_driven(of.axis, records)
-    full = readout_from_driven(comb, records, senses, sections)
-    line = readout_from_driven(comb, records, senses, sections, ("a_cir", "b_cir"))
-    axis = replace(of.axis, mechanics=Mechanics(**{key: found.value for key, found in mechanics.items()}))
+    mechanics = fit_mechanics(of.axis, records)
+    full = fit_readout(comb, records, senses, sections)
+    line = fit_readout(comb, records, senses, sections, ("a_cir", "b_cir"))
+    axis = replace(of.axis, mechanics=Mechanics(**{key: estimated.value for key, estimated in mechanics.items()}))
 
     def linearised(sense: Array, angle: Array, drive: Array) -> Array:
         features = readout_features(comb, angle, drive, RATE, sections)
@@ -289,10 +299,12 @@ class Table:
 
 def run(trials: int, seed: int, count: int = 15, duration: float = 0.016) -> Table:
     of = scene(count, duration)
-    done = [run_trial(trial(of, seed + i)) for i in range(trials)]
-    names = done[0][0]
+    outcomes = [run_trial(trial(of, seed + i)) for i in range(trials)]
+    names = outcomes[0][0]
     return Table(
-        of.frequencies[1::2], {name: [scores[name] for scores, _ in done] for name in names}, [h for _, h in done]
+        of.frequencies[1::2],
+        {name: [scores[name] for scores, _ in outcomes] for name in names},
+        [h for _, h in outcomes],
     )
 
 
@@ -301,16 +313,20 @@ TRIALS, SEED = 12, 2020
 
 
 def results() -> Results:
-    """Entries of ``results.json``, and the paper's figs 8 and 9."""
+    """Entries of ``results.json``; draws the paper's figs 8 and 9."""
     table = run(TRIALS, SEED)
     draw_signals(trial(scene(3), SEED))
     out: Results = {}
     for name, (phase, angle) in PAPER.items():
         for what, paper in (("peak", phase), ("angle", angle)):
-            each = table.per_trial(name, what)
+            per_trial = table.per_trial(name, what)
             key = "phase_rmse_deg" if what == "peak" else "angle_rmse_deg"
-            spread = {"median": float(np.median(each)), "sd": float(each.std()), "max": float(each.max())}
-            out[f"chen2020.table3.{name}.{key}"] = entry(paper, rms(each), TRIALS, SEED, spread_over_draws=spread)
+            spread = {
+                "median": float(np.median(per_trial)),
+                "sd": float(per_trial.std()),
+                "max": float(per_trial.max()),
+            }
+            out[f"chen2020.table3.{name}.{key}"] = entry(paper, rms(per_trial), TRIALS, SEED, spread_over_draws=spread)
         demodulated = table.per_trial(name, "demodulated")
         out[f"chen2020.table3.{name}.demodulated_phase_rmse_deg"] = entry(phase, rms(demodulated), TRIALS, SEED)
     for name in ("ekf", "ukf"):
@@ -326,13 +342,13 @@ def results() -> Results:
         out[f"chen2020.variant.{name}.phase_rmse_deg"] = entry(phase, rms(table.per_trial(name, "peak")), TRIALS, SEED)
     for name in ("lag_ekf", "lag_ukf"):
         for what, key in (("peak", "peak_phase"), ("demodulated", "phase"), ("angle", "angle")):
-            each = table.per_trial(name, what)
+            per_trial = table.per_trial(name, what)
             out[f"chen2020.lag_modelled.{name[4:]}.{key}_rmse_deg"] = entry(
-                PAPER["ukf"][what == "angle"], rms(each), TRIALS, SEED, worst_draw=float(each.max())
+                PAPER["ukf"][what == "angle"], rms(per_trial), TRIALS, SEED, worst_draw=float(per_trial.max())
             )
     for what, key in (("demodulated", "phase"), ("angle", "angle")):
-        moved = table.per_trial("lag_moved", what)
-        out[f"chen2020.lag_modelled.resonance_moved.{key}_rmse_deg"] = entry(None, rms(moved), TRIALS, SEED)
+        shifted_resonance = table.per_trial("lag_moved", what)
+        out[f"chen2020.lag_modelled.resonance_moved.{key}_rmse_deg"] = entry(None, rms(shifted_resonance), TRIALS, SEED)
     both = out["chen2020.lag_modelled.ukf.phase_rmse_deg"], out["chen2020.lag_modelled.ukf.peak_phase_rmse_deg"]
     out["chen2020.lag_modelled.phase_rmse_deg"] = max(both, key=lambda e: e["ours"])
     draw(table)
@@ -345,9 +361,9 @@ def draw_signals(of: Trial) -> None:
     sense, drive, true = of.senses[middle], of.references[middle].voltage, of.scene.records[middle][1]
     paper, late = constant_phase(of, range(0, len(of.senses), 2))
     shown = {
-        "ACM": theta(problem_of(of.axis, sense, drive), "acm", PRINTED_TORQUE_NOISE),
-        "EKF": theta(problem_of(paper, sense, drive, late), "ekf", 1e14),
-        "UKF": theta(problem_of(paper, sense, drive, late), "ukf", 1e14),
+        "ACM": filtered_angle(filter_input(of.axis, sense, drive), "acm", PUBLISHED_ACCELERATION_VARIANCE),
+        "EKF": filtered_angle(filter_input(paper, sense, drive, late), "ekf", 1e14),
+        "UKF": filtered_angle(filter_input(paper, sense, drive, late), "ukf", 1e14),
     }
     cut = slice(round(SCORED_FROM * RATE), round(SCORED_FROM * RATE) + 640)
     time = 1e6 * np.arange(640) / RATE
@@ -355,9 +371,9 @@ def draw_signals(of: Trial) -> None:
         axes[0, 0].plot(time, drive[cut])
         axes[0, 0].set(ylabel="drive [V]")
         axes[1, 0].plot(time, np.rad2deg(true[cut]), "k", label="true")
-        for name, found in shown.items():
-            turned = found[cut] * np.sign(found[cut] @ true[cut])
-            axes[1, 0].plot(time, np.rad2deg(turned), lw=0.8, label=name)
+        for name, estimated in shown.items():
+            signed = estimated[cut] * np.sign(estimated[cut] @ true[cut])
+            axes[1, 0].plot(time, np.rad2deg(signed), lw=0.8, label=name)
         axes[1, 0].set(xlabel="time [us]", ylabel="angle [deg]")
         axes[1, 0].legend(fontsize=7)
 

@@ -1,4 +1,4 @@
-"""What a blur study varies: its file, and the cells that follow from it. docs/studies.md describes the file."""
+"""Plan of a blur study: its file (docs/reference/study.md), and the jobs and cells that follow from it."""
 
 from __future__ import annotations
 
@@ -11,24 +11,30 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from estimation.estimate import ESTIMATORS
+from estimation.estimators import estimators
+from estimation.estimators import registered as registered_estimators
 from phantoms.experiment import device_named
 from phantoms.targets import TARGETS, TISSUES
 from scanner.device import Device
 from scanner.device_toml import FINITE, NOT_NEGATIVE, POSITIVE, WHOLE, check_values, checked_number
 from scanner.errors import BadInput
 from scanner.files import read_toml
-from scanner.terms import registered
+from scanner.terms import registered as registered_terms
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What all recordings of a study share; the attributes are those of ``phantoms.experiment.Experiment``.
+    """Conditions that all recordings of a study share, as in ``phantoms.experiment.Experiment``.
 
     Attributes:
-        photons: a sample at full brightness.
+        duration: [s].
+        sample_rate: [Hz].
+        drift_tau: time constant of the drift [s].
+        field_um: width of the field on the sample [um].
+        spot_um: standard deviation of the beam's spot [um].
+        photons: per sample at full brightness.
     """
 
     duration: float = field(default=0.02, metadata=POSITIVE)
@@ -43,11 +49,12 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class Design:
-    """A way to scan.
+class StudyDesign:
+    """A device and its drives.
 
     Attributes:
-        device: as TOML text, so that a worker elsewhere needs no file.
+        name: of the design.
+        device: as TOML text, so that a worker on another machine needs no file.
         drive_x, drive_y: frequency [Hz], amplitude [V], offset [V].
     """
 
@@ -59,18 +66,21 @@ class Design:
 
 @dataclass(frozen=True)
 class Study:
-    """A study: every phantom under every design, drift and sense noise, seen by every estimator at every resolution.
+    """A study: every phantom under every design, drift and sense noise, with every estimator at every resolution.
 
     Attributes:
-        drifts: relative changes of both stiffnesses in the end.
-        snr_db: sense signal over its noise, rms to rms [dB]; empty keeps the device's own noise.
-        pixels: of the picture, along both sides.
-        p: pixels of shift tolerated.
-        seeds: recordings of each world, with the seeds 0, 1, ...
+        name: of the study.
+        designs, phantoms, estimators: by name, or files of phantoms.
+        drifts: final relative changes of both stiffnesses.
+        snr_db: rms of the sense signal over rms of its noise [dB]; empty uses the noise of the device.
+        pixels: of the picture along both sides.
+        p: tolerated displacements [px].
+        seeds: number of recordings of each scenario, with the seeds 0, 1, ...
+        recording: conditions of all recordings.
     """
 
     name: str
-    designs: tuple[Design, ...]
+    designs: tuple[StudyDesign, ...]
     phantoms: tuple[str, ...]
     estimators: tuple[str, ...]
     drifts: tuple[float, ...] = field(default=(-0.002,), metadata=FINITE)
@@ -86,8 +96,8 @@ class Study:
             if not getattr(self, name):
                 raise BadInput("is empty", channel=name, hint="list at least one")
         for name in self.estimators:
-            if name not in ESTIMATORS:
-                known = ", ".join(ESTIMATORS)
+            if name not in estimators():
+                known = ", ".join(estimators())
                 raise BadInput(f"no estimator is named {name!r}", channel="estimators", hint=f"there are {known}")
         for name in self.phantoms:
             if name not in TARGETS and name not in TISSUES and not Path(name).is_file():
@@ -100,11 +110,11 @@ class Study:
 
 
 @dataclass(frozen=True)
-class World:
-    """One simulated recording."""
+class Scenario:
+    """Parameters of one simulated recording."""
 
     phantom: str
-    design: Design
+    design: StudyDesign
     drift: float
     snr_db: float | None
     seed: int
@@ -113,110 +123,116 @@ class World:
 
 @dataclass(frozen=True)
 class Job:
-    """A recording and the ways to reconstruct it that are still to be done.
+    """A scenario and the reconstructions of it that are still to be done.
 
     Attributes:
-        ways: estimator and pixels.
-        p: pixels tolerated, each a cell.
-        of: digest of what the names in a cell stand for.
+        scenario: the recording.
+        variants: estimator and pixels of each reconstruction.
+        p: tolerated displacements [px]; each is a cell of its own.
+        digest: of everything that the names in a cell stand for.
     """
 
-    world: World
-    ways: tuple[tuple[str, int], ...]
+    scenario: Scenario
+    variants: tuple[tuple[str, int], ...]
     p: tuple[float, ...]
-    of: str
+    digest: str
 
-    def cell(self, way: tuple[str, int], p: float) -> dict[str, Any]:
-        """What stands for one cell in the journal."""
-        world = self.world
+    def cell(self, variant: tuple[str, int], p: float) -> dict[str, Any]:
+        """Return the parameters of one cell, as the journal stores them."""
+        scenario = self.scenario
         return {
-            "phantom": world.phantom,
-            "design": world.design.name,
-            "drift": world.drift,
-            "snr_db": world.snr_db,
-            "estimator": way[0],
-            "pixels": way[1],
+            "phantom": scenario.phantom,
+            "design": scenario.design.name,
+            "drift": scenario.drift,
+            "snr_db": scenario.snr_db,
+            "estimator": variant[0],
+            "pixels": variant[1],
             "p": p,
-            "seed": world.seed,
-            "of": self.of,
+            "seed": scenario.seed,
+            "of": self.digest,
         }
 
     def cells(self) -> Iterator[dict[str, Any]]:
-        """All cells of the job."""
-        return (self.cell(way, p) for way, p in product(self.ways, self.p))
+        """Yield all cells of the job."""
+        return (self.cell(variant, p) for variant, p in product(self.variants, self.p))
 
 
-def key(cell: Mapping[str, Any]) -> str:
-    """A cell as text that is equal for equal cells."""
+def cell_key(cell: Mapping[str, Any]) -> str:
+    """Return a text that is equal for equal cells."""
     return json.dumps(cell, sort_keys=True)
 
 
-def jobs(study: Study) -> Iterator[Job]:
-    """All jobs, seed by seed, so that a study that is stopped early has seen every world."""
+def plan_jobs(study: Study) -> Iterator[Job]:
+    """Yield all jobs, seed by seed, so that a study that is stopped early covers every scenario."""
     digests = {
         (phantom, design.name): _digest(phantom, design, study.recording)
         for phantom, design in product(study.phantoms, study.designs)
     }
-    ways = tuple(product(study.estimators, study.pixels))
-    worlds = product(range(study.seeds), study.phantoms, study.designs, study.drifts, study.snr_db or (None,))
-    for seed, phantom, design, drift, snr in worlds:
-        world = World(phantom, design, drift, snr, seed, study.recording)
-        yield Job(world, ways, study.p, digests[phantom, design.name])
+    variants = tuple(product(study.estimators, study.pixels))
+    scenarios = product(range(study.seeds), study.phantoms, study.designs, study.drifts, study.snr_db or (None,))
+    for seed, phantom, design, drift, snr in scenarios:
+        scenario = Scenario(phantom, design, drift, snr, seed, study.recording)
+        yield Job(scenario, variants, study.p, digests[phantom, design.name])
 
 
-def remaining(all_jobs: Iterable[Job], done: Mapping[str, Any]) -> list[Job]:
-    """The jobs without the ways all of whose cells are in ``done``, by ``key``."""
+def remaining_jobs(all_jobs: Iterable[Job], done: Mapping[str, Any]) -> list[Job]:
+    """Return the jobs without the variants whose cells are all in ``done``, a mapping by ``cell_key``."""
     left = []
     for job in all_jobs:
-        ways = tuple(way for way in job.ways if any(key(job.cell(way, p)) not in done for p in job.p))
-        if ways:
-            left.append(Job(job.world, ways, job.p, job.of))
+        variants = tuple(
+            variant for variant in job.variants if any(cell_key(job.cell(variant, p)) not in done for p in job.p)
+        )
+        if variants:
+            left.append(Job(job.scenario, variants, job.p, job.digest))
     return left
 
 
 def read_study(path: Path) -> Study:
-    """The study in a TOML file.
+    """Read a study from a TOML file.
 
     Raises:
-        BadInput: the file cannot be read, or a key is missing, unknown or holds what it cannot.
+        BadInput: the file cannot be read, or a key is missing, unknown or has an invalid value.
     """
     table = read_toml(path)
     try:
-        conditions = _made(Conditions, table.pop("recording", {}), "recording")
+        conditions = _build(Conditions, table.pop("recording", {}), "recording")
         listed = table.pop("designs", [])
         if not isinstance(listed, list):
             raise BadInput("must be a list of tables", channel="designs", hint="write [[designs]]")
-        designs = tuple(_design(each, path.parent) for each in listed)
-        return _made(Study, _texts(table) | {"recording": conditions, "designs": designs}, "")
+        designs = tuple(_read_design(each, path.parent) for each in listed)
+        return _build(Study, _check_texts(table) | {"recording": conditions, "designs": designs}, "")
     except BadInput as error:
         where = f"{path}: {error.file}" if error.file else path
         raise BadInput(error.what, file=where, channel=error.channel, hint=error.hint) from None
 
 
-def _made(cls: type[T], table: object, where: str) -> T:
-    known = [each.name for each in fields(cls)]  # type: ignore[arg-type]
-    needed = [each.name for each in fields(cls) if each.default is MISSING and each.default_factory is MISSING]  # type: ignore[arg-type]
+def _build(cls: type[T], table: object, where: str) -> T:
+    """An instance of a dataclass from a table; ``where`` is the table's dotted key for messages."""
+    known = [attribute.name for attribute in fields(cls)]  # type: ignore[arg-type]
+    needed = [a.name for a in fields(cls) if a.default is MISSING and a.default_factory is MISSING]  # type: ignore[arg-type]
     if not isinstance(table, Mapping):
         raise BadInput("must be a table", channel=where, hint=f"write [{where}]")
     for name in table:
         if name not in known:
-            raise BadInput("is no key of a study", channel=_key(where, name), hint=f"there are {', '.join(known)}")
+            raise BadInput(
+                "is no key of a study", channel=_dotted_key(where, name), hint=f"there are {', '.join(known)}"
+            )
     for name in needed:
         if name not in table:
-            raise BadInput("is missing", channel=_key(where, name), hint=f"needed are {', '.join(needed)}")
+            raise BadInput("is missing", channel=_dotted_key(where, name), hint=f"needed are {', '.join(needed)}")
     try:
         return cls(**table)
     except BadInput as error:
-        channel = _key(where, error.channel or "") or None
+        channel = _dotted_key(where, error.channel or "") or None
         raise BadInput(error.what, file=error.file, channel=channel, hint=error.hint) from None
 
 
-def _key(where: str, name: str) -> str:
+def _dotted_key(where: str, name: str) -> str:
     return ".".join(part for part in (where, name) if part)
 
 
-def _texts(table: Mapping[str, Any]) -> dict[str, Any]:
-    """The table with its lists of names checked."""
+def _check_texts(table: Mapping[str, Any]) -> dict[str, Any]:
+    """The table, after a check of its names and lists of names."""
     out = dict(table)
     for name in ("phantoms", "estimators"):
         value = out.get(name, [])
@@ -229,21 +245,23 @@ def _texts(table: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _design(table: object, folder: Path) -> Design:
-    """A design; its device is a named one or a file, relative to the study's own."""
-    made = _made(Design, table, "designs")
+def _read_design(table: object, folder: Path) -> StudyDesign:
+    """A design. Its device is a name or a file, relative to the folder of the study."""
+    design = _build(StudyDesign, table, "designs")
     for name in ("name", "device"):
-        if not isinstance(getattr(made, name), str):
-            raise BadInput(f"is {getattr(made, name)!r} and must be text", channel=f"designs.{name}")
-    beside = folder / made.device
-    device = Device.load(beside) if beside.is_file() else device_named(made.device)
+        if not isinstance(getattr(design, name), str):
+            raise BadInput(f"is {getattr(design, name)!r} and must be text", channel=f"designs.{name}")
+    beside = folder / design.device
+    device = Device.load(beside) if beside.is_file() else device_named(design.device)
     device.require_scan()
     for name in ("x", "y"):
         device.axis(name)
-    return Design(made.name, device.to_toml(), _drive(made.drive_x, "drive_x"), _drive(made.drive_y, "drive_y"))
+    return StudyDesign(
+        design.name, device.to_toml(), _read_drive(design.drive_x, "drive_x"), _read_drive(design.drive_y, "drive_y")
+    )
 
 
-def _drive(value: object, name: str) -> tuple[float, float, float]:
+def _read_drive(value: object, name: str) -> tuple[float, float, float]:
     channel = f"designs.{name}"
     if not isinstance(value, list) or len(value) != 3:
         hint = "give frequency, amplitude, offset, as [27680.0, 30.0, 30.0]"
@@ -255,10 +273,10 @@ def _drive(value: object, name: str) -> tuple[float, float, float]:
     return frequency, amplitude, offset
 
 
-def _digest(phantom: str, design: Design, recording: Conditions) -> str:
-    """Of all that decides a result besides the cell's own numbers: another device, picture, term file or version."""
+def _digest(phantom: str, design: StudyDesign, recording: Conditions) -> str:
+    """Digest of what determines a result besides the numbers of the cell: device, picture, terms, version."""
     picture = Path(phantom)
     bytes_of = hashlib.sha256(picture.read_bytes()).hexdigest() if picture.is_file() else phantom
-    own_terms = [path.read_text(encoding="utf-8") for path in registered()]
-    told = json.dumps([version("lissajous"), bytes_of, asdict(design), asdict(recording), *own_terms], sort_keys=True)
-    return hashlib.sha256(told.encode()).hexdigest()[:16]
+    user_files = [path.read_text(encoding="utf-8") for path in (*registered_terms(), *registered_estimators())]
+    text = json.dumps([version("lissajous"), bytes_of, asdict(design), asdict(recording), *user_files], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

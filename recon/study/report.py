@@ -1,4 +1,4 @@
-"""The report of a study: blur against phase error, where the bound holds, estimator against estimator."""
+"""The report of a study: blur over phase error, where the bound p/m is satisfied, estimators compared."""
 
 from __future__ import annotations
 
@@ -9,25 +9,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import blur, views
+from recon.imaging import blur
 from recon.pipeline import AXES
-from recon.report import Figure, Section, Table, render
+from recon.report.conclusions import conclude_study
+from recon.report.figures import COLOURS, figure_uri, new_figure, use_plain_ticks
+from recon.report.page import Figure, Section, Table, render
 from recon.study.plan import Study
 from recon.study.table import Columns
+from scanner.arrays import Array
 
-Array = NDArray[np.float64]
+MARKERS = "o+^xs"
+"""Markers of the phantoms, repeated if there are more."""
 
-SIGNS = "o+^xs"
-LEAST_DEG = 1e-4  # phase errors below are drawn here: an error of 0 has no place on a logarithmic axis
+MIN_PHASE_ERROR_DEG = 1e-4
+"""Phase errors below this are drawn here: zero has no place on a logarithmic axis."""
 
 
 def study_report(study: Study, data: Columns, summary: Mapping[str, Any]) -> str:
     """The page.
 
     Args:
-        data: the study's table as columns (``recon.study.table.columns``).
+        data: the study's table as columns (``recon.study.table.table_columns``).
     """
-    lead = (
+    subject = (
         f"Phantoms {len(study.phantoms)}, scan designs {len(study.designs)}, drifts {len(study.drifts)}, noise levels "
         f"{max(1, len(study.snr_db))}, seeds {study.seeds}, estimators {len(study.estimators)}, resolutions "
         f"{len(study.pixels)}, values of p {len(study.p)}: {summary['cells']} cells, {summary['failed']} failed."
@@ -38,17 +42,17 @@ def study_report(study: Study, data: Columns, summary: Mapping[str, Any]) -> str
     if worked["seed"].size:
         maps = [_bound_map(study, worked, design.name) for design in study.designs]
         sections += [
-            Section("Blur against phase error", BLUR_TEXT, figures=[_blur_figure(study, worked)], least="40rem"),
-            Section("Where the bound holds", MAP_TEXT, figures=maps, least="40rem"),
+            Section("Blur over phase error", BLUR_TEXT, figures=[_blur_figure(study, worked)], least="40rem"),
+            Section("Where the bound is satisfied", MAP_TEXT, figures=maps, least="40rem"),
             Section(
-                "Estimator against estimator",
-                RIVALS_TEXT,
-                _rivals(study, worked),
+                "Estimators compared",
+                COMPARISON_TEXT,
+                _win_table(study, worked),
                 [_error_figure(study, worked)],
-                "40rem",
+                "24rem",
             ),
         ]
-    return render(study.name, lead, sections, notes)
+    return render(study.name, conclude_study(summary), sections, notes, subject)
 
 
 ESTIMATORS_TEXT = (
@@ -56,59 +60,62 @@ ESTIMATORS_TEXT = (
     "noiseless scene, in units of the scene's contrast."
 )
 BLUR_TEXT = (
-    "Above, the phase's share of the blur; a phase error δφ moves a sample by m δφ cos α pixels, rms m δφ/√2 (line). "
-    "Below, the picture's own error, which knows nothing of that law, against the phase error rms over both axes; each "
-    "phantom has its own sign. Dashed: the bound p/m."
+    "Top: blur by the phase error; δφ displaces a sample by m δφ cos α pixels, rms m δφ/√2 (line). Bottom: rms error "
+    "of the picture, which is measured independently, over the rms phase error of both axes. Each phantom has a marker "
+    "of its own. Dashed: the bound p/m."
 )
-MAP_TEXT = (
-    "How much of the scan has a phase error within ±p/m: mean over phantoms, noise levels, seeds and both axes."
-)
-RIVALS_TEXT = (
+MAP_TEXT = "Percentage of the scan with a phase error within ±p/m: mean over phantoms, noise, seeds and axes."
+COMPARISON_TEXT = (
     "How often, in per cent of recordings and axes, the estimator of the row has a smaller phase error than that of "
-    "the column; both saw the same recordings. Below, phase error: median, and the 10th to the 90th percentile."
+    "the column; both estimated the same recordings. Below, phase error: median, and the 10th to the 90th percentile."
 )
 
 
 def _estimators(statistics: Mapping[str, Mapping[str, float | None]]) -> Table:
     head = ["", "phase error, median [°]", "95th percentile [°]", "scan within ±p/m", "picture error", "time [s]"]
     rows = []
-    for name, own in statistics.items():
+    for name, values in statistics.items():
         formats = {
             "phase_rmse_deg_median": ".4f", "phase_rmse_deg_p95": ".4f", "within_bound": ".1%",
             "picture_error_median": ".3f", "seconds_median": ".2f", "failed": ".1%",
         }  # fmt: skip
-        rows.append([name, *("–" if (v := own[key]) is None else format(v, spec) for key, spec in formats.items())])
+        rows.append([name, *("–" if (v := values[key]) is None else format(v, spec) for key, spec in formats.items())])
     return Table([*head, "failed"], rows)
 
 
 def _blur_figure(study: Study, data: Columns) -> Figure:
-    drawing, axes = views.figure(2, len(study.pixels), (max(5.0, 4.5 * len(study.pixels)), 6.4))
+    drawing, axes = new_figure(2, len(study.pixels), (max(5.0, 4.5 * len(study.pixels)), 6.4))
     for (above, below), pixels in zip(axes.T, study.pixels, strict=True):
         here = (data["pixels"] == pixels) & (data["p"] == study.p[0])  # neither blur nor picture knows p
-        law = np.geomspace(max(LEAST_DEG, data["phase_rmse_deg"][here].min(initial=1.0)), 20.0, 50)
+        law = np.geomspace(max(MIN_PHASE_ERROR_DEG, data["phase_rmse_deg"][here].min(initial=1.0)), 20.0, 50)
         above.plot(law, 0.5 * pixels * np.radians(law) / np.sqrt(2.0), color="#444", lw=0.8)
         for name, colour in zip(study.estimators, _colours(), strict=False):
-            for phantom, sign in zip(study.phantoms, cycle(SIGNS), strict=False):
+            for phantom, sign in zip(study.phantoms, cycle(MARKERS), strict=False):
                 x, y = (
                     here & (data["estimator"] == name) & (data["phantom"] == phantom) & (data["axis"] == axis)
                     for axis in AXES
                 )
                 label = name if phantom == study.phantoms[0] else None
                 style: dict[str, Any] = {"ms": 4, "alpha": 0.6, "color": colour}
-                error = np.maximum(data["phase_rmse_deg"], LEAST_DEG)
+                error = np.maximum(data["phase_rmse_deg"], MIN_PHASE_ERROR_DEG)
                 above.loglog(error[x | y], data["blur_phase_px"][x | y], sign, label=label, **style)
                 below.loglog(np.hypot(error[x], error[y]) / np.sqrt(2.0), data["picture_error"][x], sign, **style)
         for panel in (above, below):
             for p in study.p:
-                bound = np.degrees(blur.bound(p, pixels / 2))
+                bound = np.degrees(blur.phase_bound(p, pixels / 2))
                 panel.axvline(bound, color="#444", lw=0.8, ls="--")
                 panel.text(bound, 0.98, f" p = {p:g}", transform=panel.get_xaxis_transform(), va="top", fontsize=7)
         above.set_title(f"{pixels} × {pixels} pixels", fontsize=9)
         below.set_xlabel("phase error, rms [°]")
+        for axis in (above.xaxis, above.yaxis, below.xaxis, below.yaxis):
+            use_plain_ticks(axis)
     axes[0, 0].set_ylabel("blur by phase, rms [px]")
     axes[1, 0].set_ylabel("picture error")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    return Figure(views.figure_uri(drawing), "blur by phase, a sign a scan and axis; picture error, a sign a scan")
+    return Figure(
+        figure_uri(drawing),
+        "blur by the phase error, a marker a scan and axis; picture error, a marker a scan",
+    )
 
 
 def _bound_map(study: Study, data: Columns, design: str) -> Figure:
@@ -116,11 +123,11 @@ def _bound_map(study: Study, data: Columns, design: str) -> Figure:
     drifts = sorted(study.drifts)
     pixels = sorted(study.pixels)
     size = (1.2 + 2.2 * len(study.estimators), 0.9 + (0.6 + 0.28 * len(drifts)) * len(study.p))
-    drawing, axes = views.figure(len(study.p), len(study.estimators), size)
+    drawing, axes = new_figure(len(study.p), len(study.estimators), size)
     for row, p in enumerate(study.p):
         for column, name in enumerate(study.estimators):
             chosen = (data["design"] == design) & (data["p"] == p) & (data["estimator"] == name)
-            held = _means(data, chosen, ("drift", drifts), ("pixels", [float(n) for n in pixels]))
+            held = _mean_within_bound(data, chosen, ("drift", drifts), ("pixels", [float(n) for n in pixels]))
             panel = axes[row, column]
             panel.imshow(held, vmin=0.0, vmax=1.0, cmap="RdYlGn", alpha=0.6, aspect="auto")
             for i, j in np.ndindex(held.shape):
@@ -137,10 +144,10 @@ def _bound_map(study: Study, data: Columns, design: str) -> Figure:
             if column == 0:
                 panel.set_ylabel(f"drift, p = {p:g}")
     drawing.supxlabel("pixels across", fontsize=9)
-    return Figure(views.figure_uri(drawing), f"{design}: per cent of the scan within ±p/m, by resolution and drift")
+    return Figure(figure_uri(drawing), f"{design}: per cent of the scan within ±p/m, by resolution and drift")
 
 
-def _means(
+def _mean_within_bound(
     data: Columns, chosen: NDArray[np.bool_], rows: tuple[str, Sequence[float]], across: tuple[str, Sequence[float]]
 ) -> Array:
     """Mean of ``within_bound`` over the chosen rows at each pair of two columns' values; nan where there are none."""
@@ -152,7 +159,7 @@ def _means(
     return out
 
 
-def _rivals(study: Study, data: Columns) -> Table:
+def _win_table(study: Study, data: Columns) -> Table:
     """For each pair of estimators, in which part of what both did the row's has the smaller phase error."""
     errors: dict[str, dict[tuple[Any, ...], float]] = {name: {} for name in study.estimators}
     once = (data["pixels"] == study.pixels[0]) & (data["p"] == study.p[0])  # a phase error knows neither
@@ -175,23 +182,26 @@ def _error_figure(study: Study, data: Columns) -> Figure:
     panels = [("drift", "drift of the stiffness [%]", 100.0)]
     if len(study.snr_db) > 1:
         panels.append(("snr_db", "SNR of the sense signal [dB]", 1.0))
-    drawing, axes = views.figure(1, len(panels), (4.6 * len(panels), 3.2))
+    drawing, axes = new_figure(1, len(panels), (4.6 * len(panels), 3.2))
     for panel, (what, label, unit) in zip(axes[0], panels, strict=True):
         for name, colour in zip(study.estimators, _colours(), strict=False):
             own = data["estimator"] == name
             at = np.unique(data[what][own])
             if not at.size:
                 continue
-            error = [np.maximum(data["phase_rmse_deg"][own & (data[what] == value)], LEAST_DEG) for value in at]
+            error = [
+                np.maximum(data["phase_rmse_deg"][own & (data[what] == value)], MIN_PHASE_ERROR_DEG) for value in at
+            ]
             low, median, high = np.array([np.percentile(each, [10, 50, 90]) for each in error]).T
             panel.fill_between(unit * at, low, high, color=colour, alpha=0.15, lw=0)
             panel.plot(unit * at, median, "o-", ms=3, lw=1.2, color=colour, label=name)
         panel.set(yscale="log", xlabel=label, xticks=unit * np.unique(data[what]))
+        use_plain_ticks(panel.yaxis)
     axes[0, 0].set_ylabel("phase error, rms [°]")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    return Figure(views.figure_uri(drawing), "phase error of each estimator: median, 10th to 90th percentile")
+    return Figure(figure_uri(drawing), "phase error of each estimator: median, 10th to 90th percentile")
 
 
 def _colours() -> list[str]:
     """Enough colours for every estimator there is."""
-    return [*views.COLOURS, "#4aa3a2", "#7a7a7a", "#d08fb2"]
+    return [*COLOURS, "#4aa3a2", "#7a7a7a", "#d08fb2"]

@@ -1,7 +1,7 @@
-"""Running a study: what is done stands in a journal, the rest goes to the machine's cores or to a Dask cluster.
+"""Execution of a study: finished cells are in a journal, the others run on this machine's cores or a Dask cluster.
 
-The journal ``cells.jsonl`` in the output folder has a line for each cell, written by this process alone when a job
-comes back and forced to disk before the next is taken: a study that is killed at any moment goes on from there.
+The journal ``cells.jsonl`` in the output folder has a line for each cell. This process alone writes it, when a job
+returns, and forces it to disk before the next result is processed. A study that is killed continues from there.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from typing import IO, Any
 
 from tqdm import tqdm
 
-from recon.executors import executor_of, task
-from recon.output import check_folder, finite, replacing_folder, write_json
-from recon.study.plan import Job, jobs, key, read_study, remaining
-from recon.study.table import columns, require_parquet, rows, statistics, write_csv, write_parquet
-from recon.study.world import do
+from recon.executors import open_executor, picklable_task
+from recon.io.output import check_folder, finite, replacing_folder, write_json
+from recon.study.job import run_job
+from recon.study.plan import Job, cell_key, plan_jobs, read_study, remaining_jobs
+from recon.study.table import estimator_statistics, require_parquet, table_columns, table_rows, write_csv, write_parquet
 from scanner.errors import BadInput
 
 JOURNAL = "cells.jsonl"
@@ -34,19 +34,21 @@ Record = Mapping[str, Any]
 def run_study(
     path: Path, output: Path, *, scheduler: str | None = None, workers: int | None = None, parquet: bool = False
 ) -> dict[str, Any]:
-    """Do what is left of a study and write its table, summary.json and report.html into ``output``.
+    """Run the unfinished jobs of a study and write its table, summary.json and report.html into ``output``.
 
     Args:
-        scheduler: address of a Dask scheduler; the machine's own cores without one.
-        workers: processes on this machine; one a core if not given.
-        parquet: write the table as Parquet too.
+        path: of the study's TOML file.
+        output: folder, new or of the same study.
+        scheduler: address of a Dask scheduler; None for processes on this machine.
+        workers: number of processes on this machine; None for one per core.
+        parquet: also write the table as Parquet.
 
     Returns:
         The summary.
 
     Raises:
-        BadInput: the study, the folder or the scheduler does not serve.
-        OSError: interrupted, or the workers are gone; what is done is kept and the line says so.
+        BadInput: the study, the folder or the scheduler cannot be used.
+        OSError: interrupted, or a worker ended; finished cells are kept, and the message says so.
     """
     from recon.study.report import study_report
 
@@ -54,16 +56,16 @@ def run_study(
     study = read_study(path)
     if parquet:
         require_parquet()
-    everything = list(jobs(study))
+    all_jobs = list(plan_jobs(study))
     # The pool comes first: a scheduler that does not answer leaves no folder behind.
-    pool = executor_of(scheduler, workers)
-    with _telling(output), pool as executor, _journal(_folder(output) / JOURNAL) as (file, done):
+    pool = open_executor(scheduler, workers)
+    with _explain_interruption(output), pool as executor, _journal(_create_folder(output) / JOURNAL) as (file, done):
         before = len(done)
-        left = remaining(everything, done)
+        left = remaining_jobs(all_jobs, done)
         if left:
-            _work(executor, left, done, file, sum(1 for job in everything for _ in job.cells()))
-        records = [done[key(cell)] for job in everything for cell in job.cells()]
-        table = rows(records)
+            _run_jobs(executor, left, done, file, sum(1 for job in all_jobs for _ in job.cells()))
+        records = [done[cell_key(cell)] for job in all_jobs for cell in job.cells()]
+        table = table_rows(records)
         summary = finite(
             {
                 "study": study.name,
@@ -73,7 +75,7 @@ def run_study(
                 "failed": sum("failed" in record for record in records),
                 "reasons": sorted({record["failed"] for record in records if "failed" in record}),
                 "rows": len(table),
-                "estimators": statistics(table),
+                "estimators": estimator_statistics(table),
                 "seconds": time.perf_counter() - began,
             }
         )
@@ -82,44 +84,46 @@ def run_study(
             if parquet:
                 write_parquet(folder / "table.parquet", table)
             write_json(folder / "summary.json", summary)
-            (folder / "report.html").write_text(study_report(study, columns(table), summary), encoding="utf-8")
+            (folder / "report.html").write_text(study_report(study, table_columns(table), summary), encoding="utf-8")
             shutil.copyfile(path, folder / "study.toml")
     return dict(summary)
 
 
-def _folder(output: Path) -> Path:
-    """The folder, made where it is not there yet."""
+def _create_folder(output: Path) -> Path:
+    """The folder, created if it does not exist."""
     check_folder(output)
     output.mkdir(exist_ok=True)
     return output
 
 
 @contextmanager
-def _telling(output: Path) -> Iterator[None]:
-    """What stops a study, in one line that says what became of the work."""
+def _explain_interruption(output: Path) -> Iterator[None]:
+    """Turn what interrupts a study into an OSError whose message says that finished cells are kept."""
     try:
         yield
     except KeyboardInterrupt:
-        raise _stopped(InterruptedError, errno.EINTR, "interrupted", output) from None
+        raise _interruption_error(InterruptedError, errno.EINTR, "interrupted", output) from None
     except OSError as error:
-        error.filename = error.filename or str(output)  # a full disk does not say where
+        error.filename = error.filename or str(output)  # the error of a full disk names no file
         raise
     except BrokenExecutor:
-        raise _stopped(ChildProcessError, errno.ECHILD, "a worker was killed (out of memory?)", output) from None
+        raise _interruption_error(
+            ChildProcessError, errno.ECHILD, "a worker was killed (out of memory?)", output
+        ) from None
     except CancelledError:
-        raise _stopped(ConnectionAbortedError, errno.ECONNABORTED, "the scheduler is gone", output) from None
+        raise _interruption_error(ConnectionAbortedError, errno.ECONNABORTED, "the scheduler is gone", output) from None
 
 
-def _stopped(kind: type[OSError], number: int, why: str, output: Path) -> OSError:
+def _interruption_error(kind: type[OSError], number: int, why: str, output: Path) -> OSError:
     return kind(number, f"{why}; what was done is kept, the same command goes on from there", str(output))
 
 
 @contextmanager
 def _journal(path: Path) -> Iterator[tuple[IO[bytes], dict[str, Record]]]:
-    """The journal, open at its end, and its records by the key of their cell.
+    """The journal, open at its end, and its records by ``cell_key``.
 
     Raises:
-        BadInput: another process writes it, or a line in its midst is no record.
+        BadInput: another process writes it, or a line before the last one is not a record.
     """
     import fcntl
 
@@ -132,32 +136,32 @@ def _journal(path: Path) -> Iterator[tuple[IO[bytes], dict[str, Record]]]:
         file.seek(0)
         text = file.read()
         whole = text.rfind(b"\n") + 1
-        file.truncate(whole)  # a line that a kill cut short: its cell counts as not done
+        file.truncate(whole)  # an incomplete last line of a killed run: its cell is repeated
         done: dict[str, Record] = {}
         for number, line in enumerate(text[:whole].splitlines(), 1):
             try:
-                found = json.loads(line)
-                done[key(found["cell"])] = found
+                record = json.loads(line)
+                done[cell_key(record["cell"])] = record
             except (ValueError, KeyError, TypeError):
                 raise BadInput(f"line {number} is no record of a cell", file=path, hint="remove the line") from None
         yield file, done
 
 
-def _work(executor: Executor, left: Sequence[Job], done: dict[str, Record], file: IO[bytes], total: int) -> None:
-    """Do the jobs, write each one's records when it comes back, and tell the time that is left."""
+def _run_jobs(executor: Executor, left: Sequence[Job], done: dict[str, Record], file: IO[bytes], total: int) -> None:
+    """Run the jobs, write the records of each when it returns, and show the remaining time."""
     with tqdm(
         total=total,
         initial=total - sum(1 for job in left for _ in job.cells()),
         desc="blur-study",
         unit="cell",
-        smoothing=0.0,  # cells differ by a factor of ten: the mean of all tells the time left best
+        smoothing=0.0,  # cells differ by a factor of ten, so the mean over all predicts best
         file=sys.stderr,
         mininterval=0.5 if sys.stderr.isatty() else 30.0,
     ) as bar:
-        for future in as_completed([executor.submit(task(do, each)) for each in left]):
+        for future in as_completed([executor.submit(picklable_task(run_job, each)) for each in left]):
             records = future.result()
             file.write(b"".join(json.dumps(each).encode() + b"\n" for each in records))
             file.flush()
             os.fsync(file.fileno())
-            done.update((key(each["cell"]), each) for each in records)
+            done.update((cell_key(each["cell"]), each) for each in records)
             bar.update(len(records))

@@ -1,4 +1,4 @@
-"""The table of a study: a row for each cell and axis; as CSV, as Parquet, as columns, and summed up by estimator."""
+"""The table of a study, a row for each cell and axis: as CSV, as Parquet, as columns, and summarised by estimator."""
 
 from __future__ import annotations
 
@@ -11,85 +11,85 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.pipeline import AXES
+from scanner.device import AXES
 from scanner.errors import BadInput
 
 Row = dict[str, Any]
 Columns = Mapping[str, NDArray[Any]]
 
-CELL = ("phantom", "design", "drift", "snr_db", "estimator", "pixels", "p", "seed")
-MEASURED = (
+CELL_COLUMNS = ("phantom", "design", "drift", "snr_db", "estimator", "pixels", "p", "seed")
+AXIS_COLUMNS = (
     "phase_rmse_deg", "phase_bias_deg", "phase_sd_deg", "bound_deg", "within_bound", "amplitude_rmse",
     "seen_deg", "seen_sd_deg",
     "blur_phase_px", "blur_amplitude_px", "blur_sampling_px", "blur_optics_px", "blur_total_px",
 )  # fmt: skip
-SHARED = ("picture_error", "fill", "seconds")
-NAMES = (*CELL, "axis", *MEASURED, *SHARED, "failed")
-TEXTS = ("phantom", "design", "estimator", "axis", "failed")
+SCAN_COLUMNS = ("picture_error", "fill", "seconds")
+COLUMN_NAMES = (*CELL_COLUMNS, "axis", *AXIS_COLUMNS, *SCAN_COLUMNS, "failed")
+TEXT_COLUMNS = ("phantom", "design", "estimator", "axis", "failed")
 
 
-def rows(records: Iterable[Mapping[str, Any]]) -> list[Row]:
-    """A row for each record and axis with all of ``NAMES``; what was not measured is None."""
+def table_rows(records: Iterable[Mapping[str, Any]]) -> list[Row]:
+    """Return a row for each record and axis with all of ``COLUMN_NAMES``; None where there is no result."""
     return [
-        {name: record["cell"][name] for name in CELL}
+        {name: record["cell"][name] for name in CELL_COLUMNS}
         | {"axis": axis}
-        | {name: record.get(axis, {}).get(name) for name in MEASURED}
-        | {name: record.get(name) for name in (*SHARED, "failed")}
+        | {name: record.get(axis, {}).get(name) for name in AXIS_COLUMNS}
+        | {name: record.get(name) for name in (*SCAN_COLUMNS, "failed")}
         for record in records
         for axis in AXES
     ]
 
 
-def columns(table: Sequence[Row]) -> Columns:
-    """The rows as arrays of shape (rows,): text as str, numbers as float64 with nan for None."""
+def table_columns(table: Sequence[Row]) -> Columns:
+    """Return the rows as arrays of shape (rows,): text as str, numbers as float64 with nan for None."""
     return {
         name: np.array([row[name] or "" for row in table])
-        if name in TEXTS
+        if name in TEXT_COLUMNS
         else np.array([row[name] for row in table], np.float64)
-        for name in NAMES
+        for name in COLUMN_NAMES
     }
 
 
 def write_csv(path: Path, table: Sequence[Row]) -> None:
-    """The rows with a head; None is an empty field."""
+    """Write the rows with a header; None becomes an empty field."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, NAMES)
+        writer = csv.DictWriter(file, COLUMN_NAMES)
         writer.writeheader()
         writer.writerows(table)
 
 
 def require_parquet() -> None:
-    """Raises BadInput, with what to install, where pyarrow is missing."""
+    """Raise BadInput, with the command that installs it, if pyarrow is missing."""
     if importlib.util.find_spec("pyarrow") is None:
         raise BadInput("--parquet needs pyarrow", hint="pip install 'lissajous[parquet]'")
 
 
 def write_parquet(path: Path, table: Sequence[Row]) -> None:
-    """The rows as Parquet, with types that do not hang on what they hold."""
+    """Write the rows as Parquet, with column types that do not depend on the values."""
     import pyarrow
     import pyarrow.parquet
 
-    kinds = {name: pyarrow.string() if name in TEXTS else pyarrow.float64() for name in NAMES}
+    kinds = {name: pyarrow.string() if name in TEXT_COLUMNS else pyarrow.float64() for name in COLUMN_NAMES}
     kinds |= {name: pyarrow.int64() for name in ("pixels", "seed")}
     pyarrow.parquet.write_table(pyarrow.Table.from_pylist(list(table), pyarrow.schema(kinds.items())), path)
 
 
-def statistics(table: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """By estimator: phase error over all rows, fraction of the scan within the bound, picture's error, failures."""
+def estimator_statistics(table: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Return phase error, fraction of the scan within the bound, picture error and failures by estimator."""
     if not table:
         return {}
-    data = columns(table)
+    data = table_columns(table)
     out = {}
     for name in dict.fromkeys(data["estimator"]):
-        own = data["estimator"] == name
-        worked = own & (data["failed"] == "")
-        error = data["phase_rmse_deg"][worked]
+        of_estimator = data["estimator"] == name
+        succeeded = of_estimator & (data["failed"] == "")
+        error = data["phase_rmse_deg"][succeeded]
         out[str(name)] = {
             "phase_rmse_deg_median": float(np.median(error)) if error.size else np.nan,
             "phase_rmse_deg_p95": float(np.percentile(error, 95)) if error.size else np.nan,
-            "within_bound": float(np.mean(data["within_bound"][worked])) if error.size else np.nan,
-            "picture_error_median": float(np.nanmedian(data["picture_error"][worked])) if error.size else np.nan,
-            "seconds_median": float(np.median(data["seconds"][worked])) if error.size else np.nan,
-            "failed": float(np.mean(data["failed"][own] != "")),
+            "within_bound": float(np.mean(data["within_bound"][succeeded])) if error.size else np.nan,
+            "picture_error_median": float(np.nanmedian(data["picture_error"][succeeded])) if error.size else np.nan,
+            "seconds_median": float(np.median(data["seconds"][succeeded])) if error.size else np.nan,
+            "failed": float(np.mean(data["failed"][of_estimator] != "")),
         }
     return out

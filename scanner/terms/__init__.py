@@ -1,28 +1,33 @@
-"""The catalogue of physics that a nominal device may leave out: one file, one effect."""
+"""The catalogue of effects that a nominal device leaves out: one file, one effect.
+
+Nothing in here simulates, estimates or reads recordings: ``scanner.forward_model`` and the estimators apply the laws.
+"""
 
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import pkgutil
 from functools import cache
 from pathlib import Path
 
 from scanner.errors import BadInput
-from scanner.terms.term import STAGES, Parameter, Scales, Term, View, section, shifted
+from scanner.interpolation import shift_samples
+from scanner.lowpass import apply_lowpass
+from scanner.terms.term import STAGES, NaturalScales, Parameter, SignalContext, Term
+from scanner.user_files import load_objects
 
 __all__ = [
     "STAGES",
+    "NaturalScales",
     "Parameter",
-    "Scales",
+    "SignalContext",
     "Term",
-    "View",
+    "apply_lowpass",
     "catalogue",
     "load_terms",
     "register",
     "registered",
-    "section",
-    "shifted",
+    "shift_samples",
 ]
 
 
@@ -30,48 +35,39 @@ _REGISTERED: dict[Path, dict[str, Term]] = {}
 
 
 def catalogue() -> dict[str, Term]:
-    """Every term of this package and of registered files by the effect's name, in the order of the stages."""
-    terms = [*_own_terms(), *(term for each in _REGISTERED.values() for term in each.values())]
+    """Return every term of this package and of registered files by its effect, in the order of the stages."""
+    terms = [*_builtin_terms(), *(term for terms in _REGISTERED.values() for term in terms.values())]
     return {term.effect: term for term in sorted(terms, key=lambda term: (STAGES.index(term.stage), term.effect))}
 
 
 def register(path: str | Path) -> None:
-    """Take the terms of a user's own file into the catalogue; raises as :func:`load_terms`."""
+    """Add the terms of a user's file to the catalogue. Raises as :func:`load_terms`."""
     _REGISTERED[Path(path).resolve()] = load_terms(path)
 
 
 def registered() -> tuple[Path, ...]:
-    """The term files taken into the catalogue."""
+    """Return the registered term files."""
     return tuple(_REGISTERED)
 
 
+NOT_IN_CATALOGUE = ("term", "measured_law")
+"""Modules here that hold no effect: the base class, and the law without a name that a diagnosis writes."""
+
+
 @cache
-def _own_terms() -> tuple[Term, ...]:
-    names = [module.name for module in pkgutil.iter_modules(__path__) if module.name != "term"]
+def _builtin_terms() -> tuple[Term, ...]:
+    names = [module.name for module in pkgutil.iter_modules(__path__) if module.name not in NOT_IN_CATALOGUE]
     return tuple(importlib.import_module(f"{__name__}.{name}").TERM for name in names)
 
 
 def load_terms(path: str | Path) -> dict[str, Term]:
-    """The terms of a user's own file: everything in it that is a :class:`Term`, by the effect's name.
+    """Return the terms in a user's file, which is every :class:`Term` in it, by the name of its effect.
 
     Raises:
         BadInput: no such file, it fails to run, or it holds no term.
     """
     path = Path(path)
-    if not path.is_file():
-        raise BadInput("no such file", file=path, hint="--terms takes a Python file that holds a Term")
-    spec = importlib.util.spec_from_file_location(f"terms_of_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise BadInput("is not a Python file", file=path, hint="--terms takes a .py file that holds a Term")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:  # whatever the user's code raises is the user's to read, in one line
-        what = f"fails to run: {type(error).__name__}: {error}"
-        raise BadInput(what, file=path, hint="correct the term file") from error
-    terms = [value for value in vars(module).values() if isinstance(value, Term)]
-    if not terms:
-        raise BadInput("holds no term", file=path, hint="make a scanner.terms.Term in it")
+    terms = load_objects(path, Term, "--terms")
     for term in terms:
         if term.stage not in STAGES:
             hint = f"stages: {', '.join(STAGES)}"

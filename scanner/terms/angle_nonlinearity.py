@@ -1,19 +1,16 @@
-"""A reference detector that bends: arctangent or cubic."""
+"""A reference detector whose output is not proportional to the angle (arctangent or cubic)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return signal * (1.0 + p[0] * signal * signal)
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (c3,) = p
+    return signal * (1.0 + c3 * signal * signal)
 
 
 TERM = Term(
@@ -22,7 +19,7 @@ TERM = Term(
     equation="θ_ref = θ (1 + c3 θ²)",
     parameters=(Parameter("c3", "1/rad^2", lambda s: 0.03 / s.amplitude**2),),
     source="chen2019, eq. 10: θ = arctan(y G/L)",
-    lookalikes={"cubic-stiffness": "sense and angle both show it: compare them"},
+    confounders={"cubic-stiffness": "cubic stiffness shows in the sense signal and in the angle: compare them"},
     channels=("angle",),
     output=output,
 )

@@ -1,19 +1,18 @@
-"""A sample that fades while it is looked at; a laser that dims looks the same."""
+"""A sample whose light decays exponentially. A laser that dims has the same law."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return signal * np.exp(-view.time / p[0])
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (tau,) = p
+    return signal * np.exp(-context.time / tau)
 
 
 TERM = Term(

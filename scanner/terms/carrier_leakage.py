@@ -1,20 +1,19 @@
-"""Carrier that reaches the detector past the comb and adds as a vector."""
+"""Carrier that reaches the detector without passing the comb. It adds to the signal as a vector."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scanner.arrays import Array
 from scanner.device import Amdm
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return np.sqrt((signal + p[0]) ** 2 + p[1] ** 2)
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    a, q = p
+    return np.sqrt((signal + a) ** 2 + q**2)
 
 
 TERM = Term(
@@ -26,7 +25,9 @@ TERM = Term(
         Parameter("q", "V", lambda s: 0.02 * s.sense_peak),
     ),
     source="chen2020, section II-C: amplitude demodulation",
-    lookalikes={"offset-drift": "it wanders, this stays: record longer; turn the carrier's phase"},
+    confounders={
+        "offset-drift": "an offset drifts, leakage is constant: record for longer, or change the carrier's phase"
+    },
     applies=lambda axis, scales: isinstance(scales.readout, Amdm),
     output=output,
 )

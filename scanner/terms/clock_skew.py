@@ -1,19 +1,16 @@
-"""Channels whose clocks do not run at one rate."""
+"""Channels whose clocks run at different rates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from scanner.arrays import Array
 from scanner.terms.term import Parameter, Term
-
-Array = NDArray[np.float64]
 
 
 def clock(time: Array, p: Sequence[float]) -> Array:
-    return (1.0 + p[0]) * time
+    (skew,) = p
+    return (1.0 + skew) * time
 
 
 TERM = Term(
@@ -22,7 +19,7 @@ TERM = Term(
     equation="y(t) = y_nominal((1 + ε) t)",
     parameters=(Parameter("skew", "1", lambda s: 5e-5),),
     source="IEEE 1588: drift of free-running oscillators, 1 to 200 ppm",
-    lookalikes={"resonance-drift": "it moves the amplitude as well: drive the mirror, or record the angle"},
+    confounders={"resonance-drift": "a drift changes the amplitude as well: drive the mirror, or record the angle"},
     channels=("sense", "angle"),
     clock=clock,
 )

@@ -1,4 +1,4 @@
-"""Combs that stand beside the rest position of the mirror."""
+"""Combs whose largest capacitance is not at the rest position of the mirror."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from scanner.terms.term import Parameter, Term
 
 
 def constants(axis: Axis, p: Sequence[float]) -> Axis:
+    (theta_c,) = p
     comb = axis.require_capacitance()
-    return replace(axis, capacitance=replace(comb, theta_th=comb.theta_th + p[0]))
+    return replace(axis, capacitance=replace(comb, theta_th=comb.theta_th + theta_c))
 
 
 TERM = Term(
@@ -20,7 +21,7 @@ TERM = Term(
     equation="C(θ − θ_c)",
     parameters=(Parameter("theta_c", "rad", lambda s: 0.007),),
     source="chen2020, section II-C: angle of the largest capacitance",
-    lookalikes={"quadratic-stiffness": "the angle shows it too: record the angle"},
+    confounders={"quadratic-stiffness": "quadratic stiffness shows in the angle too: record the angle"},
     constants=constants,
     applies=lambda axis, scales: axis.capacitance is not None,
 )

@@ -1,17 +1,18 @@
-"""Dry friction: a torque against the motion, whatever its speed above that at which the contact begins to slide."""
+"""Dry friction: a torque against the motion, independent of its speed above the one at which the contact slides."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+from scanner.integrator.abi import TORQUE_LAW
 from scanner.terms.term import Parameter, Term
-from scanner.trajectory import TORQUE
 
 
-@njit(TORQUE, cache=True)
+@njit(TORQUE_LAW, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    return -p[0] * omega / np.sqrt(omega * omega + p[1] * p[1]), 0.0, 0.0
+    tau_c, omega_s = p[0], p[1]
+    return -tau_c * omega / np.sqrt(omega * omega + omega_s * omega_s), 0.0, 0.0
 
 
 TERM = Term(
@@ -23,9 +24,9 @@ TERM = Term(
         Parameter("omega_s", "rad/s", lambda s: 0.01 * s.amplitude * s.rate, kind="log"),
     ),
     source="Feeny & Liang, J. Sound Vib. 195, 149 (1996)",
-    lookalikes={
-        "quadratic-drag": "decay rate follows A there, 1/A here: record the end of the decay",
-        "cubic-damping": "decay rate follows A² there, 1/A here: record the end of the decay",
+    confounders={
+        "quadratic-drag": "its decay rate is proportional to A, that of friction to 1/A: record the end of the decay",
+        "cubic-damping": "its decay rate is proportional to A², that of friction to 1/A: record the end of the decay",
     },
     torque=torque,
 )

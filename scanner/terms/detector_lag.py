@@ -1,19 +1,17 @@
-"""A detector slower than the picture: light passes a first-order section before it is recorded."""
+"""A detector that is slower than the picture: the light passes a first-order section before it is recorded."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scanner.terms.term import Parameter, Term, View, section
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.lowpass import apply_lowpass
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return section(signal, p[0], view.step)
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (f_c,) = p
+    return apply_lowpass(signal, f_c, context.step)
 
 
 TERM = Term(
@@ -22,8 +20,8 @@ TERM = Term(
     equation="τ_d I' = L - I, τ_d = 1/(2π f_c)",
     parameters=(Parameter("f_c", "Hz", lambda s: 3e5, kind="inverse", sign=1),),
     source="first-order response of photodiode and amplifier",
-    lookalikes={
-        "intensity-delay": "a lag blurs along the sweep, a delay does not: scan faster, or a target with fine detail",
+    confounders={
+        "intensity-delay": "a lag blurs along the line, a delay does not: scan faster, or use a finer target",
     },
     channels=("intensity",),
     output=output,

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View, section
-from scanner.trajectory import halves, thirds
+from scanner.arrays import Array
+from scanner.integrator.nodes import from_nodes, to_nodes
+from scanner.lowpass import apply_lowpass
+from scanner.terms.term import Parameter, SignalContext, Term
 
-Array = NDArray[np.float64]
 
-
-def voltage(voltage: Array, p: Sequence[float], view: View) -> Array:
-    return thirds(section(halves(voltage), p[0], 0.5 * view.step))
+def voltage(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (f_c,) = p
+    return to_nodes(apply_lowpass(from_nodes(voltage), f_c, 0.5 * context.step))
 
 
 TERM = Term(
@@ -23,9 +23,9 @@ TERM = Term(
     equation="V' = 2π f_c (V_set − V)",
     parameters=(Parameter("f_c", "Hz", lambda s: 5.0 * s.drive_rate / (2.0 * np.pi), kind="inverse", sign=1),),
     source="Horowitz & Hill, The Art of Electronics, section 1.7",
-    lookalikes={
-        "readout-lag": "for a linear axis the two commute: record the angle, or drive harder",
-        "channel-delay": "a delay does not shrink the signal: drive at a second frequency, or record the angle",
+    confounders={
+        "readout-lag": "for a linear axis the two commute: record the angle, or use a larger drive",
+        "channel-delay": "a delay does not attenuate the signal: drive at a second frequency, or record the angle",
     },
     applies=lambda axis, scales: scales.voltage_rms > 0,
     voltage=voltage,

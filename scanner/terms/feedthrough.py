@@ -1,20 +1,19 @@
-"""Drive voltage that gets into the sense signal past the mirror."""
+"""Drive voltage that couples into the sense signal electrically."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    change = view.raw_voltage - view.raw_voltage.mean()
-    return signal + p[0] * change + p[1] * np.gradient(change, view.step) / p[2]
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    g, h, omega_d = p
+    change = context.raw_voltage - context.raw_voltage.mean()
+    return signal + g * change + h * np.gradient(change, context.step) / omega_d
 
 
 TERM = Term(
@@ -27,8 +26,10 @@ TERM = Term(
         Parameter("omega_d", "rad/s", lambda s: s.drive_rate, kind="fixed"),
     ),
     source="Lee & Seshia, Sens. Actuators A 156, 36 (2009)",
-    lookalikes={"channel-delay": "it stays when the motion stops: record two amplitudes, or a detuned drive"},
+    confounders={
+        "channel-delay": "feedthrough remains when the motion stops: record two amplitudes, or a detuned drive"
+    },
     applies=lambda axis, scales: scales.voltage_rms > 0,
     output=output,
-    of_axis=True,
+    per_axis=True,
 )

@@ -1,19 +1,16 @@
-"""A field that bends: the beam's place is not proportional to the mirror's angle."""
+"""A distorted field: the position of the beam is not proportional to the angle of the mirror."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return signal * (1.0 + p[0] * signal * signal)
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (c3,) = p
+    return signal * (1.0 + c3 * signal * signal)
 
 
 TERM = Term(
@@ -22,7 +19,7 @@ TERM = Term(
     equation="s = θ (1 + c3 θ²)",
     parameters=(Parameter("c3", "1/rad^2", lambda s: 0.02 / s.amplitude**2),),
     source="tan 2θ = 2θ (1 + 4/3 θ²) before a flat field, third order of an objective's distortion",
-    lookalikes={"angle-nonlinearity": "a straight line on the sample bends by the field alone"},
+    confounders={"angle-nonlinearity": "only a distorted field bends a straight line on the sample"},
     channels=("place",),
     output=output,
 )

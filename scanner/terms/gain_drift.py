@@ -1,20 +1,17 @@
-"""A readout gain that changes while the recording runs."""
+"""A readout gain that changes during the recording."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    base = signal.mean() if view.variant == "signal" else 0.0
-    return base + (signal - base) * (1.0 + p[0] * view.time / p[1])
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    g, T = p
+    base = signal.mean() if context.variant == "signal" else 0.0
+    return base + (signal - base) * (1.0 + g * context.time / T)
 
 
 TERM = Term(
@@ -26,9 +23,9 @@ TERM = Term(
         Parameter("T", "s", lambda s: s.duration, kind="fixed"),
     ),
     source="Horowitz & Hill, The Art of Electronics, section 5.1",
-    lookalikes={
-        "damping-drift": "the angle shows it too: record the angle",
-        "offset-drift": "no harmonic changes: record the angle",
+    confounders={
+        "damping-drift": "a change of damping shows in the angle too: record the angle",
+        "offset-drift": "an offset changes no harmonic: record the angle",
     },
     channels=("sense", "sense:signal"),
     output=output,

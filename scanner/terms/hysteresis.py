@@ -1,4 +1,4 @@
-"""An actuator that remembers where it turned: piezo ceramics, magnets. Gain and lag grow with the swing."""
+"""An actuator with hysteresis (piezo ceramics, magnets): gain and lag grow with the amplitude of the drive."""
 
 from __future__ import annotations
 
@@ -6,44 +6,44 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import float64, njit
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View
-from scanner.trajectory import halves, thirds
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.integrator.nodes import from_nodes, to_nodes
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
 @njit(float64[::1](float64[::1]), cache=True)
-def plays(v):  # type: ignore[no-untyped-def]
-    """Sum of play operators of every width, evenly dense, over ``v`` (n,), all of them at rest at the first sample.
+def prandtl_ishlinskii(v):  # type: ignore[no-untyped-def]
+    """Return the integral of the play operators of all half-widths over a signal ``v`` (n,), shape (n,).
 
-    Rayleigh's law: P = ± x²/2 away from rest, P = P_turn ± (x − x_turn)²/4 after a turn. A swing that passes an earlier
-    turn forgets it, so the turns that still count lie nested, each inside the one before.
+    All operators are at rest at the first sample. With uniform density the integral has a closed form (Rayleigh):
+    P = ± x²/2 away from rest, and P = P_r ± (x − x_r)²/4 after a reversal at x_r. A signal that passes an earlier
+    reversal erases it, so the reversals that still count are nested, each inside the one before.
     """
     out = np.zeros_like(v)
-    turn, height = np.empty_like(v), np.empty_like(v)
+    reversal, value_at = np.empty_like(v), np.empty_like(v)
     depth, widest = 0, 0.0
     for i in range(1, v.size):
         x, before = v[i] - v[0], v[i - 1] - v[0]
         if abs(x) >= widest:
             widest = abs(x)
             out[i] = 0.5 * x * widest
-            turn[0], height[0], depth = x, out[i], 1
+            reversal[0], value_at[0], depth = x, out[i], 1
             continue
-        if (x - before) * (before - turn[depth - 1]) < 0.0:
-            turn[depth], height[depth] = before, out[i - 1]
+        if (x - before) * (before - reversal[depth - 1]) < 0.0:
+            reversal[depth], value_at[depth] = before, out[i - 1]
             depth += 1
-        while depth > 2 and (x - turn[depth - 2]) * (turn[depth - 2] - turn[depth - 1]) >= 0.0:
+        while depth > 2 and (x - reversal[depth - 2]) * (reversal[depth - 2] - reversal[depth - 1]) >= 0.0:
             depth -= 2
-        far = x - turn[depth - 1]
-        out[i] = height[depth - 1] + 0.25 * far * abs(far)
+        distance = x - reversal[depth - 1]
+        out[i] = value_at[depth - 1] + 0.25 * distance * abs(distance)
     return out
 
 
-def voltage(voltage: Array, p: Sequence[float], view: View) -> Array:
-    half = halves(voltage)
-    return thirds(half + p[0] * plays(half))
+def voltage(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (h,) = p
+    half_steps = from_nodes(voltage)
+    return to_nodes(half_steps + h * prandtl_ishlinskii(half_steps))
 
 
 TERM = Term(
@@ -52,9 +52,9 @@ TERM = Term(
     equation="V + h ∫ P_r[V] dr,  P_r the play operator of half-width r",
     parameters=(Parameter("h", "1/V", lambda s: 0.1 / s.voltage_rms, sign=1),),
     source="Rayleigh, Phil. Mag. 23, 225 (1887); Kuhnen, European Journal of Control 9, 407 (2003), eq 1-10",
-    lookalikes={
-        "drive-lag": "its phase follows the frequency, whatever the swing: drive at two amplitudes",
-        "cubic-stiffness": "no loop: gain changes with the swing, phase far from resonance does not",
+    confounders={
+        "drive-lag": "its phase depends on frequency, not on amplitude: drive at two amplitudes",
+        "cubic-stiffness": "no loop: gain changes with amplitude, phase far from resonance does not",
     },
     applies=lambda axis, scales: axis.drive is not None and axis.drive.kind == "linear" and scales.voltage_rms > 0,
     voltage=voltage,

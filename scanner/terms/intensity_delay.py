@@ -1,19 +1,17 @@
-"""An intensity that is recorded late: cable, digital filter, another converter."""
+"""An intensity that is recorded with a delay: cable, digital filter, another converter."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scanner.terms.term import Parameter, Term, View, shifted
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.interpolation import shift_samples
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return shifted(signal, -p[0] / view.step)
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (tau,) = p
+    return shift_samples(signal, -tau / context.step)
 
 
 TERM = Term(
@@ -22,9 +20,9 @@ TERM = Term(
     equation="I(t) = L(t - τ)",
     parameters=(Parameter("tau", "s", lambda s: 2e-6, sign=1),),
     source="latency between a detector's and a readout's converters",
-    lookalikes={
-        "detector-lag": "a lag blurs along the sweep, a delay does not: scan faster, or a target with fine detail",
-        "channel-delay": "a late sense signal moves the picture the other way; a phase error moves one axis only",
+    confounders={
+        "detector-lag": "a lag blurs along the line, a delay does not: scan faster, or use a finer target",
+        "channel-delay": "a delayed sense signal shifts the picture the other way, a phase error shifts one axis only",
     },
     channels=("intensity",),
     output=output,

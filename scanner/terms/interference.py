@@ -1,20 +1,19 @@
-"""A tone that follows neither drive nor motion."""
+"""A tone that neither the drive nor the motion causes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    turn = 2.0 * np.pi * p[2] * view.time
-    return signal + p[0] * np.cos(turn) + p[1] * np.sin(turn)
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    a, b, f = p
+    phase = 2.0 * np.pi * f * context.time
+    return signal + a * np.cos(phase) + b * np.sin(phase)
 
 
 TERM = Term(
@@ -27,7 +26,7 @@ TERM = Term(
         Parameter("f", "Hz", lambda s: s.line or 1.0, kind="line"),
     ),
     source="Ott, Electromagnetic Compatibility Engineering, 2009, chapter 2",
-    lookalikes={"offset-drift": "no line: record longer"},
+    confounders={"offset-drift": "a drift has no spectral line: record for longer"},
     applies=lambda axis, scales: scales.line is not None,
     output=output,
 )

@@ -1,4 +1,4 @@
-"""A baseline that wanders."""
+"""A baseline that drifts slowly."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebval
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Scales, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import NaturalScales, Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    # cos(j turn) is Chebyshev's polynomial of the cosine: one cosine for all of them.
-    return signal + chebval(np.cos(np.pi * view.time / p[-1]), [0.0, *p[:-1]])
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    *coefficients, T = p
+    # cos(j u) is the Chebyshev polynomial T_j of cos u, so all terms need one cosine.
+    return signal + chebval(np.cos(np.pi * context.time / T), [0.0, *coefficients])
 
 
-def _size(j: int) -> Callable[[Scales], float]:
+def _size(j: int) -> Callable[[NaturalScales], float]:
     return lambda s: 0.08 * s.sense_rms / j
 
 
@@ -31,6 +30,6 @@ TERM = Term(
         Parameter("T", "s", lambda s: s.duration, kind="fixed"),
     ),
     source="Horowitz & Hill, The Art of Electronics, section 8.1: drift and 1/f noise",
-    lookalikes={"gain-drift": "the harmonics scale with it: look at them, or record the angle"},
+    confounders={"gain-drift": "a gain scales the harmonics too: compare the harmonics, or record the angle"},
     output=output,
 )

@@ -1,18 +1,19 @@
-"""One-to-two exchange with a mode at twice the frequency: the mirror pushes it with θ², it gives back q θ."""
+"""One-to-two internal resonance: the mirror drives a mode at twice its frequency with θ², the mode acts back as q θ."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+from scanner.integrator.abi import TORQUE_LAW
 from scanner.terms.term import Parameter, Term
-from scanner.trajectory import TORQUE
 
 
-@njit(TORQUE, cache=True)
+@njit(TORQUE_LAW, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    w2 = 2.0 * np.pi * p[1]
-    return -p[0] * nominal[2] * theta * z0, z1, w2 * w2 * (-theta * theta - z0) - w2 / p[2] * z1
+    g, f2, q2 = p[0], p[1], p[2]
+    w2 = 2.0 * np.pi * f2
+    return -g * nominal.k * theta * z0, z1, w2 * w2 * (-theta * theta - z0) - w2 / q2 * z1
 
 
 TERM = Term(
@@ -24,17 +25,17 @@ TERM = Term(
         Parameter(
             "f2",
             "Hz",
-            lambda s: s.rate / 3.141592653589793,
+            lambda s: s.rate / np.pi,
             kind="log",
             spread=0.3,
             starts=(-0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4),
         ),
         Parameter("Q2", "1", lambda s: 100.0, kind="log"),
     ),
-    hidden=(lambda s: s.amplitude**2, lambda s: 2.0 * s.rate * s.amplitude**2),
+    hidden_state_scales=(lambda s: s.amplitude**2, lambda s: 2.0 * s.rate * s.amplitude**2),
     source="Antonio, Zanette & López, Nat. Commun. 3, 806 (2012)",
-    lookalikes={"cubic-damping": "no sidebands and no threshold there: record above and below the threshold"},
-    # An internal resonance takes a motion at the axis's own.
+    confounders={"cubic-damping": "cubic damping has no sidebands: record at several amplitudes"},
+    # An internal resonance needs a motion near the resonance of the axis.
     applies=lambda axis, scales: 0.5 < scales.rate * np.sqrt(scales.J / scales.k) < 2.0,
     torque=torque,
 )

@@ -1,4 +1,4 @@
-"""One more first-order section behind the readout."""
+"""An additional first-order section after the readout."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from scanner.terms.term import Parameter, Term
 
 
 def corners(p: Sequence[float]) -> tuple[float, ...]:
-    return (p[0],)
+    (f_c,) = p
+    return (f_c,)
 
 
 TERM = Term(
@@ -19,9 +20,9 @@ TERM = Term(
     equation="y' = 2π f_c (y_nominal − y)",
     parameters=(Parameter("f_c", "Hz", lambda s: 15.0 * s.rate / (2.0 * np.pi), kind="inverse", sign=1),),
     source="Horowitz & Hill, The Art of Electronics, section 1.7",
-    lookalikes={
-        "channel-delay": "a delay turns all harmonics by one time, shrinks none: drive harder, or at two frequencies",
-        "drive-lag": "for a linear axis the two commute: record the angle, or drive harder",
+    confounders={
+        "channel-delay": "a delay is the same for all harmonics, without loss: use a larger drive, or two frequencies",
+        "drive-lag": "for a linear axis the two commute: record the angle, or use a larger drive",
     },
     corners=corners,
 )

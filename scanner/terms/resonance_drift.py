@@ -1,17 +1,18 @@
-"""A stiffness that settles to a new value while the recording runs (warming)."""
+"""Stiffness that relaxes to a new value during the recording (warming)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+from scanner.integrator.abi import TORQUE_LAW
 from scanner.terms.term import Parameter, Term
-from scanner.trajectory import TORQUE
 
 
-@njit(TORQUE, cache=True)
+@njit(TORQUE_LAW, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    return p[0] * nominal[2] * np.expm1(-max(t, 0.0) / p[1]) * theta, 0.0, 0.0
+    alpha, tau = p[0], p[1]
+    return alpha * nominal.k * np.expm1(-max(t, 0.0) / tau) * theta, 0.0, 0.0
 
 
 TERM = Term(
@@ -23,9 +24,9 @@ TERM = Term(
         Parameter("tau", "s", lambda s: 0.4 * s.duration, kind="log", starts=(-1.5, 0.0, 1.5)),
     ),
     source="Hopcroft, Nix & Kenny, J. Microelectromech. Syst. 19, 229 (2010)",
-    lookalikes={
-        "cubic-stiffness": "it follows amplitude, this follows time: record a second amplitude",
-        "charging": "the drive's modulation moves too: change the bias",
+    confounders={
+        "cubic-stiffness": "cubic stiffness follows amplitude, a drift follows time: record a second amplitude",
+        "charging": "charging changes the modulation by the drive too: change the bias",
     },
     torque=torque,
 )

@@ -1,19 +1,16 @@
-"""A sample that creeps under the scan."""
+"""A sample that moves at constant velocity during the scan."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    return signal - p[0] * view.time
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (v,) = p
+    return signal - v * context.time
 
 
 TERM = Term(
@@ -21,9 +18,9 @@ TERM = Term(
     stage="optics",
     equation="s = θ - v t",
     parameters=(Parameter("v", "rad/s", lambda s: 0.03 * s.amplitude / s.duration),),
-    source="uniform motion of the sample, told as the mirror's angle that would follow it",
-    lookalikes={
-        "resonance-drift": "a phase that drifts moves forward and backward sweeps apart, a sample moves both alike"
+    source="uniform motion of the sample, expressed as the rate at which the mirror would follow it",
+    confounders={
+        "resonance-drift": "a phase drift shifts forward and backward lines apart, a moving sample shifts both equally"
     },
     channels=("place",),
     output=output,

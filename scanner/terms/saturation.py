@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.arrays import Array
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
 def _clipped(size: Array, limit: float, noise: float) -> Array:
-    """Mean of min(size + noise, limit): the noise is added before the clipping, so its mean is bent as well."""
+    """Mean of min(size + noise, limit): the noise is added before the clipping, which changes its mean."""
     from scipy.special import ndtr
 
     if noise == 0.0:
@@ -23,9 +21,10 @@ def _clipped(size: Array, limit: float, noise: float) -> Array:
     return limit - noise * (z * ndtr(z) + density)
 
 
-def output(signal: Array, p: Sequence[float], view: View) -> Array:
-    noise = view.readout.noise_sd if view.readout else 0.0
-    return np.sign(signal) * _clipped(np.abs(signal), p[0], noise)
+def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (limit,) = p
+    noise = context.readout.noise_sd if context.readout else 0.0
+    return np.sign(signal) * _clipped(np.abs(signal), limit, noise)
 
 
 TERM = Term(
@@ -34,7 +33,7 @@ TERM = Term(
     equation="y = clip(y_nominal, −L, L)",
     parameters=(Parameter("limit", "V", lambda s: s.sense_peak, kind="log", spread=0.2, starts=(0.0, -0.4, -1.2)),),
     source="converter data sheets: input range",
-    lookalikes={"sensor-cubic": "no flat top in the histogram there: look at the largest samples"},
+    confounders={"sensor-cubic": "a cubic sensor makes no flat top in the histogram: look at the largest samples"},
     output=output,
-    at_output=True,
+    after_noise=True,
 )

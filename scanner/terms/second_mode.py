@@ -1,18 +1,19 @@
-"""Another mode of the structure, coupled to the mirror."""
+"""Another mode of the structure, coupled linearly to the mirror."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+from scanner.integrator.abi import TORQUE_LAW
 from scanner.terms.term import Parameter, Term
-from scanner.trajectory import TORQUE
 
 
-@njit(TORQUE, cache=True)
+@njit(TORQUE_LAW, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    w2 = 2.0 * np.pi * p[1]
-    return p[0] * nominal[2] * z0, z1, w2 * w2 * (theta - z0) - w2 / p[2] * z1
+    c, f2, q2 = p[0], p[1], p[2]
+    w2 = 2.0 * np.pi * f2
+    return c * nominal.k * z0, z1, w2 * w2 * (theta - z0) - w2 / q2 * z1
 
 
 TERM = Term(
@@ -22,15 +23,17 @@ TERM = Term(
     parameters=(
         Parameter("c", "1", lambda s: 0.01, sign=1),
         Parameter(
-            "f2", "Hz", lambda s: s.rate / 6.283185307179586, kind="log", starts=tuple(0.08 * i for i in range(-17, 18))
+            "f2", "Hz", lambda s: s.rate / (2.0 * np.pi), kind="log", starts=tuple(0.08 * i for i in range(-17, 18))
         ),
-        Parameter("Q2", "1", lambda s: 40.0, kind="log", starts=(-0.7,)),  # broad enough to be seen between two of them
+        Parameter(
+            "Q2", "1", lambda s: 40.0, kind="log", starts=(-0.7,)
+        ),  # broad enough to be detected between two start values of f2
     ),
-    hidden=(lambda s: s.amplitude, lambda s: s.amplitude * s.rate),
+    hidden_state_scales=(lambda s: s.amplitude, lambda s: s.amplitude * s.rate),
     source="Den Hartog, Mechanical Vibrations, 1956, section 3.2",
-    lookalikes={
-        "cross-axis-coupling": "its frequency is the other axis's: record the other axis",
-        "viscoelastic": "no peak of its own: sweep the drive past the peak",
+    confounders={
+        "cross-axis-coupling": "coupling has the frequency of the other axis: record the other axis",
+        "viscoelastic": "relaxation has no resonance peak: sweep the drive over the peak",
     },
     torque=torque,
 )

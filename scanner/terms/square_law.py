@@ -1,21 +1,18 @@
-"""An envelope detector that squares: the gain depends on the capacitance itself."""
+"""An envelope detector with a square law: the gain depends on the capacitance."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from scanner.arrays import Array
 from scanner.device import Amdm
-from scanner.terms.term import Parameter, Term, View
-
-Array = NDArray[np.float64]
+from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def modulate(capacitance: Array, p: Sequence[float], view: View) -> Array:
+def pre_demodulation(capacitance: Array, p: Sequence[float], context: SignalContext) -> Array:
+    (w,) = p
     change = capacitance - capacitance.mean()
-    return capacitance + p[0] * change * change
+    return capacitance + w * change * change
 
 
 TERM = Term(
@@ -24,7 +21,9 @@ TERM = Term(
     equation="y ∝ (C + C_p)²:  C → C + w (C − C̄)²,  w = 1/(2 (C̄ + C_p))",
     parameters=(Parameter("w", "1/F", lambda s: 3e10, sign=1),),
     source="chen2020, appendix: detector a_d v + b_d v²",
-    lookalikes={"profile-shape": "the circuit's C_p does not change it: change the circuit, or record the angle"},
+    confounders={
+        "profile-shape": "the profile does not depend on the circuit's C_p: change the circuit, or record the angle"
+    },
     applies=lambda axis, scales: isinstance(scales.readout, Amdm),
-    modulate=modulate,
+    pre_demodulation=pre_demodulation,
 )

@@ -1,18 +1,21 @@
-"""What a term is: one physical effect beyond the nominal laws, told once for simulator, diagnosis and estimators.
+"""The definition of a term: one physical effect beyond the nominal laws, for simulation, diagnosis and estimation.
 
-A term file holds one ``TERM``. Its law is one or more of these functions, in the order in which a signal meets them:
+A term file holds one ``TERM``. Its law is one or more of these functions, listed in the order in which a signal passes
+them:
 
-==============  ============================================================================================
-``constants``   ``(axis, p) -> axis``: other values in the nominal laws
-``voltage``     ``(voltage, p, view) -> voltage``: the drive, shape (n, 3) as in ``scanner.trajectory``
-``torque``      compiled with ``TORQUE``: torque and hidden states (mechanics)
-``bell``        compiled with ``BELL``: extra capacitance and its slope
-``modulate``    ``(capacitance, p, view) -> capacitance``: before an AMDM readout's sections
-``output``      ``(signal, p, view) -> signal``: the channel that the variant names; ``"place"`` is where on the
-                sample the beam stands, told as an angle
-``clock``       ``(time, p) -> time``: which time a sample of that channel shows
-``corners``     ``(p) -> corners``: first-order low-passes that the channel passes last [Hz]
-==============  ============================================================================================
+====================  =========================================================================================
+``constants``         ``(axis, p) -> axis``: changes values of the nominal laws
+``voltage``           ``(voltage, p, context) -> voltage``: the drive, shape (n, 3), see ``scanner.integrator.nodes``
+``torque``            compiled with ``scanner.integrator.abi.TORQUE_LAW``: torque and hidden states
+``capacitance``       compiled with ``scanner.integrator.abi.CAPACITANCE_LAW``: additional capacitance and its slope
+``pre_demodulation``  ``(capacitance, p, context) -> capacitance``: before the sections of an AMDM readout
+``output``            ``(signal, p, context) -> signal``: one of the term's ``channels``; the channel ``"place"`` is the
+                      position of the beam on the sample, as the mirror angle that would put it there [rad]
+``clock``             ``(time, p) -> time``: the time at which each sample of that channel was really taken [s]
+``corners``           ``(p) -> corners``: first-order low-pass sections that the channel passes last [Hz]
+====================  =========================================================================================
+
+``p`` holds the values of the parameters in their order. Compiled laws receive it as an array, others as a sequence.
 """
 
 from __future__ import annotations
@@ -22,32 +25,38 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scanner.arrays import Array
 from scanner.device import Axis, Readout
-from scanner.lowpass import low_passed
-
-Array = NDArray[np.float64]
+from scanner.interpolation import shift_samples
+from scanner.lowpass import apply_lowpass
 
 STAGES = ("drive", "mechanics", "capacitance", "readout", "timing", "optics")
-AMPLITUDES = ("linear", "inverse", "factor")
-"""Kinds of parameter that say how much of the effect there is: at x = 0 there is none."""
+"""Stages of the instrument, in the order in which a signal passes them."""
+
+AMPLITUDE_KINDS = ("linear", "inverse", "factor")
+"""Kinds of parameter that are the size of an effect: the effect vanishes at x = 0."""
+
+MAX_LOG_RATIO = 60.0
+"""Bound on the exponent of a ``factor`` or ``log`` parameter: exp(60) = 1e26 is beyond any physical ratio, and larger
+exponents, which a fit may try, would overflow."""
 
 
 @dataclass(frozen=True)
-class Scales:
-    """Natural sizes of one axis in one recording, from which prior ranges are told.
+class NaturalScales:
+    """Natural sizes of one axis in one recording, which set the prior ranges of parameters.
 
     Attributes:
         amplitude: of the motion [rad].
-        rate: its angular frequency, in a sweep that of the resonance [rad/s].
-        J, b, k: nominal mechanics.
+        rate: angular frequency of the motion; of the resonance where the drive is swept [rad/s].
+        J, b, k: nominal mechanics [kg m^2, N m s, N m / rad].
         duration: of the recording [s].
-        voltage_mean, voltage_rms: of the drive: mean, and deviation from it [V].
-        drive_rate: angular frequency of the drive's strongest line, of the motion where there is none [rad/s].
-        sense_rms, sense_peak: deviation of the sense signal from its mean, and its largest magnitude [V].
-        readout: of the axis, None where it has none.
-        line: frequency of a line in the residual that neither drive nor motion explains, None where there is none [Hz].
+        voltage_mean, voltage_rms: mean of the drive, and rms deviation from it [V].
+        drive_rate: angular frequency of the drive's strongest spectral line; of the motion without a drive [rad/s].
+        sense_rms, sense_peak: rms deviation of the sense signal from its mean, and its largest magnitude [V].
+        readout: of the axis; None where it has none.
+        line: frequency of a spectral line in the residual that neither drive nor motion explains; None where there is
+            none [Hz].
         two_axes: whether the other axis moves as well.
     """
 
@@ -69,29 +78,39 @@ class Scales:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a term, and how large it may plausibly be.
+    """One parameter of a term, and its prior range.
 
-    The diagnosis works with x, standard normal a priori. ``linear``: value = scale x. ``inverse``: value = scale / x
-    (a corner frequency: nothing happens at x = 0). ``factor``: value = scale exp(spread x), nothing happens at x = 0.
-    ``log``: value = scale exp(spread x), a time constant or frequency that does nothing by itself. ``line``: value =
-    scale + x / duration, the frequency of a line that was seen. ``fixed``: value = scale.
+    The diagnosis fits x, which is standard normal a priori. The physical value follows from x by the kind:
+
+    ===========  =======================  ==========================================================================
+    ``linear``   scale x                  the size of an effect
+    ``inverse``  scale / x                a corner frequency or time constant; no effect at x = 0
+    ``factor``   scale exp(spread x)      a factor on a nominal value; no effect at x = 0
+    ``log``      scale exp(spread x)      a time constant or frequency, which is not the size of an effect
+    ``line``     scale + x / duration     the frequency of a spectral line that was detected
+    ``fixed``    scale                    not fitted
+    ===========  =======================  ==========================================================================
 
     Attributes:
-        scale: natural size, from the recording's scales.
+        name: in device files.
+        unit: of the physical value [SI].
+        scale: natural size, from the scales of the recording.
+        kind: one of the above.
+        spread: standard deviation a priori of the logarithm, for ``factor`` and ``log``.
         sign: +1 or -1 where physics allows only x of that sign, 0 where both.
-        starts: values of x to search from, for a ``log`` parameter.
+        starts: values of x to start a search from, for a ``log`` parameter.
     """
 
     name: str
     unit: str
-    scale: Callable[[Scales], float]
+    scale: Callable[[NaturalScales], float]
     kind: str = "linear"
     spread: float = 1.0
     sign: int = 0
     starts: tuple[float, ...] = (0.0,)
 
-    def value(self, x: float, scales: Scales) -> float:
-        """The physical value of ``x``."""
+    def value(self, x: float, scales: NaturalScales) -> float:
+        """Return the physical value for ``x`` in a recording with the given scales."""
         size = self.scale(scales)
         if self.kind == "linear":
             return size * x
@@ -101,21 +120,21 @@ class Parameter:
             return size
         if self.kind == "line":
             return size + x / scales.duration
-        return size * float(np.exp(np.clip(self.spread * x, -60.0, 60.0)))
+        return size * float(np.exp(np.clip(self.spread * x, -MAX_LOG_RATIO, MAX_LOG_RATIO)))
 
 
 @dataclass(frozen=True)
-class View:
-    """What an array law may look at.
+class SignalContext:
+    """What a law on arrays receives beside its signal.
 
     Attributes:
-        time: of the samples, from the recording's start [s].
-        step: between them [s].
-        readout: nominal readout.
-        voltage: drive at the samples, terms included [V].
-        raw_voltage: drive at the samples as recorded [V].
-        theta, rate: the mirror's motion [rad, rad/s].
-        variant: which of the term's variants.
+        time: of the samples, from the start of the recording, shape (n,) [s].
+        step: between the samples [s].
+        readout: nominal; None where the axis has none.
+        voltage: drive at the samples, after the drive terms, shape (n,) [V].
+        raw_voltage: drive at the samples as recorded, shape (n,) [V].
+        theta, rate: motion of the mirror, shape (n,) [rad, rad/s].
+        variant: the text after the colon in the name of the term's channel, as in ``"sense:signal"``.
     """
 
     time: Array
@@ -137,17 +156,19 @@ class Term:
         stage: one of ``STAGES``.
         equation: the law with the term in it, as text.
         parameters: in the order in which the laws take them.
-        source: where it was published.
-        lookalikes: effect -> what tells the two apart.
-        hidden: scales of the hidden states (angle for angle), at most two. What they do to the mirror is in proportion
-            to the first parameter, an amplitude.
-        seeds: where the effect grows out of them instead, values of x of the hidden states to search from.
-        applies: whether an axis can show the effect at all, from its axis and scales.
-        channels: kinds of channel that ``output`` acts on, one variant each: ``"sense"``, ``"angle"``,
-            ``"intensity"`` or ``"place"``.
-        at_output: whether ``output`` acts last of all, on what the converter sees.
-        of_axis: on an electrode that all combs share, whether each axis may have the effect for itself.
-        coupled: whether ``torque`` looks at the other axis's angle.
+        source: where the law was published.
+        confounders: effect -> the measurement that distinguishes the two.
+        constants, voltage, torque, capacitance, pre_demodulation, output, clock, corners: the law, see the module.
+        hidden_state_scales: natural sizes of the hidden states, at most two. Their effect on the mirror is proportional
+            to the first parameter, which is the size of the effect.
+        initial_seeds: for an effect that grows from its hidden states: values of x of the hidden states to start a
+            search from.
+        applies: whether an axis can show the effect at all, from the axis and its scales.
+        channels: kinds of channel that ``output`` may act on: ``"sense"``, ``"angle"``, ``"intensity"`` or ``"place"``.
+            A device file selects one by its index, ``variant``.
+        after_noise: whether ``output`` acts on the sum of signal and noise, as the converter does.
+        per_axis: on an electrode that all combs share, whether each axis may have the effect separately.
+        coupled: whether ``torque`` depends on the angle of the other axis.
     """
 
     effect: str
@@ -155,67 +176,44 @@ class Term:
     equation: str
     parameters: tuple[Parameter, ...]
     source: str
-    lookalikes: Mapping[str, str] = field(default_factory=dict)
+    confounders: Mapping[str, str] = field(default_factory=dict)
     constants: Callable[[Axis, Sequence[float]], Axis] | None = None
-    voltage: Callable[[Array, Sequence[float], View], Array] | None = None
+    voltage: Callable[[Array, Sequence[float], SignalContext], Array] | None = None
     torque: Callable[..., Any] | None = None
-    bell: Callable[..., Any] | None = None
-    modulate: Callable[[Array, Sequence[float], View], Array] | None = None
-    output: Callable[[Array, Sequence[float], View], Array] | None = None
+    capacitance: Callable[..., Any] | None = None
+    pre_demodulation: Callable[[Array, Sequence[float], SignalContext], Array] | None = None
+    output: Callable[[Array, Sequence[float], SignalContext], Array] | None = None
     clock: Callable[[Array, Sequence[float]], Array] | None = None
     corners: Callable[[Sequence[float]], tuple[float, ...]] | None = None
-    hidden: tuple[Callable[[Scales], float], ...] = ()
-    seeds: tuple[tuple[float, ...], ...] = ()
-    applies: Callable[[Axis, Scales], bool] = lambda axis, scales: True
+    hidden_state_scales: tuple[Callable[[NaturalScales], float], ...] = ()
+    initial_seeds: tuple[tuple[float, ...], ...] = ()
+    applies: Callable[[Axis, NaturalScales], bool] = lambda axis, scales: True
     channels: tuple[str, ...] = ("sense",)
-    at_output: bool = False
-    of_axis: bool = False
+    after_noise: bool = False
+    per_axis: bool = False
     coupled: bool = False
 
     @property
-    def on_channel(self) -> bool:
-        """Whether the effect acts on a recorded channel, behind all that the mirror does."""
+    def acts_on_channel(self) -> bool:
+        """Whether the effect acts on a recorded channel, and not on the mirror."""
         return not (self.output is None and self.clock is None and self.corners is None)
 
-    def passed(self, signal: Array, p: Sequence[float], view: View) -> Array:
-        """``signal`` (n,) of the channel that the effect acts on, as it leaves the effect."""
+    def apply(self, signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+        """Return a signal (n,) of the channel that the effect acts on, after the effect."""
         if self.output is not None:
-            signal = self.output(signal, p, view)
+            signal = self.output(signal, p, context)
         if self.clock is not None:
-            signal = shifted(signal, (self.clock(view.time, p) - view.time) / view.step)
+            signal = shift_samples(signal, (self.clock(context.time, p) - context.time) / context.step)
         for corner in self.corners(p) if self.corners is not None else ():
-            signal = section(signal, corner, view.step)
+            signal = apply_lowpass(signal, corner, context.step)
         return signal
 
-    def values(self, x: Sequence[float], scales: Scales) -> tuple[float, ...]:
-        """Physical values of all parameters from the free ones' ``x``."""
+    def values(self, x: Sequence[float], scales: NaturalScales) -> tuple[float, ...]:
+        """Return the physical values of all parameters from ``x`` of the free ones."""
         free = iter(x)
         return tuple(p.value(0.0 if p.kind == "fixed" else next(free), scales) for p in self.parameters)
 
     @property
-    def free(self) -> tuple[Parameter, ...]:
+    def free_parameters(self) -> tuple[Parameter, ...]:
         """The parameters that are not fixed."""
         return tuple(p for p in self.parameters if p.kind != "fixed")
-
-
-def section(signal: Array, corner: float, step: float) -> Array:
-    """First-order low-pass of corner frequency ``corner`` [Hz] over ``signal`` (n,), from its own first value on.
-
-    A negative corner mirrors the change, so that a fit may walk through zero lag.
-    """
-    if not np.isfinite(corner):
-        return signal
-    slow = low_passed(signal, abs(corner), step)
-    return slow if corner > 0 else 2.0 * signal - slow
-
-
-def shifted(signal: Array, samples: Array | float) -> Array:
-    """``signal`` (n,) read ``samples`` later (negative: earlier) than each sample, by cubic interpolation."""
-    at = np.arange(signal.size) + samples
-    first = np.clip(np.floor(at).astype(np.intp), 1, signal.size - 3)
-    u = np.clip(at - first, -1.0, 2.0)
-    a, b, c, d = signal[first - 1], signal[first], signal[first + 1], signal[first + 2]
-    return (
-        -u * (u - 1) * (u - 2) / 6 * a + (u + 1) * (u - 1) * (u - 2) / 2 * b
-        - (u + 1) * u * (u - 2) / 2 * c + (u + 1) * u * (u - 1) / 6 * d
-    )  # fmt: skip

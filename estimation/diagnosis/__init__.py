@@ -1,0 +1,16 @@
+"""Diagnosis of unmodelled dynamics: which effect the nominal device omits, its size, and the updated device.
+
+The package contains the fit of the forward model to recordings and the selection of terms by evidence; simulation of
+test data, pictures and reports do not belong here. Modules in the order of the computation:
+
+1. ``data``: recorded inputs and outputs on the grids of the simulation.
+2. ``model``: simulated channels as a function of parameters; ``noise``: noise spectrum and whitening.
+3. ``fit``: whitened residuals, Jacobian and fit; ``initial``: initial state and growing windows.
+4. ``discrepancy``: flexible terms for effects without a law; ``screening``: first-order score of every candidate term.
+5. ``progressive_fit``: fits of candidates; ``exchange`` and ``pruning``: moves; ``selection``: the stepwise search.
+6. ``interference``: tones that are neither motion nor drive.
+7. ``profile_likelihood``: intervals; ``localisation``: channel, time and harmonics of a misfit;
+   ``identifiability``: detectability of every effect; ``experiment_design``: further measurements.
+8. ``discrepancy_law``, ``effect_curve``, ``posterior``: a fitted effect as formula, curve and draws.
+9. ``diagnose``: verdict and findings; ``predict``: open-loop prediction.
+"""

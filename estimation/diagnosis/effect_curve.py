@@ -1,0 +1,249 @@
+"""Curves of catalogue effects in their own variables, with 95 % bands from the posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.fit import Fit
+from estimation.diagnosis.model import Candidate
+from estimation.diagnosis.posterior import axis_trajectories, draw_parameters
+from scanner.arrays import Array
+from scanner.forward_model import (
+    ActiveTerm,
+    AxisTrajectory,
+    apply_channel_terms,
+    effective_drive,
+    sense_signal,
+    with_constants,
+)
+from scanner.integrator.abi import nominal_values
+from scanner.integrator.nodes import nodes_to_samples
+from scanner.integrator.trajectories import CapacitanceTerm
+
+CURVE_SAMPLES = 4000
+"""Times of the run at which the change by an effect is evaluated; a hundred for each bin of its curve."""
+
+CURVE_BINS = 40
+"""Bins of an effect's curve."""
+
+MODULATION_ADVANTAGE = 4.0
+"""Factor by which a time-dependent coefficient (of stiffness, damping or gain) has to reduce the unexplained variance
+against the best plain curve before it is shown in its place."""
+
+
+@dataclass(frozen=True)
+class EffectCurve:
+    """An effect in its own variables: a spring over angle, a drift over time, a lag over frequency, a gain over level.
+
+    Attributes:
+        x, y: shape (n,).
+        band: 95 % band of ``y``, shape (2, n).
+        x_label, y_label: quantity and unit.
+        logarithmic: whether ``x`` is drawn on a logarithmic axis.
+    """
+
+    x: Array
+    y: Array
+    band: Array
+    x_label: str
+    y_label: str
+    logarithmic: bool = False
+
+
+def effect_curve(fit: Fit, candidate: Candidate, bins: int = CURVE_BINS) -> EffectCurve | None:
+    """The curve of a catalogue effect with its 95 % band; None if it has a memory, or changes nothing in the run.
+
+    The motion stays as fitted, whatever the parameters: the band is that of the effect alone.
+    """
+    term = candidate.term
+    if term.effect in DISCREPANCY_TERMS or term.hidden_state_scales:
+        return None
+    scales = fit.model.scales(candidate.axis)
+    indices = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
+
+    def values(x: Array) -> tuple[float, ...]:
+        return term.values([float(v) for v in x[indices]], scales)
+
+    run_index = next(i for i, run in enumerate(fit.model.runs) if candidate.axis in run.inputs)
+    if term.corners is not None or term.clock is not None:
+        duration = fit.model.runs[run_index].duration
+        return _timing_curve(fit, candidate, values, scales.rate / (2.0 * np.pi), duration)
+    return _state_curve(fit, candidate, values, run_index, bins)
+
+
+def _timing_curve(
+    fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], frequency: float, duration: float
+) -> EffectCurve:
+    """Phase shift over frequency for low-pass sections, shift in time over time for a clock."""
+    term = candidate.term
+    if term.corners is not None:
+        corners = term.corners
+        x = np.geomspace(0.1 * frequency, 10.0 * frequency, 100)
+
+        def curve(p: Array) -> Array:
+            return np.degrees(np.sum([-np.arctan(x / corner) for corner in corners(values(p))], axis=0))
+
+        labels, shown, logarithmic = ("frequency (kHz)", "phase shift (°)"), 1e-3 * x, True
+    else:
+        clock = term.clock
+        assert clock is not None
+        x = np.linspace(0.0, duration, 100)
+
+        def curve(p: Array) -> Array:
+            return 1e6 * (clock(x, values(p)) - x)
+
+        labels, shown, logarithmic = ("time (ms)", "shift in time (µs)"), 1e3 * x, False
+    band = np.percentile([curve(p) for p in draw_parameters(fit)], [2.5, 97.5], axis=0)
+    return EffectCurve(shown, curve(fit.x), band, *labels, logarithmic)
+
+
+@dataclass(frozen=True)
+class _Representation:
+    """A way to show a change d(t): as coefficient c(variable) in d = c · regressor.
+
+    Attributes:
+        x_label, y_label: quantity and unit.
+        variable: shape (n,), over which the coefficient is shown.
+        regressor: shape (n,); ones for a plain curve.
+        scale: of the coefficient, into the unit of ``y_label``.
+    """
+
+    x_label: str
+    y_label: str
+    variable: Array
+    regressor: Array
+    scale: float = 1.0
+
+    def coefficients(self, change: Array, bins: int) -> Array:
+        """Least-squares coefficient in each bin, shape (bins,), NaN for an empty bin."""
+        place = _bin_indices(self.variable, bins)
+        weight = np.bincount(place, self.regressor**2, bins)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(weight > 0.0, np.bincount(place, change * self.regressor, bins) / weight, np.nan)
+
+    def unexplained(self, change: Array, bins: int) -> float:
+        """Mean square of ``change`` that the coefficients leave."""
+        fitted = self.coefficients(change, bins)[_bin_indices(self.variable, bins)] * self.regressor
+        return float(np.nanmean((change - fitted) ** 2))
+
+    def curve(self, change: Array, bins: int) -> Array:
+        return self.scale * self.coefficients(change, bins)
+
+
+def _state_curve(
+    fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], run_index: int, bins: int
+) -> EffectCurve | None:
+    """The change by an effect against the variable that explains it best."""
+    trajectories = axis_trajectories(fit, fit.x, run_index)
+    trajectory = trajectories[candidate.axis]
+    others = tuple(active for active in trajectory.active_terms if active.term is not candidate.term)
+    nominal = fit.model.nominal(candidate.axis, fit.x)
+    without = replace(trajectory, axis=with_constants(nominal, others), active_terms=others)
+    size = trajectory.angle.size
+    other_angle = next((t.angle for name, t in trajectories.items() if name != candidate.axis), np.zeros(size))
+    samples = np.linspace(0, size - 1, min(CURVE_SAMPLES, size)).astype(np.intp)
+
+    def change(x: Array) -> Array:
+        active = ActiveTerm(candidate.term, values(x), candidate.channel)
+        return _change(without, active, other_angle, samples)
+
+    fitted = change(fit.x)
+    if not fitted.any():
+        return None
+    shown = _choose_representation(_representations(without, candidate, samples), fitted, bins)
+    place = _bin_indices(shown.variable, bins)
+    x = np.bincount(place, shown.variable, bins) / np.maximum(np.bincount(place, minlength=bins), 1)
+    y = shown.curve(fitted, bins)
+    drawn = np.stack([shown.curve(change(p), bins) for p in draw_parameters(fit)])
+    visited = np.isfinite(y)
+    band = np.percentile(drawn[:, visited], [2.5, 97.5], axis=0)
+    return EffectCurve(x[visited], y[visited], band, shown.x_label, shown.y_label)
+
+
+def _representations(without: AxisTrajectory, candidate: Candidate, samples: NDArray[np.intp]) -> list[_Representation]:
+    """Plain curves first, then time-dependent coefficients, whose regressor is not constant."""
+    time, angle, rate = without.drive.time[samples], without.angle[samples], without.rate[samples]
+    one, quantity = np.ones(samples.size), _changed_quantity(candidate)
+    variables = {"angle (mrad)": 1e3 * angle, "rate (rad/s)": rate, "time (ms)": 1e3 * time}
+    variables["voltage (V)"] = without.voltage[samples]
+    modulations = {}
+    if candidate.term.torque is not None:
+        mechanics = without.axis.require_mechanics()
+        modulations["change of stiffness (%)"] = angle, -100.0 / mechanics.k
+        modulations["change of damping (%)"] = rate, -100.0 / mechanics.b
+    elif candidate.term.output is not None and not candidate.channel.startswith("angle") and without.axis.readout:
+        level = sense_signal(without.axis.readout, [without])[samples]
+        variables = {"level of the sense signal (V)": level} | variables
+        modulations["change of gain (%)"] = level - level.mean(), 100.0
+    usable = {name: v for name, v in variables.items() if np.ptp(v) > 1e-9 * np.abs(v).max()}
+    plain = [_Representation(name, quantity, v, one) for name, v in usable.items()]
+    products = [_Representation("time (ms)", name, 1e3 * time, r, scale) for name, (r, scale) in modulations.items()]
+    return plain + products
+
+
+def _choose_representation(options: Sequence[_Representation], change: Array, bins: int) -> _Representation:
+    plain = [option for option in options if not np.ptp(option.regressor)]
+    products = [option for option in options if np.ptp(option.regressor)]
+    best = min(plain, key=lambda option: option.unexplained(change, bins))
+    if products:
+        product = min(products, key=lambda option: option.unexplained(change, bins))
+        if MODULATION_ADVANTAGE * product.unexplained(change, bins) < best.unexplained(change, bins):
+            return product
+    return best
+
+
+def _changed_quantity(candidate: Candidate) -> str:
+    """Quantity and unit of what an effect changes at its stage."""
+    term = candidate.term
+    if term.torque is not None:
+        return "extra torque (N m)"
+    if term.capacitance is not None:
+        return "extra capacitance (F)"
+    if term.voltage is not None:
+        return "extra voltage (V)"
+    if candidate.channel.startswith("angle"):
+        return "change of the recorded angle (rad)"
+    return "change of the sense signal (V)"
+
+
+def _change(
+    without: AxisTrajectory, active: ActiveTerm, other_angle: Array, samples: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """What one effect changes at its stage along a fixed motion, shape of ``samples``."""
+    term, nominal = active.term, nominal_values(without.axis)
+    if term.torque is not None:
+        values, time = np.asarray(active.values, float), without.drive.time
+        torque = [
+            term.torque(time[i], without.angle[i], without.rate[i], other_angle[i], without.voltage[i], 0.0, 0.0,
+                        values, nominal)[0]
+            for i in samples
+        ]  # fmt: skip
+        return np.array(torque)
+    if term.capacitance is not None:
+        law = CapacitanceTerm(term.capacitance, active.values)
+        return law.evaluate(without.angle[samples], without.axis)[0]
+    if term.voltage is not None:
+        change = effective_drive(without.axis, [active], without.drive) - without.drive.voltage
+        return nodes_to_samples(change)[samples]
+    changed = replace(
+        without, axis=with_constants(without.axis, [active]), active_terms=(*without.active_terms, active)
+    )
+    if active.channel.startswith("angle"):
+        after, before = (
+            apply_channel_terms("angle", each.angle, [each], each.axis.readout) for each in (changed, without)
+        )
+        return (after - before)[samples]
+    readout = without.axis.readout
+    if readout is None:
+        return np.zeros(samples.size)
+    return (sense_signal(readout, [changed]) - sense_signal(readout, [without]))[samples]
+
+
+def _bin_indices(variable: Array, bins: int) -> NDArray[np.intp]:
+    low, high = variable.min(), variable.max()
+    return np.minimum((variable - low) / (high - low) * bins, bins - 1).astype(np.intp)

@@ -1,0 +1,173 @@
+"""Exchange moves of the selection: replace a term by one or two others that explain the same data.
+
+Where the nominal model has lost the phase of the motion, it cannot be linearised, and of two effects neither fits
+alone. A discrepancy term fits nearly any effect. Around its fit, with its own part removed, first-order scores rank
+the named terms, single and in pairs. The same exchange compares a named term with its confounders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.fit import Comparison, Fit, fit_models
+from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.progressive_fit import ABORT_MARGIN, satisfies_sign_constraints
+from estimation.diagnosis.screening import (
+    MAX_PRIOR_SIGMAS,
+    ProfiledLinearModel,
+    ScoreTest,
+    amplitude_indices,
+    linear_gain,
+    score_candidates,
+    set_amplitudes,
+)
+from scanner.arrays import Array
+
+MAX_EXCHANGE_FITS = 4
+"""Single terms, and pairs, with the largest predicted gains that are fitted in a term's place; each costs a fit."""
+
+MAX_EXCHANGES = 4
+"""Exchanges of one term for another before the search ends. It bounds the cost; every exchange lowers -2 log
+evidence."""
+
+MIN_EXCHANGE_GAIN = 0.1
+"""Fall of -2 log evidence from which a term is exchanged: twice the tolerance of a fit."""
+
+PAIR_ITERATIONS, EXCHANGE_ITERATIONS = 20, 8
+"""Largest numbers of iterations of a fit in the place of a discrepancy term, which starts far from the best fit, and in
+the place of a named term, where a confounder that needs more iterations will not become as good."""
+
+
+class RivalFit(NamedTuple):
+    """A rival of a term.
+
+    Attributes:
+        evidence_gap: its -2 log evidence minus that of the term.
+        candidate: the rival.
+        misfit_gap: its misfit (chi-square and penalty) minus that of the term, without the cost of its parameters.
+    """
+
+    evidence_gap: float
+    candidate: Candidate
+    misfit_gap: float
+
+
+RivalFits = tuple[RivalFit, ...]
+
+
+@dataclass(frozen=True)
+class ExchangeResult:
+    """A fit in which no exchange of a term lowers -2 log evidence.
+
+    Attributes:
+        fit: the best.
+        rivals: the other terms that were fitted in the place of each term, by its key.
+    """
+
+    fit: Fit
+    rivals: dict[str, RivalFits]
+
+
+def fit_exchanges(
+    comparison: Comparison, fit: Fit, removed: Sequence[Candidate], pool: Sequence[Candidate], pairs: bool = False
+) -> list[Fit]:
+    """Fits with one term of ``pool``, or with ``pairs`` also two, in the place of ``removed``; the best first."""
+    present = {candidate.key for candidate in fit.model.candidates}
+    new = [candidate for candidate in pool if candidate.key not in present]
+    scores = [s for s in score_candidates(comparison, fit, new, removed=removed) if np.any(s.columns)]
+    if not scores:
+        return []
+    ends = np.cumsum([0, *(score.columns.shape[1] for score in scores)])
+    columns = np.column_stack([score.columns[fit.rows] for score in scores])
+    normal, gradient, _ = ProfiledLinearModel(fit, fit.rows, removed).normal_equations(columns)
+
+    def predict_gain(group: tuple[int, ...]) -> tuple[float, Array]:
+        indices = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in group])
+        gain, estimate = linear_gain(normal[np.ix_(indices, indices)], gradient[indices])
+        return gain, np.clip(estimate, -MAX_PRIOR_SIGMAS, MAX_PRIOR_SIGMAS)
+
+    starts = []
+    for size in (1, 2) if pairs else (1,):
+        groups = [(*predict_gain(group), group) for group in combinations(range(len(scores)), size)]
+        groups.sort(key=lambda entry: -entry[0])
+        for rank, (_, estimate, group) in enumerate(groups):
+            confounds = size == 1 and any(_are_confounders(scores[group[0]].candidate, term) for term in removed)
+            if rank < MAX_EXCHANGE_FITS or confounds:
+                starts.append(_exchange_start(fit, removed, [scores[i] for i in group], estimate))
+    fits = fit_models(
+        comparison,
+        starts,
+        max_iterations=PAIR_ITERATIONS if pairs else EXCHANGE_ITERATIONS,
+        abort_above=fit.neg2_log_evidence + ABORT_MARGIN,
+    )
+    return sorted((f for f in fits if satisfies_sign_constraints(f)), key=lambda f: f.neg2_log_evidence)
+
+
+def _are_confounders(new: Candidate, removed: Candidate) -> bool:
+    """Whether a term is a known confounder of another, or of the same stage as a discrepancy term.
+
+    Such terms are always fitted: where an effect is large, a first-order score may miss them.
+    """
+    if removed.term.effect in DISCREPANCY_TERMS:
+        return new.term.stage == removed.term.stage
+    return removed.term.effect in new.term.confounders or new.term.effect in removed.term.confounders
+
+
+def _exchange_start(
+    fit: Fit, removed: Sequence[Candidate], new: Sequence[ScoreTest], estimate: Array
+) -> tuple[Model, Array]:
+    """The model with ``new`` in the place of ``removed``, and the start of its fit.
+
+    All other parameters start at their fitted values: the removed effect is large, so a first-order prediction of their
+    changes would not hold.
+    """
+    remaining = [candidate for candidate in fit.model.candidates if candidate not in removed]
+    model = Model(fit.model.runs, fit.model.device, [*remaining, *(score.candidate for score in new)], fit.model.mains)
+    x = model.map_parameters_from(fit.model, fit.x)
+    first = 0
+    for score in new:
+        key = score.candidate.key
+        indices = [i for i, f in enumerate(model.parameters) if f.kind == "term" and f.owner == key]
+        x[indices] = [score.x[score.model.index("term", key, model.parameters[i].name)] for i in indices]
+        width = score.columns.shape[1]
+        if amplitude_indices(model, score.candidate):
+            set_amplitudes(x, model, score.candidate, estimate[first : first + width])
+        first += width
+    return model, x
+
+
+def rivals_of(best: Fit, others: Sequence[Fit]) -> RivalFits:
+    """The last terms of ``others`` as rivals of the best fit."""
+    misfit = best.chi2 + best.penalty
+    return tuple(
+        RivalFit(
+            fit.neg2_log_evidence - best.neg2_log_evidence,
+            fit.model.candidates[-1],
+            fit.chi2 + fit.penalty - misfit,
+        )
+        for fit in others
+    )
+
+
+def exchange_to_convergence(comparison: Comparison, fit: Fit, pool: Sequence[Candidate], newest: int) -> ExchangeResult:
+    """Exchange each of the ``newest`` last terms for a better one until no exchange lowers -2 log evidence."""
+    rivals: dict[str, RivalFits] = {}
+    for _ in range(MAX_EXCHANGES):
+        rivals = {}
+        better = None
+        for candidate in fit.model.candidates[len(fit.model.candidates) - newest :]:
+            others = fit_exchanges(comparison, fit, (candidate,), pool)
+            if others and others[0].neg2_log_evidence < fit.neg2_log_evidence - MIN_EXCHANGE_GAIN:
+                better = others[0]
+                break
+            rivals[candidate.key] = rivals_of(fit, others)
+        if better is None:
+            break
+        fit = better
+    return ExchangeResult(fit, rivals)

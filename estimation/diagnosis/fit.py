@@ -1,0 +1,261 @@
+"""Output-error fit of a model to the recorded channels, with Gaussian priors.
+
+Trajectories are fitted, not derivatives. The initial state of every recording is a parameter, and every residual is
+whitened by the noise that was estimated before. A fifth of the samples is held out for validation.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.diagnosis.data import Run
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.noise import Whitener
+from estimation.least_squares import fit_levenberg_marquardt, laplace_neg2_log_evidence
+from scanner.arrays import Array, Mask
+
+TRAJECTORY_POOL = ThreadPoolExecutor(
+    len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+)
+"""Threads for independent trajectories, one per processor: compiled code and numpy release the interpreter lock."""
+
+MAX_PARALLEL_FITS = 2
+"""Fits at a time. It is the same number on every machine because the fits already finished decide which later fits are
+aborted: results must not depend on the machine."""
+
+FIT_POOL = ThreadPoolExecutor(MAX_PARALLEL_FITS)
+"""Threads for independent fits. They wait for ``TRAJECTORY_POOL`` and must not run in it."""
+
+TIME_BLOCKS = 20
+"""Blocks of equal duration into which a recording is divided for validation: short against a drift, long against a
+period of the motion."""
+
+VALIDATION_BLOCK_INTERVAL = 5
+"""Every fifth block is held out of every fit: a fifth of the data, spread over the recording."""
+
+COMPARED_WINDOW_SHARE = 0.98
+"""Share of a window whose samples are fitted: the whitening of the others depends on samples beyond the window."""
+
+DIVERGED_RESIDUAL, MAX_RESIDUAL = 1e6, 1e100
+"""Residual in place of one above the second number, whose square would overflow, of a trajectory that diverges."""
+
+INITIAL_STEP = 1e-4
+"""First difference step of every parameter, in prior standard deviations."""
+
+STEP_CHANGE_SIGMA = 0.3
+"""Change of the residual, as a norm [sigma], that a difference step causes: far above rounding, and still linear."""
+
+MIN_STEP, MAX_STEP, STEP_WITHOUT_EFFECT = 1e-7, 3e-2, 1e-2
+"""Bounds of a difference step, and the step of a parameter that changes nothing, in prior standard deviations."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model.
+
+    Attributes:
+        model: what was fitted.
+        x: parameters at the best fit, shape (p,), in prior standard deviations.
+        chi2: sum of squares of the fitted residuals.
+        penalty: what the priors add to the misfit.
+        residual: whitened, all samples of all channels, shape (N,).
+        jacobian: of the whitened residual, shape (N, p).
+        rows: mask of the fitted samples, shape (N,).
+        validation_rows: mask of the held-out samples, shape (N,).
+        neg2_log_evidence: by Laplace's method; lower is better.
+    """
+
+    model: Model
+    x: Array
+    chi2: float
+    penalty: float
+    residual: Array
+    jacobian: Array
+    rows: Mask
+    validation_rows: Mask
+    neg2_log_evidence: float
+
+    @property
+    def covariance(self) -> Array:
+        """Posterior covariance of x, shape (p, p)."""
+        fitted = self.jacobian[self.rows]
+        return np.asarray(np.linalg.inv(fitted.T @ fitted + np.diag(self.model.precision)))
+
+    @property
+    def validation_chi2(self) -> float:
+        """Reduced chi-square of the held-out samples."""
+        return float(np.mean(self.residual[self.validation_rows] ** 2))
+
+
+class Comparison:
+    """Whitened residuals of a model against recordings, with masks of the fitted and the held-out samples.
+
+    Attributes:
+        runs: the recordings.
+        whiteners: of each recording, one per channel in order.
+        rows, validation_rows: masks over all whitened samples, shape (N,).
+        time: of every whitened sample as a fraction of its recording, shape (N,).
+        channel: index of its channel, counted over all recordings, shape (N,).
+    """
+
+    def __init__(self, runs: Sequence[Run], whiteners: Sequence[Sequence[Whitener]]):
+        self.runs, self.whiteners = tuple(runs), tuple(tuple(row) for row in whiteners)
+        flat = [whitener for row in self.whiteners for whitener in row]
+        self.time = np.concatenate([whitener.time for whitener in flat])
+        self.channel = np.concatenate([np.full(whitener.samples, i) for i, whitener in enumerate(flat)])
+        compared = np.concatenate([whitener.keep for whitener in flat])
+        block = np.floor(self.time * TIME_BLOCKS).astype(int)
+        validation = block % VALIDATION_BLOCK_INTERVAL == VALIDATION_BLOCK_INTERVAL // 2
+        self.rows, self.validation_rows = compared & ~validation, compared & validation
+        self._whitened: dict[tuple[int, str, str, float], Array] = {}
+
+    def fitted(self, stop: float) -> Mask:
+        """Mask of the samples that are fitted over a window, the fraction ``stop`` of the recordings."""
+        return self.rows & (self.time < COMPARED_WINDOW_SHARE * stop) if stop < 1.0 else self.rows
+
+    def residual(self, model: Model, x: Array, stop: float = 1.0) -> Array:
+        """Whitened data minus model, shape (N,); zero beyond the window ``stop``.
+
+        A diverging trajectory gives huge but finite residuals, so that a fit rejects the step to it.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._residual(model, x, stop)
+
+    def low_frequency_excess_allowance(self, fit: Fit) -> float:
+        """Part of a fit's chi-square that slow noise may cause; see ``Whitener.low_frequency_excess_allowance``."""
+        total, first = 0.0, 0
+        fitted = np.where(fit.rows, fit.residual, 0.0)
+        for whitener in (whitener for row in self.whiteners for whitener in row):
+            if whitener.first > 1.0:
+                total += whitener.low_frequency_excess_allowance(fitted[first : first + whitener.samples])
+            first += whitener.samples
+        return total
+
+    def _residual(self, model: Model, x: Array, stop: float) -> Array:
+        parts = []
+        for run, whiteners, signals in zip(self.runs, self.whiteners, model.outputs(x, stop), strict=True):
+            for output, whitener, signal in zip(run.outputs, whiteners, signals, strict=True):
+                difference = np.zeros(output.data.size)
+                difference[: signal.size] = output.data[: signal.size] - signal
+                parts.append(whitener(difference))
+        residual = np.concatenate(parts)
+        return np.where(np.abs(residual) < MAX_RESIDUAL, residual, DIVERGED_RESIDUAL)
+
+    def _additive_columns(self, model: Model, stop: float) -> dict[int, Array]:
+        """Jacobian columns, by index in x, of the parameters that only add to a channel; they do not depend on x."""
+        columns: dict[int, Array] = {}
+        first = 0
+        for r, (run, whiteners) in enumerate(zip(self.runs, self.whiteners, strict=True)):
+            for output, whitener in zip(run.outputs, whiteners, strict=True):
+                for i, values in zip(*model.basis[(r, output.name)], strict=True):
+                    key = (r, output.name, model.parameters[i].name, stop)
+                    if key not in self._whitened:
+                        difference = -values.copy()
+                        difference[int(stop * values.size) if stop < 1.0 else values.size :] = 0.0
+                        self._whitened[key] = whitener(difference)
+                    columns[i] = np.zeros(self.time.size)
+                    columns[i][first : first + whitener.samples] = self._whitened[key]
+                first += whitener.samples
+        return columns
+
+    def jacobian(self, model: Model, x: Array, residual: Array, steps: Array, stop: float = 1.0) -> Array:
+        """Derivatives of the residual by one-sided differences, shape (N, p).
+
+        Args:
+            residual: at ``x``, shape (N,).
+            steps: difference steps, shape (p,); adapted in place so that each changes the residual by
+                ``STEP_CHANGE_SIGMA``.
+        """
+        columns = np.empty((x.size, residual.size)).T  # in memory column by column, as they are filled
+        additive = self._additive_columns(model, stop)
+        for i, column in additive.items():
+            columns[:, i] = column
+
+        trials = {}
+        for i in set(range(x.size)) - set(additive):
+            trials[i] = x.copy()
+            trials[i][i] += steps[i]
+        model.prefetch_trajectories(list(trials.values()), stop, TRAJECTORY_POOL.map)
+
+        def fill(i: int) -> None:
+            columns[:, i] = (self.residual(model, trials[i], stop) - residual) / steps[i]
+            norm = np.linalg.norm(columns[:, i])
+            steps[i] = np.clip(STEP_CHANGE_SIGMA / norm if norm else STEP_WITHOUT_EFFECT, MIN_STEP, MAX_STEP)
+
+        list(TRAJECTORY_POOL.map(fill, trials))
+        return columns
+
+
+def fit_model(
+    comparison: Comparison,
+    model: Model,
+    x: Array,
+    stop: float = 1.0,
+    max_iterations: int = 12,
+    steps: Array | None = None,
+    tolerance: float = 0.05,
+    abort_above: float = np.inf,
+    fixed: int | None = None,
+) -> Fit:
+    """Fit a model to the samples of a window; see ``estimation.least_squares.fit_levenberg_marquardt``.
+
+    Args:
+        x: start, shape (p,).
+        stop: end of the window as a fraction of the recordings.
+        max_iterations: largest number of new Jacobians.
+        steps: difference steps, shape (p,), adapted in place.
+        tolerance: stop when a step lowers the misfit by less.
+        abort_above: misfit of a competing fit. A fit above it that no longer approaches it is aborted.
+        fixed: index of a parameter that keeps its value.
+    """
+    steps = np.full(x.size, INITIAL_STEP) if steps is None else steps
+    rows = comparison.fitted(stop)
+    result = fit_levenberg_marquardt(
+        lambda trial: comparison.residual(model, trial, stop),
+        lambda trial, residual: comparison.jacobian(model, trial, residual, steps, stop),
+        x,
+        model.precision,
+        rows=rows,
+        fixed=() if fixed is None else (fixed,),
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        abort_above=abort_above,
+    )
+    return _finalise_fit(comparison, model, result.x, result.residual, result.jacobian, rows)
+
+
+def fit_models(
+    comparison: Comparison,
+    starts: Iterable[tuple[Model, Array]],
+    stop: float = 1.0,
+    max_iterations: int = 12,
+    tolerance: float = 0.05,
+    abort_above: float = np.inf,
+) -> list[Fit]:
+    """:func:`fit_model` for each model and start, ``MAX_PARALLEL_FITS`` at a time, in the order of ``starts``."""
+
+    def fit(start: tuple[Model, Array]) -> Fit:
+        return fit_model(comparison, *start, stop, max_iterations, tolerance=tolerance, abort_above=abort_above)
+
+    return list(FIT_POOL.map(fit, starts))
+
+
+def linearise_at(comparison: Comparison, model: Model, x: Array, stop: float = 1.0) -> Fit:
+    """Residual and Jacobian of a model at ``x``, as a fit without iterations."""
+    residual, steps = comparison.residual(model, x, stop), np.full(x.size, INITIAL_STEP)
+    for _ in range(2):  # the first Jacobian adapts the steps
+        jacobian = comparison.jacobian(model, x, residual, steps, stop)
+    return _finalise_fit(comparison, model, x, residual, jacobian, comparison.fitted(stop))
+
+
+def _finalise_fit(comparison: Comparison, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:
+    """A fit with its Laplace evidence."""
+    chi2, penalty = float(residual[rows] @ residual[rows]), float(model.precision @ (x * x))
+    information = jacobian[rows].T @ jacobian[rows]
+    evidence = laplace_neg2_log_evidence(chi2 + penalty, information, model.precision**-0.5)
+    return Fit(model, x, chi2, penalty, residual, jacobian, rows, comparison.validation_rows, evidence)

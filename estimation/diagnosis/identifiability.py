@@ -1,0 +1,181 @@
+"""Detectability of every effect in sigma, and its distance from the nearest confounder.
+
+Sensitivities are those of the whitened channels with the nominal values projected out. Two effects at a distance of d
+sigma are distinguished with probability Phi(d/2): 95 % at 3.3. From 4.5 on an effect is identified alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.diagnosis.data import Output
+from estimation.diagnosis.fit import Comparison, Fit, linearise_at
+from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener
+from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
+from scanner.arrays import Array
+from scanner.errors import BadInput
+from scanner.terms import Term
+
+DISCRIMINATION_SIGMA = 4.5
+"""Distance [sigma] from which an effect is identified alone. The wrong one of two effects at this distance is chosen
+with a probability of about 1 %."""
+
+
+ROUNDING = 1e-9
+"""Of a tolerance, below which a nominal value has not moved."""
+
+MAX_POSTERIOR_VARIANCE = 0.5
+"""Posterior over prior variance of a direction of the nominal values from which the recording does not determine it:
+there its own information is less than that of the stated tolerance."""
+
+
+def determined_only(fit: Fit) -> Array:
+    """Free numbers of a fit, shape of ``fit.x``, with nominal values moved only along directions that it determines.
+
+    Along the others (gain against torque in a linear drive) they stay at their nominal values. All other numbers take
+    the values that are best under that condition, to first order.
+    """
+    nominal = [i for i, f in enumerate(fit.model.parameters) if f.kind == "nominal"]
+    covariance = fit.covariance
+    variance, directions = np.linalg.eigh(covariance[np.ix_(nominal, nominal)])
+    fixed = directions[:, variance > MAX_POSTERIOR_VARIANCE].T
+    if not fixed.size:
+        return fit.x
+    condition = np.zeros((len(fixed), fit.x.size))
+    condition[:, nominal] = fixed
+    gain = covariance @ condition.T @ np.linalg.inv(condition @ covariance @ condition.T)
+    x = fit.x - gain @ (condition @ fit.x)
+    still = [i for i in nominal if abs(x[i]) < ROUNDING]
+    x[still] = 0.0
+    return np.asarray(x)
+
+
+@dataclass(frozen=True)
+class Detectability:
+    """Detectability of one effect of its natural size.
+
+    Attributes:
+        candidate: the effect, with axis and channel.
+        sigma: norm of its signal after all nominal values are refitted [sigma].
+        nearest: the confounder that fits its signal best; the effect itself if there is no other.
+        distance: norm that remains after that confounder is also fitted [sigma].
+    """
+
+    candidate: Candidate
+    sigma: float
+    nearest: Candidate
+    distance: float
+
+
+def detectability(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> list[Detectability]:
+    """Detectability of every effect that ``fit`` does not contain, the largest first.
+
+    An effect with a time constant or frequency has the median size over the grid of that parameter; for a confounder
+    the grid point that fits best is used.
+    """
+    taken = {each.key for each in fit.model.candidates}
+    candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in taken]
+    blocks = candidate_sensitivities(comparison, fit, candidates)
+    found = [(candidate, block) for candidate, own in zip(candidates, blocks, strict=True) for block in own]
+    if not found:
+        return []
+    sizes, apart = discrimination_distances(fit, [block for _, block in found], comparison.rows)
+    keys = np.array([candidate.key for candidate, _ in found])
+    effects = np.array([candidate.term.effect for candidate, _ in found])
+    shown = []
+    for candidate in candidates:
+        own = np.flatnonzero(keys == candidate.key)
+        if not own.size:
+            continue
+        i = own[np.argsort(sizes[own])[own.size // 2]]
+        others = np.flatnonzero(effects != candidate.term.effect)
+        nearest = min(others, key=lambda j: apart[i, j], default=i)
+        shown.append(Detectability(candidate, float(sizes[i]), found[nearest][0], float(apart[i, nearest])))
+    return sorted(shown, key=lambda each: -each.sigma)
+
+
+def candidate_sensitivities(comparison: Comparison, fit: Fit, candidates: Sequence[Candidate]) -> list[list[Array]]:
+    """Sensitivities to every candidate around ``fit``, shape (N, q), for each point of linearisation with any effect.
+
+    The effect of the unknown initial hidden state is projected out, because it is no evidence for the term.
+    """
+    rows, shown = comparison.rows, []
+    for screened in score_candidate_starts(comparison, fit, candidates):
+        blocks = []
+        for each in screened:
+            own, hidden = np.split(each.columns, [max(1, len(amplitude_indices(each.model, each.candidate)))], axis=1)
+            if np.any(own):
+                blocks.append(own - hidden @ np.linalg.lstsq(hidden[rows], own[rows], rcond=None)[0])
+        shown.append(blocks)
+    return shown
+
+
+def discrimination_distances(fit: Fit, blocks: Sequence[Array], rows: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Sizes and distances of effects of their natural size.
+
+    Args:
+        blocks: sensitivities to each, shape (N, q).
+
+    Returns:
+        (size [sigma], shape (n,); distance of effect i to effect j [sigma], shape (n, n)).
+    """
+    signals = np.stack([block[rows] @ np.full(block.shape[1], block.shape[1] ** -0.5) for block in blocks], axis=1)
+    return unexplained_norms(fit.jacobian[rows], fit.model.precision, signals, [block[rows] for block in blocks])
+
+
+def unexplained_norms(nominal: Array, precision: Array, signals: Array, blocks: Sequence[Array]) -> tuple[Array, Array]:
+    """Norms of ``signals`` that remain after nominal values, and also a confounder, are fitted within their priors.
+
+    Args:
+        nominal: sensitivities to the nominal values, shape (N, m); ``precision``: of their priors, (m,).
+        signals: shape (N, n).
+        blocks: sensitivities to each confounder, per prior standard deviation, shape (N, q).
+
+    Returns:
+        (norm after the nominal values, shape (n,); norm after confounder j too, shape (n, len(blocks))).
+    """
+    whole = np.column_stack([signals, *blocks])
+    cross = nominal.T @ whole
+    gram = whole.T @ whole - cross.T @ np.linalg.solve(nominal.T @ nominal + np.diag(precision), cross)
+    n = signals.shape[1]
+    ends = n + np.cumsum([0, *(block.shape[1] for block in blocks)])
+    size = np.maximum(np.diag(gram)[:n], 0.0)
+    apart = np.empty((n, len(blocks)))
+    for j in range(len(blocks)):
+        part = slice(ends[j], ends[j + 1])
+        overlap = gram[part, :n]
+        inner = gram[part, part] + np.eye(blocks[j].shape[1])
+        apart[:, j] = size - np.einsum("ij,ij->j", overlap, np.linalg.solve(inner, overlap))
+    return np.sqrt(size), np.sqrt(np.maximum(apart, 0.0))
+
+
+def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Comparison, Fit]:
+    """Comparison of a model with its own signals at ``x`` as recordings, and the perfect fit to them."""
+    runs = [
+        replace(run, outputs=tuple(replace(o, data=signal) for o, signal in zip(run.outputs, signals, strict=True)))
+        for run, signals in zip(model.runs, model.outputs(x), strict=True)
+    ]
+    made = Model(runs, model.device, model.candidates, model.mains)
+    comparison = Comparison(runs, whiteners)
+    return comparison, linearise_at(comparison, made, x)
+
+
+def stated_whitener(output: Output) -> Whitener:
+    """Whitener for the stated noise, or for that of the channel at high frequencies where none is stated.
+
+    Raises:
+        BadInput: the stated noise is zero.
+    """
+    if output.noise_sd is None:
+        return make_whitener(flat_psd(output.data, output.bins), output.data.size, output.guard)
+    if output.noise_sd <= 0.0:
+        hint = "state noise_var or noise_sd of the readout"
+        raise BadInput("its readout states no noise: every effect would show", channel=output.name, hint=hint)
+    thinning = output.step * output.full_rate
+    power = output.data.size * output.noise_sd**2 / thinning
+    return make_whitener(np.full(output.bins, power), output.data.size, output.guard)

@@ -1,0 +1,127 @@
+"""Initial values of a fit: angle and rate at the first sample, and windows of increasing length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimation.diagnosis.data import Output
+from estimation.diagnosis.fit import Comparison, Fit, fit_model, fit_models
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener, near_lines, noise_psd
+from scanner.arrays import Array
+
+FIRST_WINDOW_PERIODS = 5
+"""Periods of the motion in the first window. Errors of the nominal frequency cost less than half a cycle of phase in
+it."""
+
+WINDOW_GROWTH = 3.0
+"""Ratio of successive windows. A frequency fitted over one window predicts the phase over three times its length to
+much less than half a cycle."""
+
+EXCLUDED_HARMONICS = 12
+"""Multiples of the motion's frequency around which no noise is measured, because misfit concentrates there."""
+
+
+def window_schedule(model: Model) -> list[float]:
+    """Growing windows as fractions of the recordings, the last one 1.
+
+    Far below its resonance an axis follows its drive, so its phase cannot be lost and one window suffices.
+    """
+    if all(scales.rate < 0.5 * np.sqrt(scales.k / scales.J) for run in model.runs for scales in run.scales.values()):
+        return [1.0]
+    periods = min(run.duration * scales.rate / (2 * np.pi) for run in model.runs for scales in run.scales.values())
+    stops = [FIRST_WINDOW_PERIODS / periods]
+    while stops[-1] * WINDOW_GROWTH < 0.7:
+        stops.append(stops[-1] * WINDOW_GROWTH)
+    return [*stops, 1.0] if stops[0] < 0.7 else [1.0]
+
+
+def flat_whiteners(model: Model) -> list[list[Whitener]]:
+    """Whiteners for white noise with the level of each channel at high frequencies."""
+    return [[make_whitener(flat_psd(o.data, o.bins), o.data.size, o.guard) for o in run.outputs] for run in model.runs]
+
+
+def estimate_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
+    """Whiteners for the noise in the residual of a model at ``x``, estimated off the harmonics of motion and drive."""
+    made = []
+    for run, signals in zip(model.runs, model.outputs(x), strict=True):
+        row = []
+        for output, signal in zip(run.outputs, signals, strict=True):
+            motions = [run.scales[axis].rate / (2 * np.pi) for axis in output.axes]
+            harmonics = np.outer(motions, np.arange(1, EXCLUDED_HARMONICS + 1)).ravel()
+            lines = np.concatenate([harmonics, *(run.lines[axis] for axis in output.axes)])
+            width = 0.06 * max(motions)  # the width of the lines of a decaying motion
+            if _lines_overlap(output, lines, width, min(motions)):
+                width = 0.0
+            psd, first = noise_psd(output.data - signal, output.bins, output.step, lines, width)
+            row.append(make_whitener(psd, output.data.size, output.guard, first))
+        made.append(row)
+    return made
+
+
+def _lines_overlap(output: Output, lines: Array, width: float, motion: float) -> bool:
+    """Whether lines, as those of a multisine, exclude more than 80 % of the bins around the motion."""
+    frequency = np.arange(output.bins) / (output.data.size * output.step)
+    around = frequency < 1.5 * motion
+    return bool(near_lines(frequency, lines, width)[around].mean() > 0.8)
+
+
+def fit_initial_state(
+    comparison: Comparison, model: Model, stop: float, grid: tuple[int, int] = (9, 12), finalists: int = 3
+) -> Fit:
+    """Fit the initial angle and rate over the first window, from a grid of amplitudes and phases for each run.
+
+    An even capacitance determines the phase modulo pi only. Of two equivalent starts the first is used; the sign that
+    distinguishes them is not identifiable from the recording.
+    """
+    x = np.zeros(len(model.parameters))
+    starts: list[list[Array]] = []
+    for r, run in enumerate(model.runs):
+        for axis in run.inputs:
+            at = _start_indices(model, axis, r)
+            scored = []
+            for size in np.geomspace(0.03, 1.5, grid[0]):
+                for phase in 2 * np.pi * np.arange(grid[1]) / grid[1]:
+                    x[at] = size * np.cos(phase), size * np.sin(phase)
+                    scored.append((_misfit(model, r, x, stop), x[at].copy()))
+            scored.sort(key=lambda pair: pair[0])
+            x[at] = scored[0][1]
+            starts.append([values for _, values in scored[:finalists]])
+    starts_x = [x.copy() for _ in range(finalists)]
+    for i, one in enumerate(starts_x):
+        place = iter(starts)
+        for r, run in enumerate(model.runs):
+            for axis in run.inputs:
+                one[_start_indices(model, axis, r)] = next(place)[i]
+    fits = fit_models(comparison, [(model, one) for one in starts_x], stop, max_iterations=10)
+    return min(fits, key=lambda fit: fit.chi2 + fit.penalty)
+
+
+def _start_indices(model: Model, axis: str, r: int) -> list[int]:
+    return [i for i, f in enumerate(model.parameters) if (f.kind, f.owner, f.run) == ("start", axis, r)]
+
+
+def _misfit(model: Model, r: int, x: Array, stop: float) -> float:
+    total = 0.0
+    for output, signal in zip(model.runs[r].outputs, model.outputs(x, stop)[r], strict=True):
+        data = output.data[: signal.size]
+        total += float(np.mean((data - signal)[output.guard[0] :] ** 2)) / max(float(output.data.var()), 1e-300)
+    return total
+
+
+def fit_progressively(
+    comparison: Comparison, model: Model, x: Array, stops: Sequence[float], max_iterations: int = 6
+) -> list[Fit]:
+    """Fits over windows of increasing length, each started from the one before."""
+    steps = np.full(x.size, 1e-4)
+    fits: list[Fit] = []
+    for stop in stops:
+        last = stop == stops[-1]
+        fit = fit_model(
+            comparison, model, x, stop, 2 * max_iterations if last else max_iterations, steps, 0.05 if last else 1.0
+        )
+        fits.append(fit)
+        x = fit.x
+    return fits

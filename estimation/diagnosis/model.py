@@ -1,0 +1,418 @@
+"""Simulated channels of the nominal device with added terms, as a function of parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+
+from estimation.diagnosis.data import Output, Run, readout_of
+from scanner.arrays import Array
+from scanner.device import Amdm, Axis, Device, Readout
+from scanner.forward_model import (
+    ActiveTerm,
+    AxisTrajectory,
+    DriveInput,
+    angle_signal,
+    sense_signal,
+    simulate_axis,
+    simulate_batch,
+    simulate_coupled,
+    stated_terms,
+    with_constants,
+)
+from scanner.integrator.runge_kutta import LANES
+from scanner.terms import NaturalScales, Parameter, Term
+
+START_STATE_SD = 3.0
+"""Prior standard deviation of the initial angle and rate in amplitudes of the motion: so wide that data determine
+them."""
+
+REFERENCE_GAIN_RELATIVE_SD = 0.02
+"""Prior relative standard deviation of the gain of a reference angle: the default tolerance of the device file."""
+
+OFFSET_RELATIVE_SD = 0.05
+"""Prior standard deviation of an unstated offset in standard deviations of the signal. An offset of a well-adjusted
+readout is a few per cent of the signal."""
+
+MAINS_HZ = (50.0, 60.0)
+"""Mains frequencies [Hz]. Their first ``HUM_HARMONICS`` harmonics below the noise's standard deviation are part of the
+noise model, not an effect. A stronger tone is interference."""
+
+AXIS_CACHE_SIZE = 64
+"""Axes with fitted nominal values that a model caches: about as many as one Jacobian has columns."""
+
+HUM_HARMONICS = 3
+"""Harmonics of the mains that are part of the noise model, the n-th with a prior of 1/n: rectifiers leave these."""
+
+HUM_RELATIVE_SD = 0.5
+"""Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term on one axis, and the channel on which it acts."""
+
+    term: Term
+    axis: str
+    channel: str
+
+    @property
+    def key(self) -> str:
+        """Unique name: ``x.cubic-stiffness``, ``x.channel-delay:angle``."""
+        suffix = "" if self.channel == self.term.channels[0] else f":{self.channel}"
+        return f"{self.axis}.{self.term.effect}{suffix}"
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """One parameter of a model, in prior standard deviations: value = centre + scale x, or by its term's parameter.
+
+    Attributes:
+        kind: ``"nominal"``, ``"term"``, ``"start"``, ``"hidden"``, ``"gain"`` or ``"additive"``.
+        owner: axis, key of the candidate, or channel.
+        name: of the physical value (``"mechanics.k"``, ``"k3"``, ...).
+        run: index of its recording, -1 for all.
+        precision: 1 / variance of the prior of x, 1 for a standard normal prior.
+        parameter: of the term, None for other kinds.
+    """
+
+    kind: str
+    owner: str
+    name: str
+    run: int = -1
+    precision: float = 1.0
+    parameter: Parameter | None = None
+
+
+_Key = tuple[object, ...]
+
+
+class _Motion(NamedTuple):
+    """Everything but the drive that determines a motion; input of ``simulate_batch``."""
+
+    axis: Axis
+    active_terms: tuple[ActiveTerm, ...]
+    start: tuple[float, float]
+
+    def key(self, r: int, inputs: DriveInput) -> _Key:
+        """Key that is equal for equal motions; the readout does not affect the motion."""
+        axis, active_terms, start = self
+        return (
+            r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
+            *[(each.term.effect, each.values, each.hidden_state) for each in active_terms],
+        )  # fmt: skip
+
+
+_EMPTY_BASIS: tuple[list[int], Array] = [], np.zeros((0, 0))
+"""Basis of a channel without additive parameters: indices in x, and waveforms, shape (0, 0)."""
+
+
+class Model:
+    """Simulated channels of one or more recordings as a function of parameters x.
+
+    Attributes:
+        runs: the recordings.
+        device: the nominal device.
+        candidates: added terms.
+        free: specification of each element of x.
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        device: Device,
+        candidates: Sequence[Candidate] = (),
+        mains: Sequence[float] = MAINS_HZ,
+    ):
+        self.runs, self.device, self.candidates = tuple(runs), device, tuple(candidates)
+        self.mains = tuple(mains)
+        self.given = {name: stated_terms(axis) for name, axis in device.axes.items()}
+        self.axes = tuple(name for name in device.axes if any(name in run.inputs for run in runs))
+        self.parameters = tuple(self._parameter_specs())
+        self.precision = np.array([each.precision for each in self.parameters])
+        self._indices = {(f.kind, f.owner, f.name, f.run): i for i, f in enumerate(self.parameters)}
+        # Additive waveforms of each channel: added after all else, or before an output that clips.
+        self.basis, self._pre_saturation_basis = {}, {}
+        terms = [each.term for each in self.candidates] + [each.term for added in self.given.values() for each in added]
+        clips = any(term.after_noise for term in terms)
+        for r, run in enumerate(self.runs):
+            for output in run.outputs:
+                at, shapes = self._additive_basis(r, output)
+                if clips and output.kind == "sense":
+                    self._pre_saturation_basis[r, output.name] = at, _on_grid(shapes, output, run)
+                    at, shapes = _EMPTY_BASIS
+                self.basis[r, output.name] = at, shapes
+        self._trajectory_cache: dict[_Key, AxisTrajectory] = {}
+        self._prefetched: dict[_Key, AxisTrajectory] = {}
+        self._axis_cache: dict[_Key, Axis] = {}
+        self._nominal = {
+            axis: [(self._indices[("nominal", axis, name, -1)], name, value, tolerance)
+                   for name, value, tolerance in nominal_parameters(device, axis)]
+            for axis in self.axes
+        }  # fmt: skip
+        self._lock = Lock()
+
+    def _parameter_specs(self) -> list[ParameterSpec]:
+        free = [
+            ParameterSpec("nominal", axis, name)
+            for axis in self.axes
+            for name, _, _ in nominal_parameters(self.device, axis)
+        ]
+        for each in self.candidates:
+            free += [ParameterSpec("term", each.key, p.name, parameter=p) for p in each.term.free_parameters]
+        for r, run in enumerate(self.runs):
+            for axis in run.inputs:
+                free += [ParameterSpec("start", axis, name, r, START_STATE_SD**-2) for name in ("angle", "rate")]
+            for each in self.candidates:
+                if each.axis in run.inputs:
+                    free += [
+                        ParameterSpec("hidden", each.key, str(i), r) for i in range(len(each.term.hidden_state_scales))
+                    ]
+            for output in run.outputs:
+                if output.kind == "angle":
+                    free.append(ParameterSpec("gain", output.name, "gain", r))
+                free += [ParameterSpec("additive", output.name, name, r) for name in self.additive_terms(output)]
+        return free
+
+    def additive_terms(self, output: Output) -> dict[str, Array]:
+        """Waveforms that may add to a channel whatever the motion, each shape (n,): an unstated offset, and hum."""
+        found = {}
+        if output.kind == "angle" or not isinstance(readout_of(self.device, output.axes[0]), Amdm):
+            found["offset"] = np.full(output.data.size, OFFSET_RELATIVE_SD * output.data.std())
+        if output.kind == "sense":
+            noise = output.noise_sd or 0.0
+            for mains in self.mains:
+                found |= {
+                    name: HUM_RELATIVE_SD * noise * values
+                    for name, values in _hum_quadratures(mains, output.data.size, output.step).items()
+                }
+        return found
+
+    def _additive_basis(self, r: int, output: Output) -> tuple[list[int], Array]:
+        """Indices in x of the additive parameters of a channel, and their waveforms, shape (q, n)."""
+        shapes = self.additive_terms(output)
+        at = [self._indices[("additive", output.name, name, r)] for name in shapes]
+        return at, np.stack(list(shapes.values())) if shapes else np.zeros((0, output.data.size))
+
+    def index(self, kind: str, owner: str, name: str, run: int = -1) -> int | None:
+        """Index in x of one parameter, None if the model does not have it."""
+        return self._indices.get((kind, owner, name, run))
+
+    def scales(self, axis: str) -> NaturalScales:
+        """Natural scales of an axis, from the first recording that contains it."""
+        return next(run.scales[axis] for run in self.runs if axis in run.scales)
+
+    def values(self, candidate: Candidate, x: Array) -> tuple[float, ...]:
+        """Physical values of the parameters of a candidate."""
+        at = [self._indices[("term", candidate.key, p.name, -1)] for p in candidate.term.free_parameters]
+        return candidate.term.values([float(v) for v in x[at]], self.scales(candidate.axis))
+
+    def nominal(self, axis: str, x: Array) -> Axis:
+        """An axis with the nominal values from x, including a shared readout."""
+        parameters = self._nominal[axis]
+        factors = [max(1.0 + tolerance * x[i], 0.02) for i, _, _, tolerance in parameters]
+        key = (axis, *factors)
+        made = self._axis_cache.get(key)
+        if made is None:  # validating a device takes as long as simulating ten periods
+            tables: dict[str, dict[str, object]] = {}
+            for (_, name, value, _), factor in zip(parameters, factors, strict=True):
+                stage, own = name.split(".")
+                new = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+                tables.setdefault(stage, {})[own] = new
+            bare = replace(self.device.axis(axis), readout=readout_of(self.device, axis))
+            made = replace(bare, **{stage: replace(getattr(bare, stage), **table) for stage, table in tables.items()})
+            if len(self._axis_cache) > AXIS_CACHE_SIZE:
+                self._axis_cache.clear()
+            self._axis_cache[key] = made
+        return made
+
+    def active_terms(self, axis: str, r: int, x: Array) -> tuple[ActiveTerm, ...]:
+        """The stated and the added terms of an axis with their values, as the simulation takes them."""
+        made = list(self.given[axis])
+        for each in self.candidates:
+            if each.axis == axis:
+                scales = self.scales(axis)
+                hidden = [
+                    size(scales) * x[self._indices[("hidden", each.key, str(i), r)]]
+                    for i, size in enumerate(each.term.hidden_state_scales)
+                ]
+                padded = [*hidden, 0.0, 0.0][:2]
+                made.append(ActiveTerm(each.term, self.values(each, x), each.channel, (padded[0], padded[1])))
+        return tuple(made)
+
+    def outputs(self, x: Array, stop: float = 1.0) -> list[list[Array]]:
+        """Every compared channel of every run, up to the fraction ``stop`` of the recording."""
+        axes = {name: self.nominal(name, x) for name in self.axes}
+        return [self._run_outputs(run, r, axes, x, stop) for r, run in enumerate(self.runs)]
+
+    def full_signals(self, x: Array, r: int = 0) -> list[Array]:
+        """Every channel of one run on the integration grid, each shape (n + 1,), without additive waveforms."""
+        bare = np.where([each.kind == "additive" for each in self.parameters], 0.0, x)
+        return self._signals(self.runs[r], r, {name: self.nominal(name, x) for name in self.axes}, bare, 1.0)
+
+    def _run_outputs(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
+        signals = self._signals(run, r, axes, x, stop)
+        return [self._offset(o, o.sampled(signal), r, x) for o, signal in zip(run.outputs, signals, strict=True)]
+
+    def _signals(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
+        added = {name: self.active_terms(name, r, x) for name in run.inputs}
+        paths = self.trajectories(run, r, axes, added, x, stop)
+        signals = []
+        for output in run.outputs:
+            seen = [paths[name] for name in output.axes]
+            if output.kind == "sense":
+                readout = axes[output.axes[0]].readout
+                assert readout is not None
+                at, shapes = self._pre_saturation_basis.get((r, output.name), _EMPTY_BASIS)
+                signals.append(sense_signal(readout, seen, x[at] @ shapes[:, : seen[0].angle.size] if at else 0.0))
+            else:
+                signals.append(angle_signal(seen[0]))
+        return signals
+
+    def trajectories(self, run: Run, r: int, axes: dict[str, Axis], added: dict[str, tuple[ActiveTerm, ...]], x: Array,
+              stop: float) -> dict[str, AxisTrajectory]:  # fmt: skip
+        """Trajectories of all axes of one run."""
+
+        def moved(name: str, inputs: DriveInput, start: tuple[float, float], other: Array | None) -> AxisTrajectory:
+            if other is not None:
+                return simulate_axis(axes[name], added[name], inputs, start, other)
+            return self._cached_trajectory(axes[name], added[name], inputs, start, r)
+
+        inputs = {name: _truncate(each, stop) for name, each in run.inputs.items()}
+        coupled = any(each.term.coupled for terms in added.values() for each in terms)
+        starts = {name: self.start(name, r, x) for name in run.inputs}
+        return simulate_coupled(inputs, starts, coupled, moved)
+
+    def start(self, name: str, r: int, x: Array) -> tuple[float, float]:
+        """Initial angle [rad] and rate [rad/s] of an axis in one run."""
+        scales = self.runs[r].scales[name]
+        angle, rate = (x[self._indices[("start", name, each, r)]] for each in ("angle", "rate"))
+        return scales.amplitude * angle, scales.amplitude * scales.rate * rate
+
+    def prefetch_trajectories(
+        self, xs: Sequence[Array], stop: float, map_function: Callable[..., Iterable[object]] = map
+    ) -> None:
+        """Integrate in batches the trajectories that :meth:`outputs` needs at each of ``xs``.
+
+        Args:
+            map_function: applies a function to all elements of a list, possibly in parallel.
+        """
+        groups: dict[tuple[int, str, tuple[object, ...]], dict[_Key, _Motion]] = {}
+        for x in xs:
+            for name in self.axes:
+                axis = self.nominal(name, x)
+                for r, run in enumerate(self.runs):
+                    if name in run.inputs:
+                        motion = _Motion(axis, _motion_terms(self.active_terms(name, r, x)), self.start(name, r, x))
+                        inputs = _truncate(run.inputs[name], stop)
+                        key = motion.key(r, inputs)
+                        if key not in self._trajectory_cache:
+                            drive = tuple(each.values for each in motion.active_terms if each.term.voltage is not None)
+                            groups.setdefault((r, name, drive), {})[key] = motion
+
+        def moved(some: tuple[DriveInput, list[tuple[_Key, _Motion]]]) -> None:
+            paths = simulate_batch([motion for _, motion in some[1]], some[0])
+            with self._lock:
+                self._prefetched |= {key: path for (key, _), path in zip(some[1], paths, strict=True)}
+
+        batches = []
+        for (r, name, _), group in groups.items():
+            inputs, requests = _truncate(self.runs[r].inputs[name], stop), list(group.items())
+            parts = max(
+                -(-len(requests) // LANES), 1 + (len(requests) > LANES // 2)
+            )  # at least two parts of a large batch, for a second processor
+            batches += [(inputs, requests[i::parts]) for i in range(parts)]
+        list(map_function(moved, batches))
+
+    def _cached_trajectory(self, axis: Axis, added: tuple[ActiveTerm, ...], inputs: DriveInput,
+                    start: tuple[float, float], r: int) -> AxisTrajectory:  # fmt: skip
+        """Trajectory from the cache or a new integration; a changed readout needs no new one."""
+        motion = _Motion(axis, _motion_terms(added), start)
+        key = motion.key(r, inputs)
+        with self._lock:
+            path = self._prefetched.pop(key, None) or self._trajectory_cache.pop(key, None)
+        if path is None:
+            (path,) = simulate_batch([motion], inputs)
+        with self._lock:  # reinserted at the end: the least recently used one is dropped first
+            self._trajectory_cache[key] = path
+            if len(self._trajectory_cache) > 8 * len(self.runs):
+                self._trajectory_cache.pop(next(iter(self._trajectory_cache)))
+        return replace(path, axis=with_constants(axis, added), active_terms=added)
+
+    def _offset(self, output: Output, signal: Array, r: int, x: Array) -> Array:
+        gain = self.index("gain", output.name, "gain", r)
+        if gain is not None:
+            signal = signal * (1.0 + REFERENCE_GAIN_RELATIVE_SD * x[gain])
+        at, shapes = self.basis[(r, output.name)]
+        if not np.any(x[at]):
+            return signal
+        return signal + x[at] @ shapes[:, : signal.size]
+
+    def map_parameters_from(self, other: Model, x: Array) -> Array:
+        """``x`` of another model in the order of this one; parameters that the other lacks are zero."""
+        return np.array(
+            [0.0 if (i := other.index(f.kind, f.owner, f.name, f.run)) is None else x[i] for f in self.parameters]
+        )
+
+
+def _on_grid(shapes: Array, output: Output, run: Run) -> Array:
+    """Waveforms (q, n) from the clock of a channel to the integration grid, (q, N + 1), linearly: they are slow."""
+    grid = np.arange(len(run.inputs[output.axes[0]].voltage) + 1)
+    at, own = (grid - output.first) / output.stride, np.arange(shapes.shape[1])
+    return np.array([np.interp(at, own, shape) for shape in shapes]).reshape(len(shapes), grid.size)
+
+
+@lru_cache(maxsize=16)
+def _hum_quadratures(mains: float, n: int, step: float) -> dict[str, Array]:
+    """Quadratures of the first harmonics of the mains, the n-th with amplitude 1/n."""
+    turn = 2 * np.pi * step * np.arange(n)
+    return {
+        f"{name} {mains * multiple:g} Hz": wave(mains * multiple * turn) / multiple
+        for multiple in range(1, HUM_HARMONICS + 1)
+        for name, wave in (("cos", np.cos), ("sin", np.sin))
+    }
+
+
+def nominal_parameters(device: Device, axis: str) -> list[tuple[str, float | tuple[float, ...], float]]:
+    """Uncertain nominal values of an axis: (``stage.key``, nominal value, relative tolerance)."""
+    of = device.axis(axis)
+    readout = readout_of(device, axis)
+    shared = device.readout is not None and axis != next(iter(device.axes))
+    found: list[tuple[str, float | tuple[float, ...], float]] = []
+    stages: list[tuple[str, object, tuple[str, ...]]] = [
+        ("mechanics", of.mechanics, ("J", "b", "k")),
+        ("capacitance", of.capacitance, ("C0", "theta0", "theta_th", *(("Cb",) if isinstance(readout, Amdm) else ()))),
+        ("drive", of.drive, ("torque_per_volt",)),
+        ("readout", None if shared else readout, _readout_keys(readout)),
+    ]
+    for stage, table, keys in stages:
+        for key in keys:
+            value = getattr(table, key, None)
+            tolerance = device.tolerance(axis, key)
+            if value and tolerance > 0.0:
+                found.append((f"{stage}.{key}", value, tolerance))
+    return found
+
+
+def _readout_keys(readout: Readout | None) -> tuple[str, ...]:
+    if readout is None:
+        return ()
+    return {"amdm": ("a_cir", "b_cir", "lpf_hz"), "transimpedance": ("R_s",), "position": ("gain", "offset")}[
+        readout.kind
+    ]
+
+
+def _motion_terms(added: Iterable[ActiveTerm]) -> tuple[ActiveTerm, ...]:
+    """The terms that change the motion."""
+    return tuple(each for each in added if each.term.stage in ("drive", "mechanics", "capacitance"))
+
+
+def _truncate(inputs: DriveInput, stop: float) -> DriveInput:
+    if stop >= 1.0:
+        return inputs
+    return replace(inputs, voltage=inputs.voltage[: max(8, int(stop * len(inputs.voltage)))])

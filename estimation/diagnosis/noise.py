@@ -1,0 +1,194 @@
+"""Noise spectrum of the residual, and the whitening of residuals.
+
+Coloured noise, hum and a wrong stated noise level are not unmodelled effects. The spectrum is a running median over
+frequency without the harmonics of motion and drive, where a misfit concentrates, so that it estimates the noise only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct, idct
+from scipy.optimize import minimize_scalar
+
+from scanner.arrays import Array
+
+MEDIAN_TO_MEAN_POWER = float(np.log(2.0))
+"""Median over mean of a bin of the periodogram of Gaussian noise, which has an exponential distribution."""
+
+
+MEDIAN_RELATIVE_SPREAD = 1.44
+"""Relative standard deviation of a noise level from the median of n bins, times the root of n: 1 / ln 2 for an
+exponential distribution."""
+
+MIN_BINS_PER_BAND = 14
+"""Bins in a band of the running median, which then knows the level to 40 %."""
+
+EXTRAPOLATION_SLOPE_SD = 0.3
+"""Standard deviation of the power-law exponent with which the spectrum is extrapolated below its first band."""
+
+EXCLUDED_LOW_HALF_BINS = 6
+"""Half bins from 0 Hz on in which no noise is measured: so slow a variation may be an effect such as a drift."""
+
+SLOPE_PRIOR_SD = 0.6
+"""Prior standard deviation of the exponent by which slow noise may rise more steeply than extrapolated. Two medians of
+``MIN_BINS_PER_BAND`` bins determine the exponent no better."""
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """Turns a residual into samples of unit variance, limited to the compared band.
+
+    Attributes:
+        size: samples of the residual.
+        weights: one over the noise's standard deviation in every half bin that is compared, shape (samples,).
+        keep: which whitened samples are compared, shape (2 (m - 1),).
+        guard: samples at the start and end of the residual that are not compared.
+        psd: variance of every bin, shape (m,).
+        first: lowest bin whose noise was measured; the spectrum is extrapolated below it. 0 if all bins were measured.
+    """
+
+    size: int
+    weights: Array
+    keep: NDArray[np.bool_]
+    guard: tuple[int, int]
+    psd: Array
+    first: float = 0.0
+
+    @property
+    def samples(self) -> int:
+        """Number of whitened samples, including the guards."""
+        return int(self.weights.size)
+
+    @property
+    def time(self) -> Array:
+        """Position of every whitened sample as a fraction of the recording."""
+        return (np.arange(self.samples) + 0.5) / self.samples
+
+    def __call__(self, residual: Array) -> Array:
+        """Whitened residual, shape (samples,).
+
+        The compared part is continued by its mirror image at both ends (a cosine transform). A periodic continuation
+        would create a step for red noise, whose whitened form extends far into the recording and resembles a drift.
+        """
+        first, last = self.guard
+        seen = residual[first : residual.size - last]
+        mirrored = np.concatenate([seen[:first][::-1], seen, seen[seen.size - last :][::-1]])
+        return np.asarray(idct(dct(mirrored, norm="ortho")[: self.samples] * self.weights, norm="ortho"))
+
+    def low_frequency_excess_allowance(self, residual: Array) -> float:
+        """Fall of -2 log likelihood if the noise below the measured band rises more steeply than extrapolated.
+
+        Args:
+            residual: whitened, zero where it does not count, shape (samples,).
+        """
+        bins = 0.5 * np.arange(1, 2 * int(np.ceil(self.first)) - 1)
+        reach = np.log(self.first / bins)
+        power = dct(residual, norm="ortho")[1 : bins.size + 1] ** 2
+        share = np.count_nonzero(residual) / residual.size
+
+        def neg2_log_likelihood_change(slope: float) -> float:
+            return float(power @ np.expm1(-slope * reach) + share * slope * reach.sum() + (slope / SLOPE_PRIOR_SD) ** 2)
+
+        return -min(0.0, minimize_scalar(neg2_log_likelihood_change, bounds=(0.0, 4.0), method="bounded").fun)
+
+
+def make_whitener(psd: Array, size: int, guard: tuple[int, int], first: float = 0.0) -> Whitener:
+    """Whitener for noise of variance ``psd``, shape (m,), in the bins of a residual of ``size`` samples."""
+    samples = 2 * (psd.size - 1)
+    weights = np.sqrt(size) * np.exp(-0.5 * np.interp(0.5 * np.arange(samples), np.arange(psd.size), np.log(psd)))
+    time = (np.arange(samples) + 0.5) / samples
+    keep = (time >= guard[0] / size) & (time < 1.0 - guard[1] / size)
+    return Whitener(size, weights, keep, guard, psd, first)
+
+
+def flat_psd(data: Array, bins: int) -> Array:
+    """White noise with the level of the upper third of the spectrum of a signal, shape (bins,)."""
+    power = periodogram(data)
+    level = float(np.median(power[int(0.6 * power.size) : int(0.68 * power.size)]) / MEDIAN_TO_MEAN_POWER)
+    if level <= 0.0:
+        level = 1e-12 * max(float(np.mean(power)), 1e-300)
+    return np.full(bins, level)
+
+
+def periodogram(residual: Array) -> Array:
+    """Hann-windowed power of every bin, scaled so that white noise of variance 1 has ``residual.size`` in each."""
+    window = np.hanning(residual.size)
+    return np.abs(np.fft.rfft(residual * window)) ** 2 * (residual.size / np.sum(window**2))
+
+
+def noise_psd(
+    residual: Array, bins: int, step: float, lines: Sequence[float] | Array, width: float
+) -> tuple[Array, float]:
+    """Variance of the noise in every bin of the Fourier transform of a residual.
+
+    Args:
+        residual: shape (n,).
+        bins: number of bins wanted, from 0 Hz on.
+        step: between samples [s].
+        lines: frequencies of motion and drive, which are excluded [Hz].
+        width: excluded on either side of a line [Hz].
+
+    Returns:
+        variances, shape (bins,), and the lowest bin that was measured.
+    """
+    power = periodogram(_remove_slow_variation(residual))
+    frequency = np.arange(power.size) / (residual.size * step)
+    excluded = near_lines(frequency, lines, max(width, 3.0 / (residual.size * step)))
+    excluded[: EXCLUDED_LOW_HALF_BINS // 2] = True  # their noise is extrapolated from higher bins
+    usable = np.flatnonzero(~excluded)
+    if usable.size < 16:
+        usable = np.arange(1, power.size)
+    return _running_median(usable.astype(float), power[usable], np.arange(bins, dtype=float))
+
+
+def _remove_slow_variation(residual: Array) -> Array:
+    """A residual without its slowest variation, which would leak through the window into the measured bins."""
+    cosines = dct(residual, norm="ortho")
+    cosines[:EXCLUDED_LOW_HALF_BINS] = 0.0
+    return np.asarray(idct(cosines, norm="ortho"))
+
+
+def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -> NDArray[np.bool_]:
+    """Which frequencies lie within ``width`` of a line, shape of ``frequency`` (increasing)."""
+    marks = np.zeros(frequency.size + 1)
+    for line in np.asarray(lines, float):
+        low, high = np.searchsorted(frequency, [line - width, line + width])
+        marks[low] += 1
+        marks[high] -= 1
+    return np.cumsum(marks[:-1]) > 0
+
+
+def _running_median(position: Array, power: Array, wanted: Array) -> tuple[Array, float]:
+    """Mean power at the wanted positions, from medians over bands that widen with frequency.
+
+    Bands contain at least ``MIN_BINS_PER_BAND`` bins and span at least a quarter of their frequency.
+
+    Below the first band the spectrum is extrapolated with the slope between the first two. If red noise were assumed
+    flat there, it would be reported as a drift of the baseline.
+    """
+    edges = [0]
+    while edges[-1] < power.size:
+        edges.append(min(power.size, edges[-1] + max(MIN_BINS_PER_BAND, int(0.25 * edges[-1]))))
+    if len(edges) > 2 and edges[-1] - edges[-2] < MIN_BINS_PER_BAND:
+        edges.pop(-2)
+    centres, levels = [], []
+    for low, high in pairwise(edges):
+        centres.append(np.mean(position[low:high]))
+        # Two biases: the inverse of a noisy level is too large by its relative variance; the median of few bins is
+        # too high.
+        bias_correction = 1.0 + (MEDIAN_RELATIVE_SPREAD**2 - 0.72) / (high - low)
+        levels.append(np.median(power[low:high]) / MEDIAN_TO_MEAN_POWER * bias_correction)
+    floor = max(max(levels) * 1e-14, 1e-300)
+    heights = np.log(np.maximum(levels, floor))
+    smooth = np.interp(wanted, centres, heights)
+    if heights.size > 1:
+        slope = np.clip((heights[0] - heights[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
+        below = wanted < centres[0]
+        distance = np.log(centres[0] / np.maximum(wanted[below], 0.5))
+        smooth[below] += slope * distance + 0.5 * (EXTRAPOLATION_SLOPE_SD * distance) ** 2  # mean of a log-normal level
+    return np.exp(smooth), float(centres[0])

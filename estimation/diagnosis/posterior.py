@@ -1,0 +1,135 @@
+"""Quantities of a fit for the report: posterior draws, residuals by state, phase errors and waveforms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.diagnosis.fit import Comparison, Fit
+from scanner.arrays import Array
+from scanner.forward_model import AxisTrajectory
+
+POSTERIOR_DRAWS = 40
+"""Draws from the posterior behind a 95 % band. The band's ends have a standard error of a tenth of its width."""
+
+PORTRAIT_CELLS = 24
+"""Cells of a phase portrait along each side: about 4 % of the swing each."""
+
+PICTURE_HALF_WIDTH_PX = 200
+"""Pixels from the middle of a line to its end, in a picture of 400 pixels."""
+
+
+def axis_trajectories(fit: Fit, x: Array, run_index: int) -> dict[str, AxisTrajectory]:
+    """The trajectory of every axis of one run at the parameters ``x``."""
+    model = fit.model
+    run = model.runs[run_index]
+    axes = {name: model.nominal(name, x) for name in model.axes}
+    return model.trajectories(
+        run, run_index, axes, {name: model.active_terms(name, run_index, x) for name in run.inputs}, x, 1.0
+    )
+
+
+def draw_parameters(fit: Fit, count: int = POSTERIOR_DRAWS) -> Array:
+    """Parameters drawn from the Gaussian posterior, shape (count, len(x)); the same draws in every call."""
+    return np.random.default_rng(0).multivariate_normal(fit.x, fit.covariance, count, method="eigh")
+
+
+def phase_portrait(
+    comparison: Comparison, final: Fit, residuals: Sequence[Array], run_index: int, channel_index: int
+) -> list[Array]:
+    """Root mean square of each residual over the angle and rate of the mirror, in units of the noise.
+
+    Returns:
+        For each residual shape (PORTRAIT_CELLS, PORTRAIT_CELLS): rows are rates and columns angles, from minus to plus
+        the largest of the run; NaN for states that the mirror never had.
+    """
+    outputs_before = sum(len(run.outputs) for run in comparison.runs[:run_index])
+    output = comparison.runs[run_index].outputs[channel_index]
+    of_channel = comparison.channel == outputs_before + channel_index
+    trajectory = axis_trajectories(final, final.x, run_index)[output.axes[0]]
+    at = comparison.time[of_channel] * output.data.size * output.stride + output.first
+    grid = np.arange(trajectory.angle.size)
+    row, column = (
+        np.clip((np.interp(at, grid, v) / np.abs(v).max() + 1.0) / 2.0 * PORTRAIT_CELLS, 0, PORTRAIT_CELLS - 1)
+        for v in (trajectory.rate, trajectory.angle)
+    )
+    compared = (comparison.rows | comparison.validation_rows)[of_channel]
+    cell = (row.astype(np.intp) * PORTRAIT_CELLS + column.astype(np.intp))[compared]
+    count = np.bincount(cell, minlength=PORTRAIT_CELLS**2)
+    portraits = []
+    for residual in residuals:
+        power = np.bincount(cell, residual[of_channel][compared] ** 2, PORTRAIT_CELLS**2)
+        mean = np.where(count, power / np.maximum(count, 1), np.nan)
+        portraits.append(np.sqrt(mean).reshape(PORTRAIT_CELLS, PORTRAIT_CELLS))
+    return portraits
+
+
+@dataclass(frozen=True)
+class PhaseError:
+    """Phase error of an open-loop prediction of the motion.
+
+    Attributes:
+        time: of the run [s], shape (n,).
+        before: phase of the nominal device's motion, as fitted, against that of the improved device [rad].
+        after: half the 95 % band of the improved device's phase [rad].
+    """
+
+    time: Array
+    before: Array
+    after: Array
+
+    def blur_px(self, phase: Array) -> float:
+        """Root mean square of the displacement at the centre of a line by a phase error [px]."""
+        return PICTURE_HALF_WIDTH_PX * float(np.sqrt(np.mean(phase**2)))
+
+
+def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int, points: int = 200) -> PhaseError | None:
+    """Phase error of one axis; None if it is driven far below its resonance, where it follows the drive."""
+    run = final.model.runs[run_index]
+    scales = run.scales[axis]
+    if scales.rate < 0.5 * np.sqrt(scales.k / scales.J):
+        return None
+    at = np.linspace(0, len(run.inputs[axis].voltage), points * 16 + 1).astype(np.intp)
+
+    def phasor(fit: Fit, x: Array) -> Array:
+        trajectory = axis_trajectories(fit, x, run_index)[axis]
+        return np.asarray(trajectory.angle[at] - 1j * trajectory.rate[at] / scales.rate)
+
+    def mean_phase(product: Array) -> Array:
+        return np.angle(product[:-1].reshape(points, 16).mean(axis=1))
+
+    reference = phasor(final, final.x).conj()
+    spread = [mean_phase(phasor(final, x) * reference) for x in draw_parameters(final, POSTERIOR_DRAWS // 2)]
+    before = mean_phase(phasor(nominal, nominal.x) * reference)
+    time = run.inputs[axis].time[at[:-1]].reshape(points, 16).mean(axis=1)
+    return PhaseError(time, before, 1.96 * np.sqrt(np.mean(np.square(spread), axis=0)))
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """A few periods of one channel, measured and predicted.
+
+    Attributes:
+        time: of the run [s], shape (n,).
+        measured, before, after: the channel, and its prediction by the nominal and by the improved device, shape (n,).
+    """
+
+    time: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+def waveform(nominal: Fit, final: Fit, run_index: int, channel_index: int, samples: int = 120) -> Waveform:
+    """The part of a channel in which the nominal device is most wrong, without the samples that are not compared."""
+    output = final.model.runs[run_index].outputs[channel_index]
+    before, after = (fit.model.outputs(fit.x)[run_index][channel_index] for fit in (nominal, final))
+    start, stop = output.guard[0], output.data.size - output.guard[1]
+    length = min(samples, stop - start)
+    misfit = np.concatenate([[0.0], np.cumsum((output.data - before)[start:stop] ** 2)])
+    first = start + int(np.argmax(misfit[length:] - misfit[:-length]))
+    part = slice(first, first + length)
+    time = np.asarray(output.step * np.arange(first, first + length), np.float64)
+    return Waveform(time, output.data[part], before[part], after[part])

@@ -1,0 +1,58 @@
+"""Pruning of a discrepancy term: only the amplitudes that the data require remain.
+
+A discrepancy term has dozens of amplitudes, and the evidence charges for each. Unpruned, it would lose against two
+named terms even where a law with two of its amplitudes fits better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import comb, log
+
+import numpy as np
+
+from estimation.diagnosis.fit import Comparison, Fit, fit_model
+from estimation.diagnosis.model import Candidate, Model
+from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
+
+
+def prune_by_evidence(comparison: Comparison, fit: Fit) -> Fit | None:
+    """Refit with the required amplitudes of the last term, a discrepancy term; None if none is required.
+
+    The -2 log evidence of the result includes the choice of the amplitudes: every subset of the same size is equally
+    probable a priori.
+    """
+    candidate = fit.model.candidates[-1]
+    indices = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
+    required = _required_parameters(fit, indices)
+    if not required:
+        return None
+    names = {fit.model.parameters[i].name for i in required}
+    parameters = tuple(
+        p if p.kind == "fixed" or p.name in names else replace(p, kind="fixed", scale=lambda scales: 0.0)
+        for p in candidate.term.parameters
+    )
+    pruned = Candidate(replace(candidate.term, parameters=parameters), candidate.axis, candidate.channel)
+    model = Model(fit.model.runs, fit.model.device, [*fit.model.candidates[:-1], pruned], fit.model.mains)
+    refit = fit_model(comparison, model, model.map_parameters_from(fit.model, fit.x))
+    choice = 2.0 * log(comb(len(indices), len(required)))
+    return replace(refit, neg2_log_evidence=refit.neg2_log_evidence + choice)
+
+
+def _required_parameters(fit: Fit, indices: list[int]) -> list[int]:
+    """Those of the parameters ``indices`` whose removal raises -2 log evidence, to second order around the fit."""
+    jacobian, precision, x = fit.jacobian[fit.rows], fit.model.precision, fit.x
+    information, slope = jacobian.T @ jacobian, jacobian.T @ fit.residual[fit.rows]
+
+    def neg2_log_evidence(selected: list[int]) -> float:
+        free = np.isin(np.arange(x.size), selected)
+        step = np.where(free, 0.0, -x)
+        gradient = slope + precision * x + information @ step
+        inner = information[free][:, free]
+        step[free] = -np.linalg.solve(inner + np.diag(precision[free]), gradient[free])
+        chi2 = fit.chi2 + 2.0 * slope @ step + step @ information @ step
+        misfit = float(chi2 + precision @ (x + step) ** 2)
+        return laplace_neg2_log_evidence(misfit, inner, precision[free] ** -0.5)
+
+    remaining, _ = eliminate_backward(range(x.size), neg2_log_evidence, removable=indices)
+    return [i for i in remaining if i in indices]

@@ -1,0 +1,414 @@
+"""Stepwise selection of terms by evidence: nominal model, noise, one term after the other, joint refit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from estimation.diagnosis.clipping import clipped_readouts
+from estimation.diagnosis.data import Run
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.exchange import RivalFit, RivalFits, exchange_to_convergence, fit_exchanges, rivals_of
+from estimation.diagnosis.fit import Comparison, Fit, fit_model, fit_models
+from estimation.diagnosis.initial import (
+    estimate_whiteners,
+    fit_initial_state,
+    fit_progressively,
+    flat_whiteners,
+    window_schedule,
+)
+from estimation.diagnosis.interference import strongest_foreign_line
+from estimation.diagnosis.model import MAINS_HZ, Candidate, Model
+from estimation.diagnosis.noise import Whitener
+from estimation.diagnosis.progressive_fit import (
+    CHI2_ADEQUATE,
+    CHI2_LINEARISABLE,
+    DETECTION_THRESHOLD,
+    UNIQUE_NAME_THRESHOLD,
+    evidence_gain,
+    fit_candidates_progressively,
+    fit_screened_candidates,
+    is_significant,
+    satisfies_sign_constraints,
+)
+from estimation.diagnosis.pruning import prune_by_evidence
+from estimation.diagnosis.screening import all_candidates
+from scanner.device import Device
+from scanner.terms import Term
+
+Progress = Callable[[str], None]
+
+MAX_EFFECTS = 3
+"""Effects that are selected in one diagnosis. It bounds the cost: each effect needs a search among all candidates."""
+
+CHI2_LARGE = 10.0
+"""Held-out reduced chi-square of the nominal device above which several named terms may replace a discrepancy term.
+With a smaller misfit, three terms can explain nearly anything."""
+
+MAX_REMAINING_MISFIT_RATIO = 0.005
+"""Share of the nominal misfit that several named terms may leave to replace a discrepancy term: 7 % of its
+amplitude."""
+
+CHI2_INADEQUATE = 1.3
+"""Held-out reduced chi-square from which named terms do not explain the data: confounders of the true effect were
+chosen."""
+
+CHI2_DIVERGED = 100.0
+"""Reduced chi-square from which a fit has lost the phase of the motion, so that sensitivities around it say nothing
+about a further effect."""
+
+MAX_DISCREPANCY_FITS = 3
+"""Discrepancy terms that are pruned to compete with named terms. Pruning costs a fit each."""
+
+REFIT_MARGIN, REFIT_MARGIN_RELATIVE = 80.0, 0.1
+"""Candidates within this distance of the best in -2 log evidence, or within this share of the gain of the best, are
+refitted after the noise has been estimated anew, which may change their order."""
+
+
+@dataclass(frozen=True)
+class SelectionStep:
+    """One effect found: the fits without and with it, and the rivals that were tried in its place.
+
+    Attributes:
+        candidate: what was added.
+        before, after: fits without and with it, all else that was found in both, under the same noise.
+        rivals: its rivals when it was found.
+    """
+
+    candidate: Candidate
+    before: Fit
+    after: Fit
+    rivals: RivalFits
+
+
+@dataclass(frozen=True)
+class SelectionResult:
+    """What was found.
+
+    Attributes:
+        comparison: under the last noise.
+        nominal: the nominal device under the last noise.
+        final: the device with all that was found.
+        steps: effect by effect.
+    """
+
+    comparison: Comparison
+    nominal: Fit
+    final: Fit
+    steps: tuple[SelectionStep, ...] = field(default_factory=tuple)
+
+
+def select_terms(
+    runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: Progress = lambda text: None
+) -> SelectionResult:
+    """Select the terms that ``device`` omits from ``runs``.
+
+    Where a discrepancy term fits better than any single term but not adequately, several terms may act. They are
+    selected if, added one after the other, they leave almost no misfit and have the better evidence.
+
+    Args:
+        terms: candidates by effect.
+        say: called with a line of progress.
+    """
+    clipped = clipped_readouts(runs, terms.get("saturation"))
+    model = Model(runs, device, clipped)
+    say("nominal device")
+    stops = window_schedule(model)
+    comparison = Comparison(runs, flat_whiteners(model))
+    early = fit_progressively(comparison, model, fit_initial_state(comparison, model, stops[0]).x, stops)
+    comparison = Comparison(runs, _min_entropy_whiteners(_fit_hum_variants(comparison, early[-1])))
+    nominal = fit_model(comparison, model, early[-1].x)
+    named = [each for each in terms.values() if each.effect not in {certain.term.effect for certain in clipped}]
+    states = [SelectionState(comparison, nominal, select_mains_hum(comparison, nominal), {})]
+    states += _forward_steps(states[0], [*named, *DISCREPANCY_TERMS.values()], early, stops, say)
+    found = states[-1]
+    if (
+        _ends_with_discrepancy(found.best)
+        and found.nominal.validation_chi2 > CHI2_LARGE
+        and found.best.validation_chi2 > CHI2_ADEQUATE
+    ):
+        several = _accept_while_halving(states[-2], _forward_steps(states[-2], named, early, stops, say, found.tried))
+        enough = several.best.validation_chi2 - 1.0 < MAX_REMAINING_MISFIT_RATIO * (
+            several.nominal.validation_chi2 - 1.0
+        )
+        if (
+            enough
+            and fit_model(found.comparison, several.best.model, several.best.x).neg2_log_evidence
+            < found.best.neg2_log_evidence
+        ):
+            found = several
+    if _ends_with_discrepancy(found.best):
+        # with the required amplitudes only, its law is simpler and better determined
+        fewer = prune_by_evidence(found.comparison, found.best)
+        if fewer is not None and fewer.neg2_log_evidence < found.best.neg2_log_evidence:
+            found = replace(found, best=fewer)
+    elif len(found.best.model.candidates) > len(clipped):
+        found = _replace_terms_by_discrepancy(found)
+    steps = tuple(
+        _selection_step(found.comparison, found.nominal, found.best, each, found.rivals.get(each.key, ()))
+        for each in found.best.model.candidates
+    )
+    return SelectionResult(found.comparison, found.nominal, found.best, steps)
+
+
+@dataclass(frozen=True)
+class SelectionState:
+    """State of the selection.
+
+    Attributes:
+        nominal, best: the nominal device and the best fit, under the same noise.
+        rivals: of each term, by its key.
+        tried: fits of the named terms among which the last was chosen, under the noise before it.
+    """
+
+    comparison: Comparison
+    nominal: Fit
+    best: Fit
+    rivals: Mapping[str, RivalFits]
+    tried: Sequence[Fit] = ()
+
+
+def _forward_steps(
+    state: SelectionState,
+    terms: Sequence[Term],
+    early: Sequence[Fit],
+    stops: Sequence[float],
+    say: Progress,
+    tried: Sequence[Fit] = (),
+) -> Iterator[SelectionState]:
+    """States of the selection after each added term.
+
+    Args:
+        tried: fits of the candidates of the first step, if they exist already.
+    """
+    comparison, nominal, best, rivals = state.comparison, state.nominal, state.best, dict(state.rivals)
+    for _ in range(MAX_EFFECTS - len(best.model.candidates)):
+        taken = {each.key for each in best.model.candidates}
+        if taken:
+            # The noise was estimated before these terms were fitted, so it may contain part of their effect.
+            comparison = Comparison(best.model.runs, estimate_whiteners(best.model, best.x))
+            best = fit_model(comparison, best.model, best.x)
+        best = with_interference_line(comparison, best)
+        adequate = bool(rivals) and best.validation_chi2 < CHI2_ADEQUATE
+        pool = [each for each in terms if not (adequate and each.effect in DISCREPANCY_TERMS)]
+        candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
+        say(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
+        if tried:
+            fits, tried = list(tried), ()
+        elif best.chi2 < (CHI2_DIVERGED if taken else CHI2_LINEARISABLE) * best.rows.sum():
+            fits = fit_screened_candidates(comparison, best, candidates)
+        else:
+            if taken:
+                say(f"refitting windows with {', '.join(sorted(taken))}")
+                early = fit_progressively(
+                    comparison, best.model, best.model.map_parameters_from(early[0].model, early[0].x), stops
+                )
+            fits = fit_candidates_progressively(comparison, best.model, early, stops, candidates)
+        if not fits or best.neg2_log_evidence - fits[0].neg2_log_evidence < DETECTION_THRESHOLD:
+            return
+        say(f"refit with {fits[0].model.candidates[-1].key}")
+        comparison = Comparison(best.model.runs, estimate_whiteners(fits[0].model, fits[0].x))
+        by_name = [fit for fit in fits if not _ends_with_discrepancy(fit)]
+        reach = max(REFIT_MARGIN, REFIT_MARGIN_RELATIVE * (best.neg2_log_evidence - fits[0].neg2_log_evidence))
+        close = [fit for fit in fits if fit.neg2_log_evidence < fits[0].neg2_log_evidence + reach][:6]
+        close = fit_models(comparison, [(fit.model, fit.x) for fit in close])
+        close = sorted((fit for fit in close if satisfies_sign_constraints(fit)), key=lambda fit: fit.neg2_log_evidence)
+        before = fit_model(comparison, best.model, best.x, max_iterations=4)
+        nominal = before if not rivals else fit_model(comparison, nominal.model, nominal.x, max_iterations=4)
+        found = next((fit for fit in close if is_significant(comparison, before, fit)), None)
+        if found is None and before.validation_chi2 > CHI2_INADEQUATE and not taken:
+            found = next(
+                (fit for fit in close if _ends_with_discrepancy(fit)), None
+            )  # an effect is missing, of which only the stage is known
+        if found is None:
+            yield SelectionState(comparison, nominal, before, rivals, by_name)
+            return
+        named = [each for each in candidates if each.term.effect not in DISCREPANCY_TERMS]
+        leads = _rivals_of_newest(found, before, close)
+        if _ends_with_discrepancy(found):
+            say("replacing the discrepancy term by named terms")
+            comparison, before, found = _replace_discrepancy_by_terms(comparison, before, found, named)
+            close = []  # they were fitted under another noise if terms were exchanged
+        if not _ends_with_discrepancy(found) and found.chi2 < CHI2_DIVERGED * found.rows.sum():
+            # The first term may imitate several effects: where much misfit remains, it may be exchanged too.
+            kept = len(best.model.candidates) if found.validation_chi2 <= CHI2_LINEARISABLE else 0
+            newest = min(len(found.model.candidates) - kept, len(uncertain(found.model)))
+            final = exchange_to_convergence(comparison, found, named, newest)
+            earlier = _rivals_of_newest(final.fit, before, close)
+            leads = {key: _merge_rivals(own, earlier.get(key, ())) for key, own in final.rivals.items()}
+            found = final.fit
+        rivals |= leads
+        best = drop_redundant(comparison, found)
+        yield SelectionState(comparison, nominal, best, rivals, by_name)
+        if _ends_with_discrepancy(best):
+            return
+
+
+def _accept_while_halving(start: SelectionState, further: Iterator[SelectionState]) -> SelectionState:
+    """The last of ``further`` while each at least halves the misfit of the one before it."""
+    last = start
+    for state in further:
+        worth = state.best.validation_chi2 - 1.0 < 0.5 * (last.best.validation_chi2 - 1.0)
+        last = state
+        if not worth:
+            break
+    return last
+
+
+def _replace_discrepancy_by_terms(
+    comparison: Comparison, before: Fit, free: Fit, named: Sequence[Candidate]
+) -> tuple[Comparison, Fit, Fit]:
+    """Replace a discrepancy term by named terms if they have the better evidence, under newly estimated noise.
+
+    Returns:
+        comparison, the fit before, the fit with the terms or, where none will do, with the free correction.
+    """
+    others = fit_exchanges(comparison, free, free.model.candidates[-1:], named, pairs=True)
+    others = [
+        fit
+        for fit in others
+        if fit.neg2_log_evidence < free.neg2_log_evidence and is_significant(comparison, before, fit)
+    ]
+    if not others:
+        return comparison, before, free
+    found = others[0]
+    fewer = [fit for fit in others if len(fit.model.candidates) < len(found.model.candidates)]
+    # the second of two terms must be significant like any second effect
+    if fewer and not is_significant(comparison, fewer[0], found):
+        found = fewer[0]
+    comparison = Comparison(comparison.runs, estimate_whiteners(found.model, found.x))
+    return comparison, fit_model(comparison, before.model, before.x), fit_model(comparison, found.model, found.x)
+
+
+def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
+    """Replace named terms by one pruned discrepancy term if that lowers -2 log evidence by ``UNIQUE_NAME_THRESHOLD``.
+
+    All terms of one stage are replaced: they may be the first terms of the series of one law without a name, which can
+    be fitted only around a model that has the phase right. With a single term per stage, the most important term is
+    replaced if the fit is inadequate. The replaced terms are reported as rivals. Otherwise the state is unchanged.
+    """
+    comparison, fit = state.comparison, state.best
+    terms = uncertain(fit.model)
+    removed = max(([each for each in terms if each.term.stage == one.term.stage] for one in terms), key=len)
+    if len(removed) == 1:
+        if fit.validation_chi2 < CHI2_INADEQUATE:
+            return state
+        removed = [max(terms, key=lambda each: refit_without(comparison, fit, each).neg2_log_evidence)]
+    free = all_candidates(fit.model.device, fit.model, DISCREPANCY_TERMS.values())
+    others = [each for each in fit_exchanges(comparison, fit, removed, free) if each.chi2 < fit.chi2]
+    fewer = [
+        each
+        for each in (prune_by_evidence(comparison, other) for other in others[:MAX_DISCREPANCY_FITS])
+        if each is not None
+    ]
+    best = min(fewer, key=lambda each: each.neg2_log_evidence, default=fit)
+    if best.neg2_log_evidence > fit.neg2_log_evidence - UNIQUE_NAME_THRESHOLD:
+        return state
+    found = drop_redundant(comparison, best)
+    worse = fit.chi2 + fit.penalty - best.chi2 - best.penalty
+    leads = tuple(RivalFit(fit.neg2_log_evidence - best.neg2_log_evidence, each, worse) for each in removed)
+    return replace(state, best=found, rivals={**state.rivals, found.model.candidates[-1].key: leads})
+
+
+def _rivals_of_newest(found: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, RivalFits]:
+    """Rivals, among ``tried``, of the one term that ``found`` has in addition to ``before``."""
+    old = {each.key for each in before.model.candidates}
+    new = [each.key for each in found.model.candidates if each.key not in old]
+    less_likely = [
+        fit
+        for fit in tried
+        if fit.neg2_log_evidence > found.neg2_log_evidence and fit.model.candidates[-1].key not in new
+    ]
+    return {new[0]: rivals_of(found, less_likely)} if len(new) == 1 else {}
+
+
+def _merge_rivals(*parts: RivalFits) -> RivalFits:
+    """All rivals with their smallest gaps, sorted by evidence."""
+    nearest: dict[str, RivalFit] = {}
+    for lead in (each for part in parts for each in part):
+        known = nearest.setdefault(lead.candidate.key, lead)
+        nearest[lead.candidate.key] = RivalFit(
+            min(known.evidence_gap, lead.evidence_gap), lead.candidate, min(known.misfit_gap, lead.misfit_gap)
+        )
+    return tuple(sorted(nearest.values(), key=lambda each: each.evidence_gap))
+
+
+def _ends_with_discrepancy(fit: Fit) -> bool:
+    return bool(fit.model.candidates) and fit.model.candidates[-1].term.effect in DISCREPANCY_TERMS
+
+
+def drop_redundant(comparison: Comparison, fit: Fit) -> Fit:
+    """Refit without the terms that the others make redundant.
+
+    A confounder may be selected first and become redundant once the true effect is added. Hum is selected anew with and
+    without every term: in a short recording a drift and one mains frequency resemble the other mains frequency.
+    """
+    fit = select_mains_hum(comparison, fit)
+    several = len(fit.model.candidates) > 1
+    for each in uncertain(fit.model) if several else ():
+        less = select_mains_hum(comparison, refit_without(comparison, fit, each))
+        if not evidence_gain(comparison, less, fit):
+            return drop_redundant(comparison, less)
+    return fit
+
+
+def uncertain(model: Model) -> list[Candidate]:
+    """The terms of a model that a fit can decide on: those recognised in the samples have no free parameter."""
+    return [each for each in model.candidates if each.term.free_parameters]
+
+
+def refit_without(comparison: Comparison, fit: Fit, candidate: Candidate) -> Fit:
+    """The fit refitted with one of its terms taken out."""
+    kept = [each for each in fit.model.candidates if each is not candidate]
+    model = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
+    return fit_model(comparison, model, model.map_parameters_from(fit.model, fit.x))
+
+
+def _selection_step(
+    comparison: Comparison,
+    nominal: Fit,
+    best: Fit,
+    candidate: Candidate,
+    rivals: RivalFits,
+) -> SelectionStep:
+    """The selection step of one term of the final fit."""
+    alone = len(best.model.candidates) == 1 and bool(candidate.term.free_parameters)
+    return SelectionStep(candidate, nominal if alone else refit_without(comparison, best, candidate), best, rivals)
+
+
+def select_mains_hum(comparison: Comparison, fit: Fit) -> Fit:
+    """The fit with hum of the one mains frequency that the recordings show, or of none."""
+    return min(_fit_hum_variants(comparison, fit), key=lambda each: each.neg2_log_evidence)
+
+
+def _fit_hum_variants(comparison: Comparison, fit: Fit) -> list[Fit]:
+    """The fit without hum, and with hum of each mains frequency alone."""
+    heard = ((), *((each,) for each in MAINS_HZ))
+    models = [Model(fit.model.runs, fit.model.device, fit.model.candidates, mains) for mains in heard]
+    return fit_models(
+        comparison, [(model, model.map_parameters_from(fit.model, fit.x)) for model in models], max_iterations=3
+    )
+
+
+def _min_entropy_whiteners(fits: Iterable[Fit]) -> list[list[Whitener]]:
+    """The whiteners with the lowest noise entropy among those of the fits.
+
+    Hum of both mains frequencies together resembles a drift of the baseline and would raise the estimate of slow noise.
+    """
+    found = [estimate_whiteners(fit.model, fit.x) for fit in fits]
+    return min(found, key=lambda noise: sum(float(np.log(each.psd).sum()) for row in noise for each in row))
+
+
+def with_interference_line(comparison: Comparison, fit: Fit) -> Fit:
+    """The same fit, with the strongest interfering line in the natural scales of its runs."""
+    line = strongest_foreign_line(fit)
+    if line is None:
+        return fit
+    runs = tuple(
+        replace(run, scales={axis: replace(scales, line=line) for axis, scales in run.scales.items()})
+        for run in fit.model.runs
+    )
+    model = Model(runs, fit.model.device, fit.model.candidates, fit.model.mains)
+    return replace(fit, model=model)

@@ -1,0 +1,24 @@
+"""Motion from the drive, with phases measured in the picture."""
+
+from __future__ import annotations
+
+from estimation.estimators.estimator import Estimator
+from scanner.device import Device
+from scanner.motion import Motion
+from scanner.recording import Recording
+
+
+def run(recording: Recording, device: Device) -> Motion:
+    from estimation.tracker.drive_only import track_drive_only
+
+    return track_drive_only(recording, device)
+
+
+ESTIMATOR = Estimator(
+    name="picture",
+    summary="averaged dynamics under the drive; a reconstruction measures the remaining phase errors in the picture",
+    needs="the drive of every axis; drive and mechanics of the device; an intensity for the phases",
+    use_when="no sense signal was recorded",
+    run=run,
+    source="docs/explanation/image_phase.md",
+)

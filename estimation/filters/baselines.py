@@ -1,0 +1,169 @@
+"""Motion without a filter: constant phase and amplitude, or the angle that a position sensor measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
+from estimation.initial import fit_initial_motion
+from estimation.reference import PhaseReference, absolute_reference, dominant_frequency
+from estimation.signals import intensity_clock, is_capacitive, phase_reference, sense_channels
+from scanner.arrays import Array
+from scanner.channel import Channel, check_signal
+from scanner.device import Axis, Device, Position
+from scanner.errors import BadInput, ChannelMissing
+from scanner.lock_in import block_length, block_phasors, unwrap_phase
+from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.recording import Recording
+
+CONSTANT_POINTS = 200
+"""Points of the slow clock of a constant motion: only a chirped drive's frequency changes along it."""
+
+WHITE_NOISE_DIFFERENCE_ORDER = 6
+"""Order of the differences by which a sensor's noise is measured: sixth differences suppress an oversampled motion
+completely, and of white noise they have sqrt(924) times the standard deviation."""
+
+
+def estimate_constant(recording: Recording, device: Device) -> Motion:
+    """Phase and amplitude of the first cycles, held for the whole recording, as a calibration before a scan gives.
+
+    Its ``phase_sd`` is that of the calibration and does not include drift.
+
+    Raises:
+        BadInput: as ``sense_channels`` and ``fit_initial_motion``.
+    """
+    axes = {}
+    for sense in sense_channels(recording, device):
+        even = is_capacitive(sense.readout)
+        references = {name: phase_reference(recording, device, name, sense.channel, even) for name in sense.axes}
+        start = fit_initial_motion(sense, device, references)
+        rate, first, n = intensity_clock(recording, sense.channel)
+        sampled = first + np.arange(n) / rate
+        time = np.linspace(sense.channel.start, sense.channel.end, CONSTANT_POINTS)
+        for name in sense.axes:
+            motion, reference = start.axes[name], references[name]
+            axes[name] = AxisMotion(
+                time=time,
+                phase=np.full(CONSTANT_POINTS, motion.phase),
+                amplitude=np.full(CONSTANT_POINTS, motion.amplitude),
+                frequency=reference.frequency_at(time),
+                phase_sd=np.full(CONSTANT_POINTS, motion.phase_sd),
+                angle=SampledAngle(motion.amplitude * np.sin(reference.phase(sampled) + motion.phase), rate, first),
+                reference=reference.kind,
+                sign=motion.sign,
+            )
+    return Motion(axes, "constant", {"calibrated_over_s": start.window})
+
+
+def estimate_from_sensor(recording: Recording, device: Device) -> Motion:
+    """Motion from the angle channels, or from position readouts where there are none; the sign is known.
+
+    Raises:
+        ChannelMissing: an axis has neither. BadInput: a channel cannot be used.
+    """
+    axes = {}
+    for name, axis in device.axes.items():
+        channel, scale, zero, noise_sd = find_position_signal(recording, axis, name)
+        check_signal(channel)
+        angle = (channel.read() - zero) / scale
+        reference = reference_from_drive_or_signal(recording, device, name, channel)
+        axes[name] = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
+    return Motion(axes, "sensor", {})
+
+
+def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[Channel, float, float, float | None]:
+    """(channel, gain, offset, noise sd in rad or None where not stated) of the best position signal of one axis."""
+    if f"angle_{name}" in recording:
+        return recording[f"angle_{name}"], 1.0, 0.0, None
+    if f"sense_{name}" in recording and isinstance(axis.readout, Position):
+        readout = axis.readout
+        return recording[f"sense_{name}"], readout.gain, readout.offset, readout.noise_sd / abs(readout.gain)
+    raise ChannelMissing(
+        f"is not in the recording and sense_{name} is no position readout",
+        file=recording.path,
+        channel=f"angle_{name}",
+        hint=f"choose another estimator, or record it; there are {', '.join(sorted(recording.channels))}",
+    )
+
+
+def reference_from_drive_or_signal(recording: Recording, device: Device, name: str, channel: Channel) -> PhaseReference:
+    """The phase reference of one axis from its drive, or from a position signal where no drive is known."""
+    if f"drive_{name}" in recording and device.axis(name).drive is not None:
+        return phase_reference(recording, device, name)
+    axis = device.axis(name)
+    band = (0.8 * axis.resonance, 1.25 * axis.resonance) if axis.mechanics else (0.0, np.inf)
+    return absolute_reference(dominant_frequency(channel, *band), channel.start, channel.end)
+
+
+def axis_motion_from_angle(
+    angle: Array, channel: Channel, reference: PhaseReference, noise_sd: float | None, clock: tuple[float, float, int]
+) -> AxisMotion:
+    """The motion of one axis from its measured angle.
+
+    Args:
+        angle: at the samples of ``channel``, shape (n,) [rad].
+        noise_sd: white noise of the sensor, per sample [rad]; measured where None.
+        clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
+
+    Raises:
+        BadInput: the channel is shorter than two blocks.
+    """
+    rate = channel.sample_rate
+    block = block_length(reference.frequency, rate, BLOCK_CYCLES)
+    time, phasors = block_phasors(angle, rate, channel.start, reference.frequency, block)
+    if time.size < 2:
+        raise BadInput(
+            f"is too short to tell its phase: {2 * block} samples are needed",
+            file=channel.file,
+            channel=channel.name,
+            hint="record for longer",
+        )
+    amplitude = np.abs(phasors)
+    if noise_sd is None:
+        differences = np.diff(angle[: 1 << 18], n=WHITE_NOISE_DIFFERENCE_ORDER)
+        noise_sd = float(np.median(np.abs(differences)) / 0.6745 / np.sqrt(924.0))
+    phase = unwrap_phase(np.angle(phasors) - reference.phase(time))
+    return AxisMotion(
+        time=time,
+        phase=phase,
+        amplitude=amplitude,
+        frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
+        phase_sd=noise_sd / np.maximum(amplitude, 1e-300) * np.sqrt(3.0 / block),  # 3/N: Hann weights, 2/N unweighted
+        angle=SampledAngle(resample_to_clock(angle, channel, clock), clock[0], clock[1]),
+        reference=reference.kind,
+        sign=f"known: {channel.name}",
+    )
+
+
+def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool]) -> Motion:
+    """The motion with the sign of each axis reversed where the user asks for it or an angle channel shows it.
+
+    An even capacitance does not distinguish theta from -theta.
+
+    Args:
+        flips: axes that the user reverses. An angle channel decides only where the sign is ambiguous.
+    """
+    from dataclasses import replace
+
+    axes = {}
+    for name, axis in motion.axes.items():
+        turn, sign = flips.get(name, False), axis.sign
+        if sign == "ambiguous" and f"angle_{name}" in recording and not turn:
+            turn, sign = _opposes(axis, recording[f"angle_{name}"]), f"known: angle_{name}"
+        elif turn:
+            sign = f"known: --flip-{name}"
+        if turn:
+            axis = axis.negated()
+        axes[name] = replace(axis, sign=sign)
+    return replace(motion, axes=axes)
+
+
+def _opposes(axis: AxisMotion, angle: Channel) -> bool:
+    """Whether the first samples of a motion are anticorrelated with a measured angle."""
+    n = min(axis.angle.size, 100_000)
+    time = axis.angle.start + np.arange(n) / axis.angle.sample_rate
+    m = min(angle.size, int(np.ceil((time[-1] - angle.start) * angle.sample_rate)) + 1)
+    measured = np.interp(time, angle.time(0, m), angle.read(0, m))
+    return float(np.nansum(measured * axis.angle.read(0, n))) < 0.0

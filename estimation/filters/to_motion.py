@@ -1,0 +1,155 @@
+"""From a filter's sample-by-sample state to a ``Motion``: slow phase and amplitude, and the angle made of them.
+
+A filter's angle contains noise of the sense signal at each sample; a resonant mirror does not move at those
+frequencies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.filters.inputs import FilterInput
+from estimation.reference import PhaseReference
+from scanner.arrays import Array
+from scanner.channel import Channel
+from scanner.errors import BadInput
+from scanner.lock_in import block_length, block_phasors, unwrap_phase
+from scanner.motion import AxisMotion, SampledAngle
+
+BLOCK_CYCLES = 4.0
+"""Cycles of the motion per point of the slow clock: short against the ring-down of a resonator, long enough that the
+third harmonic averages out."""
+
+Clock = tuple[float, float, int]
+"""Sample rate [Hz], time of the first sample [s] and number of samples."""
+
+
+@dataclass(frozen=True)
+class FilterOutput:
+    """States of a filter and its likelihood.
+
+    Attributes:
+        theta: filtered angle, shape (axes, n) [rad].
+        track: omega, var(theta), cov(theta, omega), var(omega) after every ``stride``-th step, shape (axes, m, 4).
+        stride: steps between two points of the track.
+        updates: number of measurements used.
+        chi2: sum of squared normalised innovations.
+        logdet: sum of the logarithms of the innovation variances.
+    """
+
+    theta: Array
+    track: Array
+    stride: int
+    updates: int
+    chi2: float
+    logdet: float
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log likelihood of the sense signal, up to a constant."""
+        return -0.5 * (self.chi2 + self.logdet)
+
+
+def axis_motion_from_filter(
+    problem: FilterInput, filtered: FilterOutput, i: int, name: str, clock: Clock
+) -> AxisMotion:
+    """The motion of one axis.
+
+    Args:
+        i: index of the axis in the filter; name: of the axis.
+        clock: of the angle in the result.
+
+    Raises:
+        BadInput: the signal is shorter than two blocks.
+    """
+    channel, reference = problem.sense.channel, problem.references[name]
+    f = reference.frequency
+    block = block_length(f, channel.sample_rate, BLOCK_CYCLES)
+    time, phasors = block_phasors(filtered.theta[i], channel.sample_rate, channel.start, f, block)
+    if time.size < 2:
+        raise BadInput(
+            f"is too short to tell the phase of axis {name}: {2 * block} samples are needed",
+            file=channel.file,
+            channel=channel.name,
+            hint="record for longer",
+        )
+    phase = unwrap_phase(np.angle(phasors) - reference.phase(time))
+    phase += 2 * np.pi * np.round((problem.start.axes[name].phase - phase[0]) / (2 * np.pi))
+    track_sample = np.arange(filtered.track.shape[1]) * filtered.stride + filtered.stride
+    variance = _phase_variance(filtered.theta[i, track_sample], filtered.track[i], 2 * np.pi * f)
+    block_of = np.minimum(track_sample // block, time.size - 1)
+    count = np.maximum(np.bincount(block_of, minlength=time.size), 1)
+    return AxisMotion(
+        time=time,
+        phase=phase,
+        amplitude=np.abs(phasors),
+        frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
+        phase_sd=np.sqrt(np.bincount(block_of, variance, time.size) / count),
+        angle=synthesize_angle(filtered.theta[i], channel, reference, time, phase, np.abs(phasors), clock),
+        reference=reference.kind,
+        sign=problem.start.axes[name].sign,
+    )
+
+
+def synthesize_angle(
+    theta: Array,
+    channel: Channel,
+    reference: PhaseReference,
+    knots: Array,
+    phase: Array,
+    amplitude: Array,
+    clock: Clock,
+) -> SampledAngle:
+    """The angle A sin(psi + phi) of slow phase and amplitude, with the third harmonic that the torque adds.
+
+    The third harmonic is about 0.1 % of A in a fixed relation to the fundamental; it is averaged over all of ``theta``.
+
+    Args:
+        theta: filtered angle at the samples of ``channel``, shape (n,) [rad].
+        knots: times of the slow clock, shape (m,) [s]; phase, amplitude: at the knots, shape (m,) [rad].
+        clock: of the result; NaN where ``channel`` does not reach.
+    """
+
+    def fundamental(time: Array) -> tuple[Array, Array]:
+        return reference.phase(time) + _extrapolate(time, knots, phase), _extrapolate(time, knots, amplitude)
+
+    total_phase, size = fundamental(channel.time())
+    third = 2.0 * np.mean((theta - size * np.sin(total_phase)) / size * np.exp(-3j * total_phase))
+    rate, start, n = clock
+    time = start + np.arange(n) / rate
+    if (rate, start, n) != (channel.sample_rate, channel.start, channel.size):
+        total_phase, size = fundamental(time)
+    angle = size * (np.sin(total_phase) + np.abs(third) * np.cos(3.0 * total_phase + np.angle(third)))
+    angle[(time < channel.start - 0.5 / rate) | (time > channel.end)] = np.nan
+    return SampledAngle(angle, rate, start)
+
+
+def resample_to_clock(values: Array, channel: Channel, clock: Clock) -> Array:
+    """Values at the samples of ``channel``, shape (n,), resampled to a clock by cubic splines; NaN outside."""
+    rate, start, n = clock
+    first = (start - channel.start) * channel.sample_rate
+    if rate == channel.sample_rate and abs(first - round(first)) < 1e-6 and 0 <= round(first) <= values.size - n:
+        return values[round(first) : round(first) + n]
+    from scipy.interpolate import CubicSpline
+
+    time = start + np.arange(n) / rate
+    resampled = CubicSpline(channel.time(), values)(time)
+    resampled[(time < channel.start) | (time > channel.end)] = np.nan
+    return resampled
+
+
+def _extrapolate(time: Array, knots: Array, values: Array) -> Array:
+    """Linear interpolation, continued with the end's slope beyond the knots."""
+    first, last = ((values[i + 1] - values[i]) / (knots[i + 1] - knots[i]) for i in (0, -2))
+    inside = np.interp(time, knots, values)
+    return inside + np.minimum(time - knots[0], 0.0) * first + np.maximum(time - knots[-1], 0.0) * last
+
+
+def _phase_variance(theta: Array, track: Array, rate: float) -> Array:
+    """Variance of the instantaneous phase atan2(rate theta, omega), from the state's covariance [rad2]."""
+    quadrature = track[:, 0] / rate
+    square = theta**2 + quadrature**2
+    variance = quadrature**2 * track[:, 1] - 2 * theta * quadrature * track[:, 2] / rate
+    return (variance + theta**2 * track[:, 3] / rate**2) / square**2

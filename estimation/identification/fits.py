@@ -1,0 +1,345 @@
+"""Device parameters from calibration recordings, with standard deviations (chen2020 IV-A, chen2019 IV-B).
+
+A ringdown determines k/J and b/J only: J, k and b scaled by one factor give the same ringdown. The scale comes from
+driven motion, where inertia balances a torque ½ C'(θ) V² of known size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.least_squares import fit_linear
+from scanner.arrays import Array
+from scanner.device import Amdm, Axis, Capacitance, Mechanics, Position, Transimpedance
+from scanner.errors import BadInput
+from scanner.integrator.trajectories import integrate
+from scanner.laws import capacitance, capacitance_slope, electrostatic_torque
+from scanner.lock_in import block_length, block_phasors
+from scanner.lowpass import run_section, section_coefficients
+
+BLOCK_CYCLES = 20.0
+"""Cycles of the motion per block of a driven record, whose phasors are one equation: harmonics and noise average
+out."""
+
+STEPS_PER_CYCLE = 80
+"""Runge-Kutta steps per cycle in the fit of a ringdown: the relative error of its frequency is then 3e-7."""
+
+MAX_RINGDOWN_RESIDUAL_RATIO = 0.3
+"""Standard deviation of a ringdown's residual, relative to the signal, above which the fit is rejected."""
+
+SETTLE_TIME_S = 1e-4
+"""Time that low-pass sections of usual corner frequencies (40 kHz) need to settle, with a margin."""
+
+
+@dataclass(frozen=True)
+class IdentifiedValue:
+    """An identified value and its standard deviation, in the unit of the device file."""
+
+    value: float
+    sd: float
+
+    @property
+    def ci95(self) -> tuple[float, float]:
+        """95 % confidence interval."""
+        return self.value - 1.96 * self.sd, self.value + 1.96 * self.sd
+
+
+@dataclass(frozen=True)
+class DrivenRecord:
+    """A segment of driven motion at one drive frequency.
+
+    Attributes:
+        angle: shape (n,) [rad]. voltage: on the combs at the same samples [V].
+        frequency: of the motion [Hz]. rate: of the samples [Hz].
+    """
+
+    angle: Array
+    voltage: Array
+    frequency: float
+    rate: float
+
+
+def drive_torque(axis: Axis, record: DrivenRecord) -> Array:
+    """Torque of the drive at the samples of a record, shape (n,) [N m]."""
+    drive = axis.require_drive()
+    if drive.kind == "linear":
+        return (drive.torque_per_volt or 0.0) * record.voltage
+    comb = axis.require_capacitance()
+    return electrostatic_torque(capacitance_slope(record.angle, comb.C0, comb.theta0, comb.theta_th), record.voltage)
+
+
+def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, IdentifiedValue]:
+    """``J``, ``b`` and ``k`` from driven motion by the equation of motion (chen2020 eq 9) at the motion's frequency.
+
+    A block's phasors of angle and torque obey (k/J - w^2 + j w b/J) Θ = T / J, linear in k/J, b/J and 1/J. Phase and
+    amplitude at one drive frequency give two equations, so two frequencies are needed.
+
+    Args:
+        axis: its drive and its capacitance set the torque; its mechanics are not used.
+        records: of steady motion.
+
+    Raises:
+        BadInput: one frequency only.
+    """
+    if len({round(record.frequency, 3) for record in records}) < 2:
+        raise BadInput("driven records at two or more drive frequencies are needed to tell k, b and J", hint="sweep")
+    rows, targets = [], []
+    for record in records:
+        w = 2 * np.pi * record.frequency
+        block = block_length(record.frequency, record.rate, BLOCK_CYCLES)
+        theta, torque = (
+            block_phasors(values, record.rate, 0.0, record.frequency, block)[1]
+            for values in (record.angle, drive_torque(axis, record))
+        )
+        unit = np.exp(-1j * np.angle(theta))  # makes the angle real: rows are then in phase and in quadrature
+        row = np.stack([np.abs(theta), 1j * w * np.abs(theta), -torque * unit], axis=1)
+        rows += [row.real, row.imag]
+        targets += [w**2 * np.abs(theta), np.zeros(theta.size)]
+    (stiff, loss, inverse), covariance = fit_linear(np.concatenate(rows), np.concatenate(targets))
+    jacobian = {
+        "J": np.array([0.0, 0.0, -1.0 / inverse**2]),
+        "b": np.array([0.0, 1.0 / inverse, -loss / inverse**2]),
+        "k": np.array([1.0 / inverse, 0.0, -stiff / inverse**2]),
+    }
+    values = {"J": 1.0 / inverse, "b": loss / inverse, "k": stiff / inverse}
+    return {key: IdentifiedValue(float(values[key]), float(np.sqrt(g @ covariance @ g))) for key, g in jacobian.items()}
+
+
+def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, IdentifiedValue], Array]:
+    """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, under a bias, ``J`` from a free decay, by fitting its trajectory.
+
+    Args:
+        angle: shape (n,) [rad]. rate: [Hz].
+        axis: start of the fit, and the capacitance on which a bias acts.
+        bias: voltage on the combs [V]. It stiffens small amplitudes more than large ones, in proportion to 1/J: the
+            only information of a ringdown about J.
+
+    Returns:
+        the values, and the residual of the fit, shape (n,) [rad].
+
+    Raises:
+        BadInput: there is no ringdown near the resonance, or the fit does not reproduce it.
+    """
+    from scipy.optimize import least_squares
+
+    mechanics = axis.require_mechanics()
+    comb = axis.require_capacitance() if bias else None
+    stride = max(1, round(rate / (mechanics.resonance * STEPS_PER_CYCLE)))  # samples per step
+    steps_a_stride = max(1, round(mechanics.resonance * STEPS_PER_CYCLE / rate))
+    used = angle[::stride]
+    step = stride / rate / steps_a_stride
+    n = (used.size - 1) * steps_a_stride
+    voltage = np.full((n, 3), bias)
+    w0, loss0 = _first_guess(used, rate / stride, mechanics)
+    scale = np.array([1e-3 * w0, 0.1 * loss0, 0.01 * np.abs(used).max(), 0.01 * w0 * np.abs(used).max(), 0.1])
+
+    def trajectory(x: Array) -> Array:
+        w, loss, theta, omega, log_inverse = start + scale * np.append(x, np.zeros(5 - x.size))
+        J = mechanics.J * np.exp(-log_inverse)
+        tried = Axis(Mechanics(J, max(loss, 1e-6 * loss0) * J, w * w * J), comb)  # a step of the fit may overshoot
+        return integrate(tried, (theta, omega), voltage, step)[0][::steps_a_stride]
+
+    around = np.arange(min(used.size, 2 * STEPS_PER_CYCLE))
+    line = np.polynomial.polynomial.polyfit(around[:9] * stride / rate, used[:9], 3)
+    start = np.array([w0, loss0, line[0], line[1], 0.0])
+    free = 5 if comb else 4
+    x = np.zeros(free)
+    for part in (used.size // 8, used.size // 3, used.size):  # growing windows keep the phase error below half a cycle
+        if part > 4 * free:
+            fit = least_squares(lambda x, part=part: trajectory(x)[:part] - used[:part], x, x_scale=1.0, method="trf")
+            x = fit.x
+    residual = used - trajectory(x)
+    if residual.std() > MAX_RINGDOWN_RESIDUAL_RATIO * used.std():
+        raise BadInput(
+            "the free decay does not follow the equation of motion", hint="cut the record to the decay alone"
+        )
+    variance = float(residual @ residual) / (used.size - free)
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * variance
+    sd = scale[:free] * np.sqrt(np.diag(covariance))
+    w, loss = start[:2] + scale[:2] * x[:2]
+    values = {
+        "k_over_J": IdentifiedValue(float(w * w), float(2 * w * sd[0])),
+        "b_over_J": IdentifiedValue(float(loss), float(sd[1])),
+    }
+    if comb:
+        J = mechanics.J * np.exp(-scale[4] * x[4])
+        values["J"] = IdentifiedValue(float(J), float(J * sd[4]))
+    return values, residual
+
+
+def _first_guess(angle: Array, rate: float, mechanics: Mechanics) -> tuple[float, float]:
+    """Angular frequency [rad/s] and b/J [1/s] of a decay, from the phasors of its blocks."""
+    f = mechanics.resonance
+    block = block_length(f, rate, 6.0)
+    if angle.size < 4 * block:
+        raise BadInput("the free decay is shorter than 24 cycles", hint="record for longer")
+    time, z = block_phasors(angle, rate, 0.0, f, block)
+    z = z * np.exp(-2j * np.pi * f * time)
+    keep = np.abs(z) > 0.05 * np.abs(z).max()
+    keep[np.argmin(keep) if not keep.all() else keep.size :] = False
+    if keep.sum() < 3:
+        raise BadInput("shows no free decay near the device's resonance", hint="check the device's k and J")
+    slope = np.polyfit(time[keep], np.unwrap(np.angle(z[keep])), 1)[0]
+    decay = np.polyfit(time[keep], np.log(np.abs(z[keep])), 1)[0]
+    return 2 * np.pi * f + float(slope), max(-2.0 * float(decay), 1e-3)
+
+
+@dataclass(frozen=True)
+class ReadoutFit:
+    """An AMDM readout fitted to a reference angle.
+
+    Attributes:
+        values: ``a_cir`` [V/F], ``b_cir`` [V], ``delay`` [s] beyond the sections, ``square`` [V/F^2] of the squared
+            capacitance, ``feed`` [1] and ``feed_rate`` [s] of the drive that leaks through.
+        coefficients: of all ``readout_features``, 0 for a term left out, shape (6,).
+        noise_sd: of the residual [V].
+    """
+
+    values: Mapping[str, IdentifiedValue]
+    coefficients: Array
+    noise_sd: float
+
+
+def readout_features(comb: Capacitance, angle: Array, voltage: Array, rate: float, sections: Sequence[float]) -> Array:
+    """Regressors of an AMDM output: C, 1, C' and C^2 after the sections, the drive and its rate; shape (n, 6)."""
+    C = capacitance(angle, comb.C0, comb.Cb, comb.theta0, comb.theta_th)
+    square = C * C
+    for cutoff in sections:
+        coefficients = section_coefficients(cutoff, 1.0 / rate)
+        run_section(C, *coefficients, C[0], C[0])
+        run_section(square, *coefficients, square[0], square[0])
+    one = np.ones_like(C)
+    swing = voltage - voltage.mean()
+    return np.stack([C, one, np.gradient(C, 1 / rate), square, swing, np.gradient(voltage, 1 / rate)], axis=1)
+
+
+READOUT_FEATURES = ("a_cir", "b_cir", "delay", "square", "feed", "feed_rate")
+
+
+def fit_readout(
+    comb: Capacitance,
+    records: Sequence[DrivenRecord],
+    senses: Sequence[Array],
+    sections: Sequence[float],
+    terms: Sequence[str] = READOUT_FEATURES,
+    skip: float = SETTLE_TIME_S,
+) -> ReadoutFit:
+    """Gain and offset of an AMDM readout, with corrections to the formula a_cir C + b_cir, by least squares.
+
+    Args:
+        records: with the reference angle. senses: the output at the same samples [V].
+        sections: corner of every low-pass section [Hz].
+        terms: which of ``READOUT_FEATURES``; the paper's own fit is ``("a_cir", "b_cir")`` and no sections.
+        skip: start of each record that is left out while the sections settle [s].
+    """
+    columns = [READOUT_FEATURES.index(term) for term in terms]
+    basis, target = [], []
+    for record, sense in zip(records, senses, strict=True):
+        first = round(skip * record.rate)
+        features = readout_features(comb, record.angle, record.voltage, record.rate, sections)
+        basis.append(features[first:, columns])
+        target.append(sense[first:])
+    stacked, y = np.concatenate(basis), np.concatenate(target)
+    fitted, covariance = fit_linear(stacked, y)
+    values = {term: IdentifiedValue(float(fitted[i]), float(np.sqrt(covariance[i, i]))) for i, term in enumerate(terms)}
+    coefficients = np.zeros(len(READOUT_FEATURES))
+    coefficients[columns] = fitted
+    if "delay" in values:  # C(t - delay) = C - delay C'
+        slope, a_cir = values["delay"], values["a_cir"].value
+        values["delay"] = IdentifiedValue(-slope.value / a_cir, slope.sd / abs(a_cir))
+    return ReadoutFit(values, coefficients, float(np.std(y - stacked @ fitted)))
+
+
+@dataclass(frozen=True)
+class CapacitanceProfile:
+    """The capacitance over the angle, from a sense signal and a reference angle (chen2020 fig 7b, chen2019 fig 4b).
+
+    Attributes:
+        values: ``theta0``, ``theta_th`` [rad], ``delay`` of the sense signal against the angle [s]; ``C0`` [F] behind a
+            transimpedance readout, ``a_cir`` [V/F] and ``b_cir`` [V] behind an AMDM one, which sees C0 only times
+            a_cir.
+        residual_sd: of the fit [V].
+    """
+
+    values: Mapping[str, IdentifiedValue]
+    residual_sd: float
+
+
+def fit_capacitance_profile(
+    axis: Axis, angle: Array, sense: Array, rate: float, frequency: float
+) -> CapacitanceProfile:
+    """Fit the Gaussian capacitance, the readout's linear constants and the delay between the two channels.
+
+    The angle is smoothed over a twelfth of a cycle first, because its noise would flatten the fitted curve.
+
+    Args:
+        axis: nominal, with an AMDM or a transimpedance readout. angle: [rad], sense: [V], at the same samples, shape
+        (n,). rate: [Hz]. frequency: of the motion [Hz].
+
+    Raises:
+        BadInput: a position readout, which does not measure the capacitance.
+    """
+    from scipy.optimize import least_squares
+    from scipy.signal import savgol_filter
+
+    comb, readout = axis.require_capacitance(), axis.require_readout()
+    if isinstance(readout, Position):
+        raise BadInput("a position readout does not see the capacitance", channel=f"sense_{axis.name}")
+    window = max(7, 2 * round(rate / frequency / 24) + 1)
+    theta = savgol_filter(angle, window, min(4, window - 2))
+    omega = savgol_filter(angle, window, min(4, window - 2), deriv=1, delta=1 / rate)
+    quarter = round(0.25 * rate / frequency)
+    edge = slice(window + quarter + round(1e-4 * rate), -window - quarter)
+    sections = readout.lpf_hz if isinstance(readout, Amdm) else ()
+    samples = np.arange(theta.size)
+    y = sense[edge]
+
+    def fitted(x: Array) -> tuple[Array, Array, Array]:
+        theta0, theta_th, delay = x * scale
+        at = samples - delay * rate
+        u = (np.interp(at, samples, theta) - theta_th) / theta0
+        shape = np.exp(-u * u)
+        if isinstance(readout, Transimpedance):
+            slope = -2.0 * u / theta0 * shape * np.interp(at, samples, omega)
+            basis = -readout.R_s * readout.V_bias * slope[edge, None]
+        else:
+            for cutoff in sections:
+                run_section(shape, *section_coefficients(cutoff, 1 / rate), shape[0], shape[0])
+            basis = np.stack([shape, np.ones_like(shape)], axis=1)[edge]
+        linear, covariance = fit_linear(basis, y)
+        return np.einsum("ni,i->n", basis, linear) - y, linear, covariance
+
+    scale = np.array([comb.theta0, comb.theta0, 0.01 / frequency])
+    delays = (
+        np.arange(-quarter, quarter + 1, max(1, quarter // 12)) / rate
+    )  # a wrong half cycle would be a local minimum
+    starts = [np.array([1.0, comb.theta_th / comb.theta0, delay / scale[2]]) for delay in delays]
+    start = min(starts, key=lambda x: float(np.square(fitted(x)[0]).sum()))
+    solution = least_squares(lambda x: fitted(x)[0], start, diff_step=1e-5, ftol=1e-10)
+    residual, linear, covariance = fitted(solution.x)
+    # The linear constants are eliminated inside the residual, whose Jacobian is that of the three nonlinear ones. The
+    # covariance of a linear constant is its own plus what the uncertainty of the three contributes.
+    variance = float(residual @ residual) / (residual.size - 3 - linear.size)
+    spread = np.linalg.inv(solution.jac.T @ solution.jac) * variance
+    step = 1e-4
+    sensitivity = np.column_stack(
+        [(fitted(solution.x + step * e)[1] - fitted(solution.x - step * e)[1]) / (2 * step) for e in np.eye(3)]
+    )
+    sd = scale * np.sqrt(np.diag(spread))
+    total = covariance + sensitivity @ spread @ sensitivity.T
+    linear_sd = np.sqrt(np.diag(total))
+    estimates = solution.x * scale
+    values = {
+        key: IdentifiedValue(float(v), float(d))
+        for key, v, d in zip(("theta0", "theta_th", "delay"), estimates, sd, strict=True)
+    }
+    if isinstance(readout, Transimpedance):
+        values["C0"] = IdentifiedValue(float(linear[0]), float(linear_sd[0]))
+    else:  # y = a_cir (C0 shape + Cb) + b_cir
+        values["a_cir"] = IdentifiedValue(float(linear[0]) / comb.C0, float(linear_sd[0]) / comb.C0)
+        weight = np.array([-comb.Cb / comb.C0, 1.0])
+        values["b_cir"] = IdentifiedValue(float(weight @ linear), float(np.sqrt(weight @ total @ weight)))
+    return CapacitanceProfile(values, float(np.sqrt(variance)))

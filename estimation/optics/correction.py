@@ -1,0 +1,107 @@
+"""Correction of a recording for its device's optics terms: time and size of the intensity, position of the beam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from scanner.arrays import Array
+from scanner.channel import LazySamples
+from scanner.device import Device
+from scanner.motion import AngleTrack, Motion
+from scanner.optics import beam_position, intensity_delay, intensity_gain, terms_on_channel
+from scanner.recording import Recording
+
+
+def correct_intensity(recording: Recording, device: Device) -> Recording:
+    """The recording with its intensity corrected for the delay and the gain of the device's optics terms.
+
+    A detector's lag is corrected by its delay only: sharpening what it smoothed would raise the noise. Samples are
+    corrected as they are read.
+    """
+    if "intensity" not in recording or not terms_on_channel(device, "intensity"):
+        return recording
+    channel = recording["intensity"]
+
+    def corrected(first: int, stop: int) -> Array:
+        values = channel.read(first, stop)
+        gain = intensity_gain(device, channel.time(first, stop) - recording.start)
+        return np.asarray(values / (gain if values.ndim == 1 else gain[:, None]))
+
+    start = channel.start - intensity_delay(device, 1 / channel.sample_rate)
+    intensity = replace(
+        channel,
+        raw=LazySamples(channel.shape, np.dtype(np.float64), corrected),
+        first=0, stop=channel.size, gain=1.0, offset=0.0, start=start,
+    )  # fmt: skip
+    return replace(recording, channels=MappingProxyType({**recording.channels, "intensity": intensity}))
+
+
+@dataclass(frozen=True)
+class BeamAngle:
+    """Position of the beam on the sample, as the mirror angle that would put it there, computed when it is read.
+
+    Attributes:
+        track: of the mirror.
+        device: holds the optics terms.
+        axis: name of the axis.
+        origin: start of the recording, which is the time origin of the terms [s].
+    """
+
+    track: AngleTrack
+    device: Device
+    axis: str
+    origin: float
+
+    @property
+    def sample_rate(self) -> float:
+        """Sample rate [Hz]."""
+        return self.track.sample_rate
+
+    @property
+    def start(self) -> float:
+        """Time of the first sample on the recording's clock [s]."""
+        return self.track.start
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return self.track.size
+
+    def read(self, first: int = 0, stop: int | None = None) -> Array:
+        """Return the positions of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
+        index = np.arange(*slice(first, stop).indices(self.size))
+        time = self.start + index / self.sample_rate - self.origin
+        return beam_position(self.device, self.axis, self.track.read(first, stop), time)
+
+    def negated(self) -> BeamAngle:
+        """Return the positions for the motion of the mirror with the opposite sign."""
+        return replace(self, track=self.track.negated())
+
+    def advanced(self, time: Array, phase: Array, frequency: Array) -> BeamAngle:
+        """Return the positions for the motion of the mirror that is ahead (see ``scanner.motion.AngleTrack``)."""
+        return replace(self, track=self.track.advanced(time, phase, frequency))
+
+    def phasors(self) -> None:
+        """Return None: positions have no phasors, because the optics terms act on every sample."""
+
+
+def beam_motion(motion: Motion, device: Device, origin: float) -> Motion:
+    """The motion of the beam over the sample: the mirror's, displaced by the device's optics terms.
+
+    Args:
+        motion: of the mirror.
+        origin: start of the recording [s].
+
+    Returns:
+        the motion with the angles of the affected axes replaced; axes without such terms are unchanged.
+    """
+    axes = {
+        name: replace(axis, angle=BeamAngle(axis.angle, device, name, origin))
+        if terms_on_channel(device, "place", name)
+        else axis
+        for name, axis in motion.axes.items()
+    }
+    return replace(motion, axes=axes)

@@ -1,0 +1,199 @@
+"""Any estimator for a device that states terms: the contribution of the terms along the motion is subtracted.
+
+What a nominal device or a corrected recording can express is absorbed there (``estimation.term_absorption``). Every
+other law acts on a motion that is not known yet, so it is compensated iteratively: the motion estimated so far is
+passed through ``scanner.forward_model`` with and without the terms, the difference is subtracted from the measured
+channels, and the motion is estimated again. A torque enters as its equivalent stiffness and damping at the motion's
+amplitude and by the harmonics that it adds (``estimation.describing_function``). Every estimator so handles every term
+by the one definition in the term's file, and keeps its nominal equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+
+from estimation.describing_function import (
+    DescribingFunction,
+    add_term_motion,
+    describing_function,
+    linearised_device,
+)
+from estimation.signals import phase_reference
+from estimation.term_absorption import (
+    Terms,
+    absorb_constants,
+    drive_input,
+    measured_channels,
+    remaining_term,
+    trajectory,
+    with_clocks,
+    with_drives,
+    with_outputs,
+    with_samples,
+)
+from scanner.arrays import Array
+from scanner.channel import Channel
+from scanner.device import Device
+from scanner.forward_model import ActiveTerm, angle_signal, sense_signal, stated_terms
+from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.recording import Recording
+
+NominalEstimator = Callable[[Recording, Device], Motion]
+"""Estimates the motion of a device without terms."""
+
+Functions = Mapping[str, DescribingFunction]
+"""Describing functions by axis."""
+
+MAX_ITERATIONS = 8
+"""Bound on the iteration where a correction does not converge; the last estimate is then returned."""
+
+CORRECTION_TOLERANCE = 0.02
+"""Change of the correction, relative to the readout's noise, below which the iteration has converged: far below what
+the estimate can show."""
+
+MIN_NOISE_RATIO = 1e-3
+"""Noise that is assumed at least for that, relative to the signal: a channel may state none."""
+
+
+def estimate_with_terms(
+    recording: Recording, device: Device, run: NominalEstimator, is_model_based: bool = True
+) -> Motion:
+    """The motion of a device that may state terms.
+
+    Args:
+        run: estimates the motion of a nominal device.
+        is_model_based: whether the angle follows from a nominal model; see ``estimation.estimators.Estimator``.
+
+    Raises:
+        BadInput: a term that no catalogue has, or as ``run``.
+    """
+    stated = {name: stated_terms(axis) for name, axis in device.axes.items()}
+    if not any(stated.values()):
+        return run(recording, device)
+    bare = absorb_constants(device, stated)
+    absorbed = with_drives(with_clocks(recording, stated), device, stated)
+    absorbed, terms = with_outputs(
+        absorbed,
+        bare,
+        {name: tuple(remaining_term(active, bare.sensed_axis(name)) for active in axis_terms)
+         for name, axis_terms in stated.items()},
+    )  # fmt: skip
+    without_intensity = _without(absorbed, "intensity")  # angles at the sense signal's samples serve the iteration
+    corrected = without_intensity
+    motion, functions = run(without_intensity, bare), dict[str, DescribingFunction]()
+    for _ in range(MAX_ITERATIONS if any(map(_acts, (active for group in terms.values() for active in group))) else 0):
+        if is_model_based:
+            functions = {
+                name: describing_function(bare.axis(name), terms[name], motion, name, without_intensity.duration)
+                for name in terms
+            }
+        previous, corrected = corrected, _corrected(without_intensity, bare, terms, functions, motion)
+        motion = run(corrected, linearised_device(bare, functions))
+        if _converged(previous, corrected, bare):
+            break
+    if "intensity" in absorbed:
+        complete = replace(corrected, channels={**corrected.channels, "intensity": absorbed["intensity"]})
+        motion = run(complete, linearised_device(bare, functions))
+    axes = {name: _with_term_motion(axis, motion, functions, name) for name, axis in motion.axes.items()}
+    axes = {name: _on_recorded_reference(axis, recording, absorbed, bare, name) for name, axis in axes.items()}
+    return replace(motion, axes=axes, notes=_notes(terms))
+
+
+def _acts(active: ActiveTerm) -> bool:
+    """Whether a term still changes a signal or the motion."""
+    term = active.term
+    return any((term.torque, term.capacitance, term.pre_demodulation)) or bool(term.acts_on_channel)
+
+
+def _without(recording: Recording, name: str) -> Recording:
+    return replace(recording, channels={key: value for key, value in recording.channels.items() if key != name})
+
+
+def _corrected(recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion) -> Recording:
+    """The recording without the terms' contribution along ``motion`` to its sense and angle channels."""
+    channels = dict(recording.channels)
+    for key, kind, axes in measured_channels(recording, bare):
+        channel = recording[key]
+        angles = _angles_at_samples(channel, motion)
+        nominal, complete = [], []
+        for name in axes:
+            drive = drive_input(recording.channels.get(f"drive_{name}"), recording, channel)
+            axis = bare.sensed_axis(name)
+            with_terms = add_term_motion(angles, channel.sample_rate, motion, functions, name)
+            nominal.append(trajectory(axis, (), drive, angles[name]))
+            complete.append(trajectory(axis, tuple(terms[name]), drive, with_terms))
+        if kind == "angle":
+            contribution = angle_signal(complete[0]) - angle_signal(nominal[0])
+        else:
+            readout = bare.sensed_axis(axes[0]).require_readout()
+            contribution = sense_signal(readout, complete) - sense_signal(readout, nominal)
+        channels[key] = with_samples(channel, channel.read() - contribution[:-1])
+    return replace(recording, channels=MappingProxyType(channels))
+
+
+def _angles_at_samples(channel: Channel, motion: Motion) -> dict[str, Array]:
+    """Every axis's angle at the samples of a channel, shape (n,) [rad]; 0 where the motion is unknown."""
+    from scipy.interpolate import CubicSpline
+
+    angles = {}
+    for name, axis in motion.axes.items():
+        track = axis.angle
+        values = track.read(0, track.size)
+        if (track.sample_rate, track.start, track.size) != (channel.sample_rate, channel.start, channel.size):
+            known = np.isfinite(values)
+            time = track.start + np.arange(track.size)[known] / track.sample_rate
+            values = CubicSpline(time, values[known], extrapolate=False)(channel.time())
+        angles[name] = np.nan_to_num(values)
+    return angles
+
+
+def _converged(previous: Recording, current: Recording, device: Device) -> bool:
+    """Whether the correction of every channel changed by far less than its readout's noise."""
+    for key, channel in current.channels.items():
+        if key.startswith(("sense", "angle")):
+            new, old = channel.read(), previous[key].read()
+            axis = device.sensed_axis(key.partition("_")[2] or next(iter(device.axes)))
+            noise = axis.readout.noise_sd if key.startswith("sense") and axis.readout else 0.0
+            scale = max(noise, MIN_NOISE_RATIO * float(np.nanstd(new)))
+            if np.sqrt(np.nanmean((new - old) ** 2)) > CORRECTION_TOLERANCE * scale:
+                return False
+    return True
+
+
+def _with_term_motion(axis: AxisMotion, motion: Motion, functions: Functions, name: str) -> AxisMotion:
+    """The axis with the motion that its terms cause added to its angle."""
+    function = functions.get(name)
+    if function is None or not function.changes_angle:
+        return axis
+    angles = {key: other.angle.read(0, other.angle.size) for key, other in motion.axes.items()}
+    values = add_term_motion(angles, axis.angle.sample_rate, motion, functions, name)
+    return replace(axis, angle=SampledAngle(values, axis.angle.sample_rate, axis.angle.start))
+
+
+def _on_recorded_reference(
+    axis: AxisMotion, recording: Recording, absorbed: Recording, device: Device, name: str
+) -> AxisMotion:
+    """The axis with its phase against the drive as recorded, where the effective drive differs from it."""
+    key = f"drive_{name}"
+    if key not in absorbed or absorbed[key] is recording[key]:
+        return axis
+    effective, recorded = (phase_reference(source, device, name).phase(axis.time) for source in (absorbed, recording))
+    return replace(axis, phase=axis.phase + effective - recorded)
+
+
+def _notes(terms: Terms) -> tuple[str, ...]:
+    """How terms were represented that do not enter the estimate by their own law."""
+    notes = []
+    for name, active_terms in terms.items():
+        for active in active_terms:
+            if active.term.torque is not None:
+                notes.append(
+                    f"{active.term.effect} of {name}: as the stiffness, damping and harmonics at the amplitude"
+                )
+            if active.term.capacitance is not None:
+                notes.append(f"{active.term.effect} of {name}: in the readout; its torque as that of the nominal comb")
+    return tuple(notes)

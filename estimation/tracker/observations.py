@@ -1,0 +1,316 @@
+"""Block observations of one sense channel: references, drives, readout and whitened projections.
+
+``lay_out_blocks`` places the blocks of the whole recording and demodulates the drives; ``demodulate_blocks`` projects
+the samples of some of the blocks, because the samples of a long recording do not fit in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from estimation.reference import PhaseReference
+from estimation.signals import SenseChannel, drive_channel, is_capacitive
+from estimation.tracker.averaged_dynamics import (
+    COS,
+    MAX_READOUT_HARMONIC,
+    POINTS_PER_CYCLE,
+    SIN,
+    AxisParameters,
+    axis_parameters,
+)
+from estimation.tracker.block_signal import BlockSignal
+from estimation.tracker.change_points import block_pieces, project_block, project_cut_blocks
+from estimation.tracker.demodulation import Projections, project_blocks, residual_variance, whiten_projections
+from estimation.tracker.drive_blocks import MAX_LINE_RATE_RATIO, demodulate_drive
+from scanner.arrays import Array, Complex, Index
+from scanner.channel import Channel
+from scanner.device import Amdm, Axis, Device
+from scanner.errors import BadInput
+from scanner.harmonics import readout_response
+from scanner.laws import capacitance
+from scanner.recording import Recording
+
+MIN_BLOCK_CYCLES = 2.0
+"""Least length of a block in cycles of the slowest axis: its harmonics are then separable from the other axis's."""
+
+MIN_BLOCK_SAMPLES = 64
+"""Least length of a block: enough for all lines of two axes."""
+
+BLOCK_DECAY_TIMES = 0.15
+"""Length of a block in units of the fastest decay time 1 / (pi f / Q), if that is longer than MIN_BLOCK_CYCLES.
+
+Longer blocks save time. With 0.2, the drift within a block adds to the phase error at 40 dB
+(docs/explanation/tracker.md).
+"""
+
+SETTLING_TIME_CONSTANTS = 15.0
+"""Time constants of the readout's slowest filter that are skipped at the beginning, where its state is unknown."""
+
+DELAY_FREQUENCY_HZ = 1.0
+"""Frequency at which the readout's delay of slow changes is evaluated [Hz]; far below every scan frequency."""
+
+AMPLITUDE_TABLE_SIZE = 400
+"""Entries of the table from line magnitude to amplitude. It gives start values only."""
+
+MAX_AMPLITUDE_THETA0 = 1.6
+"""Largest amplitude of the table in units of theta0; the second line of a Gaussian comb has its maximum before it."""
+
+POSITION_HARMONICS = 3
+"""Harmonics used of a position readout: the fundamental, and the next two, which a nonlinear suspension adds."""
+
+MODEL_ERROR_RATIO = 3e-3
+"""Standard deviation of the model error within a block, over the signal's rms: bounds the assumed noise from below."""
+
+DISTURBED_VARIANCE_RATIO = 1.5
+"""Residual variance of a block, over the median one, above which the block counts as disturbed."""
+
+
+class ClippedBlocks(NamedTuple):
+    """Blocks with clipped samples.
+
+    Attributes:
+        block: their indices, shape (n,). start: the channel's first sample of each, shape (n,).
+        pieces: first and stop sample that each uses, relative to start, shape (n, 2).
+        rails: limits of the measured range, infinite for none, shape (n, 2) [V].
+    """
+
+    block: Index
+    start: Index
+    pieces: Index
+    rails: Array
+
+
+NO_CLIPPED_BLOCKS = ClippedBlocks(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2))
+)
+
+
+@dataclass(frozen=True)
+class BlockObservations:
+    """Blocks of a sense channel, ready for the filter.
+
+    Attributes:
+        sense, references: channel and reference phases that they come from.
+        parameters: of the axes ``sense.axes``, in their order.
+        time: middles of the blocks, shape (blocks,) [s].
+        signal: their measurements.
+        used_fraction: of the samples.
+        clipped: blocks with clipped samples.
+        noise_var: variance of a sample in undisturbed blocks, NaN without samples [V^2].
+    """
+
+    sense: SenseChannel
+    references: Mapping[str, PhaseReference]
+    parameters: tuple[AxisParameters, ...]
+    time: Array
+    signal: BlockSignal
+    used_fraction: float
+    clipped: ClippedBlocks
+    noise_var: float
+
+    @property
+    def parameter_rows(self) -> Array:
+        """The parameters as numbers, one axis a row, for compiled code, shape (axes, 11)."""
+        return np.array(self.parameters, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class BlockLayout:
+    """Times of all blocks of a sense channel, and the drives of its axes in them.
+
+    Attributes:
+        sense: the channel. axes: whose motion it measures. parameters: of these.
+        references: with knots at the switches of the drives. switches: their times, shape (switches,) [s].
+        starts: first sample of every block, shape (blocks,). length: of a block [samples].
+        time: middles of the blocks, shape (blocks,) [s].
+        lines: (axis, order) of each line that is used, shape (lines, 2).
+        psi, w, force, drive_share: as in ``BlockSignal``, shape (blocks, axes, ...).
+    """
+
+    sense: SenseChannel
+    axes: tuple[Axis, ...]
+    parameters: tuple[AxisParameters, ...]
+    references: Mapping[str, PhaseReference]
+    switches: Array
+    starts: Index
+    length: int
+    time: Array
+    lines: Index
+    psi: Array
+    w: Array
+    force: Complex
+    drive_share: Array
+
+
+def lay_out_blocks(
+    recording: Recording, device: Device, sense: SenseChannel, references: Mapping[str, PhaseReference]
+) -> BlockLayout:
+    """Place the blocks of one sense channel and demodulate the drives of its axes in them.
+
+    Raises:
+        BadInput: the channel is too short, or a drive does not cover it.
+        DeviceInvalid: the device lacks a value.
+    """
+    channel, axes = sense.channel, tuple(device.axis(name) for name in sense.axes)
+    length = _block_length(axes, [references[name].frequency for name in sense.axes], channel.sample_rate)
+    count = channel.size // length
+    if count < 3:
+        raise BadInput(
+            f"is {channel.size} samples long; {3 * length} are needed to track a motion",
+            file=channel.file,
+            channel=channel.name,
+            hint="record for longer",
+        )
+    starts = np.arange(count) * length
+    time: Array = channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate)
+    parameters = tuple(axis_parameters(axis, sense.readout) for axis in axes)
+    width = length / channel.sample_rate
+    drives = [
+        demodulate_drive(drive_channel(recording, name, gaps_ok=True), references[name], time, width, law)
+        for name, law in zip(sense.axes, parameters, strict=True)
+    ]
+    psi, w, force, drive_share = (
+        np.ascontiguousarray(np.stack([getattr(drive, name) for drive in drives], axis=1))
+        for name in ("psi", "w", "force", "drive_share")
+    )
+    return BlockLayout(
+        sense=sense,
+        axes=axes,
+        parameters=parameters,
+        references={name: drive.reference for name, drive in zip(sense.axes, drives, strict=True)},
+        switches=np.concatenate([drive.switches for drive in drives]),
+        starts=starts,
+        length=length,
+        time=time,
+        lines=_usable_lines(axes, sense, w, channel.sample_rate),
+        psi=psi,
+        w=w,
+        force=force,
+        drive_share=drive_share,
+    )
+
+
+def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = None) -> BlockObservations:
+    """Demodulate the blocks ``first`` up to ``stop`` of a sense channel."""
+    sense, channel, lines, length = layout.sense, layout.sense.channel, layout.lines, layout.length
+    part = slice(first, stop)
+    starts, w = layout.starts[part], layout.w[part]
+    settling = 0
+    if isinstance(sense.readout, Amdm) and sense.readout.lpf_hz:
+        settling = int(SETTLING_TIME_CONSTANTS / (2 * np.pi * min(sense.readout.lpf_hz)) * channel.sample_rate)
+    projections = project_blocks(channel, starts, length, lines, w, settling)
+    pieces = block_pieces(starts, length, channel.sample_rate, channel.start, layout.switches)
+    if layout.switches.size:
+        projections = project_cut_blocks(projections, channel, starts, pieces, lines, w)
+    response, response_slope = _line_response(sense, lines, w)
+    whitened, moments, whiteners = whiten_projections(projections.sums, projections.grams, projections.geometry)
+    noise, median_noise = _noise_variance(projections, channel, starts, pieces, lines, w, sense.readout.noise_sd)
+    signal = BlockSignal(
+        psi=layout.psi[part],
+        w=w,
+        force=layout.force[part],
+        drive_share=layout.drive_share[part],
+        step=length / channel.sample_rate,
+        lines=lines,
+        response=np.ascontiguousarray(response),
+        response_slope=np.ascontiguousarray(response_slope),
+        mean_gain=float(readout_response(sense.readout, 0.0).real),
+        mean_delay=float(readout_response(sense.readout, DELAY_FREQUENCY_HZ).imag / (2 * np.pi * DELAY_FREQUENCY_HZ)),
+        table_w=np.ascontiguousarray(projections.table_w),
+        whitened=whitened,
+        whitened_moments=np.ascontiguousarray(moments),
+        whiteners=whiteners,
+        geometry=projections.geometry,
+        noise_var=noise,
+        external_phase=np.zeros(w.shape),
+        external_var=np.full(w.shape, np.inf),
+        amplitude_table=np.stack([_amplitude_table(axis, sense) for axis in layout.axes]),
+        main_order=2 if is_capacitive(sense.readout) else 1,
+    )
+    used = float((projections.counts - projections.clipped_counts).sum()) / (starts.size * length)
+    clipped = _clipped_blocks(projections, starts, pieces, settling)
+    time = layout.time[part]
+    return BlockObservations(sense, layout.references, layout.parameters, time, signal, used, clipped, median_noise)
+
+
+def _clipped_blocks(projections: Projections, starts: Index, pieces: Index, settling: int) -> ClippedBlocks:
+    """The blocks with a finite rail."""
+    block = np.flatnonzero(np.isfinite(projections.rails).any(axis=1))
+    used = pieces[block].copy()
+    used[:, 0] = np.maximum(used[:, 0], settling - starts[block])
+    return ClippedBlocks(block, starts[block], used, projections.rails[block])
+
+
+def _block_length(axes: Sequence[Axis], frequencies: list[float], rate: float) -> int:
+    """Samples of a block, from MIN_BLOCK_CYCLES and BLOCK_DECAY_TIMES."""
+    width = MIN_BLOCK_CYCLES / min(frequencies)
+    decays = [axis.quality / (np.pi * axis.resonance) for axis in axes if axis.mechanics is not None]
+    return max(MIN_BLOCK_SAMPLES, round(max([width, BLOCK_DECAY_TIMES * min(decays)] if decays else [width]) * rate))
+
+
+def _usable_lines(axes: Sequence[Axis], sense: SenseChannel, w: Array, rate: float) -> Index:
+    """(axis, order) of the lines below MAX_LINE_RATE_RATIO; a comb that is symmetric has even orders only."""
+    found = []
+    for i, axis in enumerate(axes):
+        if is_capacitive(sense.readout):
+            even = axis.require_capacitance().theta_th == 0.0
+            orders = range(2 if even else 1, MAX_READOUT_HARMONIC + 1, 2 if even else 1)
+        else:
+            orders = range(1, POSITION_HARMONICS + 1)
+        found += [(i, n) for n in orders if n * w[:, i].max() < 2 * np.pi * MAX_LINE_RATE_RATIO * rate]
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def _line_response(sense: SenseChannel, lines: Index, w: Array) -> tuple[Complex, Complex]:
+    """Readout's response at each line of each block, and its derivative by the motion's angular frequency."""
+    f = w[:, lines[:, 0]] * lines[:, 1] / (2 * np.pi)
+    step = 1e-4
+    high, low = (readout_response(sense.readout, f * (1.0 + s)) for s in (step, -step))
+    return readout_response(sense.readout, f), (high - low) / (2.0 * step * w[:, lines[:, 0]])
+
+
+def _noise_variance(
+    projections: Projections, channel: Channel, starts: Index, pieces: Index, lines: Index, w: Array, noise_sd: float
+) -> tuple[Array, float]:
+    """Variance of each block's samples, shape (blocks,), and the typical one [V^2].
+
+    A block has the typical variance unless it is disturbed. Lines whose phase slips or whose amplitude decays within a
+    block leave residuals about a stationary fit. Blocks that seem disturbed are therefore fitted again with two more
+    lines beside each line, which follow such changes.
+    """
+    if not projections.counts.any():  # a gap that covers all blocks
+        return np.ones(starts.size), np.nan
+    variance = residual_variance(projections)
+    variance[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator has no residuals
+    samples = np.maximum(projections.counts, 1)
+    signal_var = float(np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2))
+    typical = max(float(np.nanmedian(variance)), MODEL_ERROR_RATIO**2 * signal_var)
+    length = int(pieces[:, 1].max())
+    sideband = channel.sample_rate / length  # [rad/s]: a slip of 1 rad over the block
+    axes = w.shape[1]
+    extended = np.concatenate([*(lines + np.array([i * axes, 0]) for i in range(3)), [[3 * axes, 1]]])
+    for k in np.flatnonzero(variance > DISTURBED_VARIANCE_RATIO * typical):
+        omega = np.concatenate([w[k], w[k] - sideband, w[k] + sideband, [np.pi * sideband]])
+        block = project_block(channel, int(starts[k]), pieces[k], length, extended, omega)
+        variance[k] = residual_variance(block)[0]
+    return np.where(variance > DISTURBED_VARIANCE_RATIO * typical, variance, typical), typical
+
+
+def _amplitude_table(axis: Axis, sense: SenseChannel) -> Array:
+    """Amplitudes [rad] and magnitudes of their main line, shape (2, AMPLITUDE_TABLE_SIZE).
+
+    Beyond the largest magnitude, where a larger motion has a smaller line, the table is constant.
+    """
+    if not is_capacitive(sense.readout):
+        amplitudes = np.linspace(0.0, 2.0, AMPLITUDE_TABLE_SIZE)
+        return np.stack([amplitudes, amplitudes])
+    comb = axis.require_capacitance()
+    amplitudes = np.linspace(1e-4, MAX_AMPLITUDE_THETA0, AMPLITUDE_TABLE_SIZE) * comb.theta0
+    values = capacitance(amplitudes[:, None] * SIN[1], comb.C0, comb.Cb, comb.theta0, comb.theta_th)
+    sizes = np.abs(values @ COS[2]) * (2.0 / POINTS_PER_CYCLE)
+    top = int(sizes.argmax())
+    return np.stack([np.minimum(amplitudes, amplitudes[top]), np.maximum.accumulate(sizes)])

@@ -1,0 +1,184 @@
+"""Process noise: how fast the resonance drifts, estimated from the recording itself, and its posterior distribution.
+
+Four spectral densities of each axis are tuned: of white noise on the rates of phase and ln A [rad^2/s], of the
+stiffness's rate [1/s^3], of the damping [1/s] and of the logarithm of the readout gain [1/s].
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from estimation.tracker import rts_smoother
+from estimation.tracker.block_signal import BlockSignal
+from estimation.tracker.filter_run import filter_blocks, select_blocks
+from estimation.tracker.kalman_filter import StateEstimate
+from estimation.tracker.linearisation import Linearisation, empty_linearisation
+from estimation.tracker.observations import BlockObservations
+from estimation.tracker.state_space import AXIS_STATES, DAMPING, GAIN, LOG_AMPLITUDE, PHASE, STIFFNESS_RATE, padded_size
+from scanner.arrays import Array
+
+INITIAL_DENSITIES = (1e-7, 0.1, 1e-5, 1e-6)
+"""Densities at which the tuning starts. 0.1 / s^3 is a stiffness drift of 0.1 % in 30 ms, usual while warming up."""
+
+MIN_DENSITIES = (1e-9, 1e-4, 1e-8, 1e-8)
+"""Least densities: 1e-4 / s^3 is a stiffness drift of 0.003 % in 30 ms. They keep the covariance regular."""
+
+MAX_DENSITIES = (1.0, 100.0, 1.0, 1.0)
+"""Largest densities: a thousand times those of a scanner that warms up. Beyond, the filter would follow the noise."""
+
+MAX_TUNING_BLOCKS = 300
+"""Blocks on which the densities are tuned, in up to three parts: with more, the tuning would dominate the run time."""
+
+MAX_TUNING_ROUNDS = 12
+"""Most rounds of the tuning; the densities may grow by MAX_DENSITY_GROWTH in each."""
+
+LOG_DENSITY_TOLERANCE = 0.2
+"""Change of the logarithm of a density at which the tuning ends: its standard deviation at 50 degrees of freedom."""
+
+MIN_INFORMATIVE_DOF = 1e-3
+"""Degrees of freedom of a disturbance in the data below which its density is left unchanged."""
+
+PRIOR_DOF = (0.0, 1.0, 0.0, 0.0)
+"""Degrees of freedom that the prior adds to each density's score: one for a prior that is flat in the square root."""
+
+MAX_DENSITY_GROWTH = 10.0
+"""Largest factor by which a density grows in a round; keeps the fixed-point iteration stable."""
+
+STIFFNESS_RATE_COLUMN = 1
+"""Index of the stiffness rate's density among the four."""
+
+NODE_SPACING_LOG = 2.0
+"""Spacing, in ln q, of the densities q at which the posterior is evaluated.
+
+At 0 dB a scan of 30 ms has one to three degrees of freedom, a standard deviation of 0.8 to 1.4 in ln q.
+"""
+
+MIN_KNOWN_DOF = 30.0
+"""Degrees of freedom from which a density counts as known: its relative standard deviation is then 0.26."""
+
+POSTERIOR_POINTS = 201
+"""Points at which the posterior of ln q is integrated; 0.02 apart."""
+
+
+class TuningPart(NamedTuple):
+    """Consecutive blocks of a signal, with their linearisations, which all runs over them share."""
+
+    signal: BlockSignal
+    linear: Linearisation
+
+
+class NoisePosterior(NamedTuple):
+    """Posterior distribution of the process noise at a few nodes. Tracks are interpolated linearly between the nodes.
+
+    Attributes:
+        densities: at the nodes, shape (nodes, axes, 4).
+        mean_weights: posterior mean of each node's interpolation weight, shape (axes, nodes).
+        weight_products: posterior mean of the products of two weights, shape (axes, nodes, nodes).
+    """
+
+    densities: Array
+    mean_weights: Array
+    weight_products: Array
+
+
+def tune_process_noise(
+    observations: BlockObservations, start: StateEstimate, parts: list[TuningPart], densities: Array | None = None
+) -> Array:
+    """Most probable spectral densities of the process noise, shape (axes, 4).
+
+    For a density q, step h and the sums R = sum of r^2 and N of ``disturbance_scores``, the derivative of the
+    log-posterior by ln q is (q h R + dof_prior - q h N) / 2. The iteration q <- (q R + dof_prior / h) / N has its fixed
+    point where this vanishes. A density with less than one degree of freedom q h N in the data does not delay the end.
+    The prior is flat in the standard deviation of the stiffness rate (Gelman, Bayesian Analysis 1, 515, 2006). Without
+    it, a likelihood that is flat towards zero drift would often yield none.
+
+    Args:
+        start: estimate before the first block of each part. parts: blocks to tune on.
+        densities: to start from, shape (axes, 4); INITIAL_DENSITIES if None.
+    """
+    step, axes = observations.signal.step, len(observations.parameters)
+    densities = np.tile(INITIAL_DENSITIES, (axes, 1)) if densities is None else densities
+    for _ in range(MAX_TUNING_ROUNDS):
+        squares, information = _score_terms(observations, parts, start, densities)
+        dof = information * densities * step
+        informative = dof > MIN_INFORMATIVE_DOF
+        fixed_point = (densities * squares + np.array(PRIOR_DOF) / step) / np.where(informative, information, 1.0)
+        limited = np.clip(np.minimum(fixed_point, MAX_DENSITY_GROWTH * densities), MIN_DENSITIES, MAX_DENSITIES)
+        new = np.where(informative, limited, densities)
+        converged = np.abs(np.log(new / densities)) < LOG_DENSITY_TOLERANCE
+        converged |= (dof < 1.0) & (np.array(PRIOR_DOF) == 0.0)
+        densities = new
+        if converged.all():
+            break
+    return densities
+
+
+def _score_terms(
+    observations: BlockObservations, parts: list[TuningPart], start: StateEstimate, densities: Array
+) -> tuple[Array, Array]:
+    """Sums of r^2 and of N by density, see ``rts_smoother.disturbance_scores``, each of shape (axes, 4)."""
+    squares, information = np.zeros((2, padded_size(start.mean.size)))
+    for part in parts:
+        run = filter_blocks(observations, *part, start, densities)
+        terms = rts_smoother.disturbance_scores(*part, run.history)
+        squares, information = np.add((squares, information), terms)
+    return _sum_by_density(squares, len(densities)), _sum_by_density(information, len(densities))
+
+
+def mean_nis(observations: BlockObservations, start: StateEstimate, parts: list[TuningPart], densities: Array) -> float:
+    """Mean normalised innovation squared over the parts; 1 where the model and the noise level are right."""
+    runs = [filter_blocks(observations, *part, start, densities) for part in parts]
+    return sum(run.nis for run in runs) / max(sum(run.measurements for run in runs), 1)
+
+
+def noise_posterior(
+    observations: BlockObservations, start: StateEstimate, parts: list[TuningPart], densities: Array
+) -> NoisePosterior:
+    """Posterior of the stiffness rate's density about the most probable one: one node, or three if it is uncertain.
+
+    The nodes of all axes are evaluated together, because each axis has its own score. The derivative of the
+    log-posterior by ln q is a parabola through the scores at the three nodes.
+
+    Args:
+        densities: the most probable ones, shape (axes, 4).
+    """
+    nodes = np.array([-NODE_SPACING_LOG, 0.0, NODE_SPACING_LOG])
+    by_node = np.repeat(densities[None], nodes.size, axis=0)
+    by_node[:, :, STIFFNESS_RATE_COLUMN] *= np.exp(nodes)[:, None]
+    squares, information = np.empty((2, *by_node.shape))
+    for i in (1, 0, 2):  # the middle one first: if the density is known, the others are not needed
+        squares[i], information[i] = _score_terms(observations, parts, start, by_node[i])
+        dof = (information * by_node * observations.signal.step)[:, :, STIFFNESS_RATE_COLUMN]
+        if i == 1 and (dof[1] > MIN_KNOWN_DOF).all():
+            axes = len(densities)
+            return NoisePosterior(densities[None], np.ones((axes, 1)), np.ones((axes, 1, 1)))
+    slopes = 0.5 * ((squares * by_node * observations.signal.step)[:, :, STIFFNESS_RATE_COLUMN] - dof) + 0.5
+    log_ratio = np.linspace(nodes[0], nodes[-1], POSTERIOR_POINTS)
+    weights = np.stack([np.interp(log_ratio, nodes, unit) for unit in np.eye(nodes.size)])
+    mean, products = [], []
+    for axis_slopes in slopes.T:
+        log_posterior = np.polyval(np.polyint(np.polyfit(nodes, axis_slopes, 2)), log_ratio)
+        posterior = np.exp(log_posterior - log_posterior.max())
+        posterior /= posterior.sum()
+        mean.append(weights @ posterior)
+        products.append((weights * posterior) @ weights.T)
+    return NoisePosterior(by_node, np.array(mean), np.array(products))
+
+
+def _sum_by_density(sums: Array, axes: int) -> Array:
+    """Sums by state as sums by density, shape (axes, 4): phase and ln A together, stiffness rate, damping, gain."""
+    by_state = sums[: axes * AXIS_STATES].reshape(axes, AXIS_STATES)
+    phase_and_log = by_state[:, PHASE] + by_state[:, LOG_AMPLITUDE]
+    return np.stack([phase_and_log, *by_state[:, [STIFFNESS_RATE, DAMPING, GAIN]].T], axis=1)
+
+
+def tuning_parts(signal: BlockSignal) -> list[TuningPart]:
+    """The blocks to tune on: all, or a third of MAX_TUNING_BLOCKS each at the beginning, middle and end."""
+    blocks, third = len(signal.whitened), MAX_TUNING_BLOCKS // 3
+    starts = (0, (blocks - third) // 2, blocks - third)
+    parts = [signal]
+    if blocks > MAX_TUNING_BLOCKS:
+        parts = [select_blocks(signal, start, start + third) for start in starts]
+    return [TuningPart(part, empty_linearisation(part)) for part in parts]

@@ -1,0 +1,384 @@
+"""The public functions: each takes a recording or a file's path, and a device or its name or path.
+
+A recording that is given by its path is opened here, and its file is closed when no result needs it any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from scanner.device import Device
+from scanner.errors import BadInput
+from scanner.recording import Recording
+
+if TYPE_CHECKING:
+    from estimation.diagnosis.diagnose import Diagnosis
+    from estimation.diagnosis.predict import Predicted
+    from estimation.identification.calibrate import Identification
+    from recon.pipeline import Reconstruction
+    from recon.scan_design import ScanCandidate, SustainedBand
+    from scanner.motion import Motion
+
+RecordingSource = Recording | str | Path
+"""A recording, or the path of a recording or of an instrument's file."""
+
+DeviceSource = Device | str | Path
+"""A device, the name of a device that comes with the program, or the path of a device file."""
+
+MappingSource = str | Path | Mapping[str, Any]
+"""Which variable of an instrument's file is which channel: a TOML file, or its content as a dictionary."""
+
+
+def load_device(device: DeviceSource) -> Device:
+    """Return the device of that name, or the device in the TOML file at that path.
+
+    Raises:
+        BadInput: no device has that name and no file that path, or the file is not a valid device.
+    """
+    from phantoms.experiment import device_named
+
+    return device if isinstance(device, Device) else device_named(str(device))
+
+
+class Simulation(NamedTuple):
+    """A simulated recording with its known answer.
+
+    Attributes:
+        recording: what an instrument would have recorded.
+        truth: what only the simulation knows: the true angles (``angle_x``, ``angle_y``), the scene, the drift.
+    """
+
+    recording: Recording
+    truth: Mapping[str, Any]
+
+    def write(self, path: str | Path) -> None:
+        """Write recording and truth into one file, as ``lissajous simulate`` does."""
+        self.recording.write(path, self.truth)
+
+    def __repr__(self) -> str:
+        return f"Simulation(truth: {', '.join(self.truth)}) of\n{self.recording!r}"
+
+
+def simulate(
+    device: DeviceSource = "imaging",
+    *,
+    target: str = "immunohistochemistry",
+    drive_x: tuple[float, float, float] = (27680.0, 30.0, 30.0),
+    drive_y: tuple[float, float, float] = (6540.0, 30.0, 30.0),
+    duration: float = 0.06,
+    sample_rate: float = 5e6,
+    drift: float | Mapping[str, float] = -0.002,
+    drift_tau: float = 0.025,
+    field_um: float = 250.0,
+    spot_um: float = 0.4,
+    photons: float = 1000.0,
+    angles: bool = False,
+    seed: int = 0,
+    nominal: DeviceSource | None = None,
+) -> Simulation:
+    """Simulate the scan of a target while both resonances drift.
+
+    Args:
+        device: the true device. It needs both axes and a field of view, ``[scan]``.
+        target: name of a target, or an image file.
+        drive_x, drive_y: frequency [Hz], amplitude [V] and offset [V] of the sinusoidal drive of each axis.
+        duration: of the recording [s].
+        sample_rate: of all channels [Hz].
+        drift: relative change of the stiffness in the end, of both axes or by axis name.
+        drift_tau: time constant of the drift [s].
+        field_um: width of the field of view on the sample [um].
+        spot_um: standard deviation of the beam's spot [um].
+        photons: photons a sample at full brightness.
+        angles: record the true angles as the reference channels ``angle_x`` and ``angle_y`` too.
+        seed: of all noise.
+        nominal: the device that the recording states, where the calibration differs from the true device.
+
+    Raises:
+        BadInput: the device cannot be simulated, or there is no such target.
+    """
+    from phantoms.experiment import Experiment, simulate_experiment
+    from phantoms.optics import Detector
+    from phantoms.waveforms import Sine
+
+    experiment = Experiment(
+        device=load_device(device),
+        target=target,
+        drives={"x": Sine(*drive_x), "y": Sine(*drive_y)},
+        duration=duration,
+        sample_rate=sample_rate,
+        drift=dict(drift) if isinstance(drift, Mapping) else {"x": drift, "y": drift},
+        drift_tau=drift_tau,
+        field_um=field_um,
+        spot_um=spot_um,
+        detector=Detector(photons_per_sample=photons, bits=12),
+        angles=angles,
+    )
+    return Simulation(*simulate_experiment(experiment, seed, None if nominal is None else load_device(nominal)))
+
+
+def convert(file: str | Path, mapping: MappingSource, output: str | Path | None = None) -> Recording:
+    """Return the recording that a mapping makes of an instrument's file; its samples are read when they are needed.
+
+    Args:
+        file: MATLAB, HDF5, TDMS, LabVIEW, CSV, oscilloscope, NumPy or WAV file.
+        mapping: which variable is which channel: a TOML file or the same as a dictionary.
+        output: write the recording to this path and return it from there.
+
+    Raises:
+        BadInput: the file cannot be read, or the mapping does not fit it.
+    """
+    from recon.io.convert import convert_file, open_any
+
+    plan = _as_mapping(mapping)
+    if output is None:
+        return open_any(Path(file), plan)
+    convert_file(Path(file), plan, Path(output))
+    return Recording.open(output)
+
+
+def estimate(
+    recording: RecordingSource,
+    device: DeviceSource | None = None,
+    estimator: str | None = None,
+    *,
+    mapping: MappingSource | None = None,
+    flip_x: bool = False,
+    flip_y: bool = False,
+) -> Motion:
+    """Estimate the motion of every axis.
+
+    Args:
+        recording: a recording or a file.
+        device: in place of the recording's own.
+        estimator: ``"tracker"``, ``"ukf"``, ...; chosen by what was recorded where None.
+        mapping: needed where ``recording`` is an instrument's file.
+        flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
+
+    Raises:
+        BadInput: no such estimator, or the recording or the device lacks what it needs.
+    """
+    from estimation.estimate import estimate as estimate_motion
+
+    return estimate_motion(_opened(recording, device, mapping), None, estimator, {"x": flip_x, "y": flip_y})
+
+
+def reconstruct(
+    recording: RecordingSource,
+    device: DeviceSource | None = None,
+    estimator: str | None = None,
+    *,
+    pixels: tuple[int, int] = (400, 400),
+    p: float = 1.0,
+    flip_x: bool = False,
+    flip_y: bool = False,
+    spot: float | None = None,
+    sense_only: bool = False,
+    mapping: MappingSource | None = None,
+    truth: Mapping[str, Any] | None = None,
+) -> Reconstruction:
+    """Estimate the motion, map the intensity to pixels and assess the result.
+
+    Args:
+        recording: a recording or a file.
+        device: in place of the recording's own.
+        estimator: ``"tracker"``, ``"ukf"``, ...; chosen by what was recorded where None.
+        pixels: width and height of the picture.
+        p: pixels of displacement that are tolerated; the phase bound is p/m with m half the pixels across.
+        flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
+        spot: standard deviation of the beam's spot [px], for the account of the blur.
+        sense_only: do not correct the phase by the error that the picture shows.
+        mapping: needed where ``recording`` is an instrument's file.
+        truth: of a simulation, for ``evaluation``; a simulated file's own truth is read from the file.
+
+    Raises:
+        BadInput: the recording or the device lacks what is needed.
+    """
+    from recon.evaluation import load_truth, truth_from_simulation
+    from recon.pipeline import Options
+    from recon.pipeline import reconstruct as reconstruct_recording
+
+    options = Options(
+        estimator=estimator, pixels=pixels, p=p, flips={"x": flip_x, "y": flip_y}, spot=spot, sense_only=sense_only
+    )
+    known = truth_from_simulation(truth) if truth is not None else None
+    if known is None and not isinstance(recording, Recording) and mapping is None:
+        known = load_truth(Path(recording))
+    return reconstruct_recording(_opened(recording, device, mapping), options, known, quiet=True)
+
+
+def diagnose(
+    recordings: RecordingSource | Sequence[RecordingSource],
+    device: DeviceSource | None = None,
+    *,
+    mapping: MappingSource | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Diagnosis:
+    """Locate, name and model what the nominal device leaves out: motion, readout and, with an intensity, optics.
+
+    Args:
+        recordings: one or several of one device; several are judged together.
+        device: the nominal one, in place of that of the first recording.
+        mapping: needed where the recordings are an instrument's files.
+        progress: called with a line of text at every step.
+
+    Raises:
+        BadInput: no device, or a recording that cannot be compared with it.
+    """
+    from estimation.complete_diagnosis import diagnose_with_optics
+
+    opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
+    return diagnose_with_optics(opened, None if device is None else load_device(device), progress)
+
+
+def identify(
+    recordings: RecordingSource | Sequence[RecordingSource],
+    device: DeviceSource | None = None,
+    *,
+    mapping: MappingSource | None = None,
+) -> Identification:
+    """Measure a device's constants from recordings at rest, in free decay and driven.
+
+    Args:
+        recordings: one or several; each is used for what it shows.
+        device: the nominal one, in place of that of the first recording that states one.
+        mapping: needed where the recordings are an instrument's files.
+
+    Raises:
+        BadInput: no device is stated, or no recording shows anything of it.
+    """
+    from estimation.identification.calibrate import identify as identify_device
+
+    opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
+    nominal = load_device(device) if device is not None else next((r.device for r in opened if r.device), None)
+    if nominal is None:
+        raise BadInput("states no device", file=opened[0].path, channel="/device", hint="give one as device=")
+    return identify_device(opened, nominal)
+
+
+def predict(
+    recording: RecordingSource,
+    device: DeviceSource | None = None,
+    *,
+    mapping: MappingSource | None = None,
+) -> dict[str, Predicted]:
+    """Play the recording's drive through a device, open loop, and compare every sense and angle channel.
+
+    Args:
+        recording: a recording or a file.
+        device: in place of the recording's own.
+        mapping: needed where ``recording`` is an instrument's file.
+
+    Returns:
+        By channel name the predicted and the measured samples and their difference ``rmse``.
+
+    Raises:
+        BadInput: no device, or nothing to compare with.
+    """
+    from estimation.diagnosis.predict import predict as predict_channels
+
+    opened = _opened(recording, device, mapping)
+    if opened.device is None:
+        raise BadInput("states no device", file=opened.path, channel="/device", hint="give one as device=")
+    return predict_channels(opened, opened.device)
+
+
+@dataclass(frozen=True)
+class ScanDesign:
+    """Drive frequencies for a wanted scan.
+
+    Attributes:
+        bands: by axis name the motion that the drive sustains against its frequency.
+        candidates: pairs of drive frequencies, best first.
+    """
+
+    bands: Mapping[str, SustainedBand]
+    candidates: Sequence[ScanCandidate]
+
+    def __repr__(self) -> str:
+        lines = [f"ScanDesign: {len(self.candidates)} pairs of drive frequencies, best first"]
+        lines += [
+            f"  {pair.drive[0]:.2f} Hz x {pair.drive[1]:.2f} Hz: {pair.figure.frame_rate:.3f} pictures a second, "
+            f"fill {pair.fill['worst']:.1%} to {pair.fill['best']:.1%}"
+            for pair in self.candidates[:5]
+        ]
+        return "\n".join(lines)
+
+
+def design(
+    device: DeviceSource = "imaging",
+    *,
+    pixels: tuple[int, int] = (400, 400),
+    frame_rate: float = 15.0,
+    fill: float = 0.95,
+    half_angles: tuple[float, float] | None = None,
+    volts: tuple[float, float] = (30.0, 30.0),
+    sample_rate: float | None = None,
+    margin: float = 0.0005,
+) -> ScanDesign:
+    """Find drive frequencies whose Lissajous figure fills the picture at the wanted frame rate.
+
+    Args:
+        device: whose drives have to sustain the field.
+        pixels: width and height of the picture.
+        frame_rate: pictures a second, at least [Hz].
+        fill: fraction of the pixels that one picture has to visit.
+        half_angles: half the field in x and y [rad]; the device's ``[scan]`` where None.
+        volts: amplitude and offset of both drives [V].
+        sample_rate: samples a second [Hz]; the beam's whole path counts where None.
+        margin: relative change of either stiffness that field and motion have to survive.
+
+    Raises:
+        BadInput: the drives do not sustain the field, or no pair of frequencies repeats at the frame rate.
+    """
+    from recon.imaging.picture import Grid
+    from recon.scan_design import ScanRequirements
+    from recon.scan_design import design as design_scan
+
+    loaded = load_device(device)
+    if half_angles is None:
+        scan = loaded.require_scan()
+        half_angles = scan.half_angle_x, scan.half_angle_y
+    requirements = ScanRequirements(Grid(*pixels, *half_angles), frame_rate, fill, sample_rate, margin)
+    return ScanDesign(*design_scan(loaded, requirements, volts))
+
+
+def blur_study(
+    study: str | Path, output: str | Path, *, workers: int | None = None, scheduler: str | None = None
+) -> dict[str, Any]:
+    """Run a study of many simulated scans and write its table and report; finished cells are not computed again.
+
+    Args:
+        study: what to vary (TOML).
+        output: folder of table, report and journal.
+        workers: processes on this machine; one a core where None.
+        scheduler: address of a Dask scheduler in place of this machine.
+
+    Returns:
+        The content of ``summary.json``.
+
+    Raises:
+        BadInput: the study, the folder or the scheduler cannot be used.
+    """
+    from recon.study.run import run_study
+
+    return run_study(Path(study), Path(output), scheduler=scheduler, workers=workers)
+
+
+def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: MappingSource | None) -> Recording:
+    """The recording, opened where a path is given, with ``device`` in place of its own where one is given."""
+    from recon.io.convert import open_any
+
+    if not isinstance(recording, Recording):
+        recording = open_any(Path(recording), None if mapping is None else _as_mapping(mapping))
+    return recording if device is None else replace(recording, device_toml=load_device(device).to_toml())
+
+
+def _as_mapping(mapping: MappingSource) -> Path | Mapping[str, Any]:
+    return Path(mapping) if isinstance(mapping, str) else mapping
+
+
+def _as_list(recordings: RecordingSource | Sequence[RecordingSource]) -> list[RecordingSource]:
+    return [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)

@@ -1,0 +1,140 @@
+"""The command line, ``lissajous COMMAND``: one module a command, with its arguments, its work on files and its text.
+
+Contains no estimation, no imaging and no drawing. A command's module has ``add_arguments(parser)``, ``run(args)``, that
+returns the summary, and ``format_summary(summary)``, which returns the text for the terminal; it is imported only if
+that command is called, and imports numpy and whatever takes long inside its functions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import NoReturn
+
+from recon.interrupts import StopRequest, handle_interrupts
+
+COMMANDS = {
+    "reconstruct": "track the motion of a recording and map its intensities to a picture",
+    "simulate": "make a recording with a known truth",
+    "identify": "find a device's constants from recordings at rest, ringing down and driven",
+    "predict": "play a recording's drive through a device and compare",
+    "diagnose": "locate, name and model what the nominal device leaves out",
+    "design": "find drive frequencies for a wanted field, resolution, frame rate and fill",
+    "blur-study": "compare phantoms, scans, drifts, noise, estimators, resolutions and p in one table",
+    "info": "list what a recording or an instrument's file holds, with a mapping to start from",
+    "convert": "turn an instrument's file into a recording",
+    "completion": "print a script that completes commands, options and files in bash, zsh or fish",
+}
+"""Commands and their one-line help."""
+
+
+class _PrintVersion(argparse.Action):
+    """``--version``: print the installed version and exit."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from importlib.metadata import version
+
+        print(f"lissajous {version('lissajous')}")
+        parser.exit()
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that reports wrong arguments in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return the exit code: 0 done, 2 bad arguments or input, 1 anything else."""
+    # The matrices are small: threads inside BLAS slow them down, on a busy machine several times.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    with handle_interrupts() as stop:
+        try:
+            return _run_command(words, stop)
+        except BaseException as error:
+            if not stop.came or isinstance(error, SystemExit):
+                raise
+            # Compiled code may turn an interrupt in a callback into another exception, a TypeError or a BadInput.
+            print(f"lissajous {' '.join(words[:1])}: interrupted; nothing was written", file=sys.stderr)
+            return 1
+
+
+def _run_command(words: Sequence[str], stop: StopRequest) -> int:
+    parser = _Parser(
+        prog="lissajous", description="Resonant scanners: motion, pictures and missing physics from recordings."
+    )
+    parser.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+    for name, text in COMMANDS.items():
+        called = name in words[:1]  # only this command's module is imported, which keeps --help quick
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + "." if called else None)
+        if called:
+            module = add_command(name, command)
+    args = parser.parse_args(words)
+    return _run(module, args, f"{parser.prog} {args.command}", stop)
+
+
+def add_command(name: str, parser: argparse.ArgumentParser) -> ModuleType:
+    """Add a command's arguments to its parser; return its module."""
+    module = importlib.import_module(f"recon.cli.{name.replace('-', '_')}")
+    module.add_arguments(parser)
+    parser.add_argument("--terms", type=Path, metavar="PATH", help="Python file with terms that a device uses")
+    parser.add_argument("--estimators", type=Path, metavar="PATH", help="Python file with further estimators of motion")
+    parser.add_argument("--readers", type=Path, metavar="PATH", help="Python file with readers of further file formats")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON, and nothing else, on stdout")
+    return module
+
+
+def reconstruct_main() -> int:
+    """``reconstruct-from-recording``: ``lissajous reconstruct`` as a separate command."""
+    return main(["reconstruct", *sys.argv[1:]])
+
+
+def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequest) -> int:
+    from scanner.errors import BadInput, line_of
+
+    try:
+        if args.terms is not None:
+            from scanner.terms import register
+
+            register(args.terms)
+        if args.estimators is not None:
+            from estimation.estimators import register as register_estimators
+
+            register_estimators(args.estimators)
+        if args.readers is not None:
+            from recon.io.readers import register as register_readers
+
+            register_readers(args.readers)
+        summary = module.run(args)
+        print(json.dumps(summary, indent=1) if args.json else _printable(module.format_summary(summary)))
+        return int(summary.get("exit", 0))  # of several recordings, some may have failed
+    except BadInput as error:
+        if stop.came:  # an interrupt may have caused it
+            raise
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print(f"{prog}: needs more memory than there is; cut the recording into shorter ones", file=sys.stderr)
+        return 2
+    except OSError as error:  # a full disk, a folder that may not be written
+        print(f"{prog}: {line_of(error, 'output')}", file=sys.stderr)
+        return 1
+
+
+def _printable(text: str) -> str:
+    """Text without control characters, which names in a file may contain and a terminal would obey."""
+    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""``lissajous convert FILE``: an instrument's file becomes a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+# What may be said of channels in arguments: option -> key of the mapping, and what its value is.
+OPTIONS = {"unit": ("unit", str), "rate": ("sample_rate", float), "start": ("start", float)}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="the instrument's file; `lissajous info FILE` lists what it holds")
+    parser.add_argument("--mapping", type=Path, help="TOML: which variable is which channel, unit, rate, device")
+    parser.add_argument(
+        "--channel", action="append", default=[], metavar="NAME=VARIABLE",
+        help="for each channel, in place of a mapping",
+    )  # fmt: skip
+    for option, text in (("unit", "unit"), ("rate", "sample rate [Hz]"), ("start", "time of the first sample [s]")):
+        parser.add_argument(
+            f"--{option}", action="append", default=[], metavar=f"[NAME=]{option.upper()}",
+            help=f"{text} of all channels, or of one, where the file does not state it",
+        )  # fmt: skip
+    parser.add_argument("--format", help="the file's format, where neither its beginning nor its name tells")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the recording to write (.h5)")
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    from recon.io.convert import convert_file
+    from scanner.errors import BadInput
+
+    said = [f"--{name}" for name in ("channel", "format", *OPTIONS) if getattr(args, name)]
+    if args.mapping is None:
+        return convert_file(args.file, plan_of(args), args.output)
+    if said:
+        raise BadInput(f"stands beside {said[0]}", channel="--mapping", hint="say it all in one of the two")
+    return convert_file(args.file, args.mapping, args.output)
+
+
+def plan_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The mapping that the arguments state.
+
+    Raises:
+        BadInput: no channel, one without a variable, or a value that is none.
+    """
+    from scanner.errors import BadInput
+
+    hint = "as --channel sense_x=CH2 --unit V --rate 5e6, or write a --mapping"
+    channels: dict[str, dict[str, Any]] = {}
+    for text in args.channel:
+        name, given, variable = text.partition("=")
+        if not (name and given and variable) or name in channels:
+            raise BadInput(f"{text!r} names no channel and variable of its own", channel="--channel", hint=hint)
+        channels[name] = {"variable": variable}
+    if not channels:
+        raise BadInput("nothing says which variable is which channel", file=args.file, hint=f"say so, {hint}")
+    for option, (key, kind) in OPTIONS.items():
+        for text in getattr(args, option):
+            name, given, value = text.rpartition("=")
+            if given and name not in channels:
+                raise BadInput(f"{name!r} is no channel named by --channel", channel=f"--{option}", hint=hint)
+            try:
+                said = kind(value)
+            except ValueError:
+                raise BadInput(f"{value!r} is no number", channel=f"--{option}", hint=hint) from None
+            for each in [name] if given else channels:
+                channels[each][key] = said
+    return {"channels": channels} | ({"format": args.format} if args.format else {})
+
+
+def format_summary(summary: dict[str, Any]) -> str:
+    lines = [f"{summary['recording']}: {summary['duration']:.6g} s, from {summary['source']} ({summary['format']})"]
+    for name, own in summary["channels"].items():
+        by = own["stated_by"]
+        line = f"  {name}: {own['variable']}, {own['unit']} ({by['unit']})"
+        line += f", {own['sample_rate']:.9g} Hz ({by['sample_rate']})"
+        line += f", from {own['start']:.9g} s ({by['start']}), {own['shape'][0]} samples"
+        lines.append(line + "".join(f"; the file states {key} {value}" for key, value in own["overruled"].items()))
+    return "\n".join(lines)

@@ -1,0 +1,127 @@
+"""``lissajous diagnose REC...``: locate, name and model what the nominal device leaves out.
+
+With ``--plan`` nothing is measured: the command lists which effects such recordings could show.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="recordings of one device (.h5)")
+    parser.add_argument(
+        "--plan",
+        action="store_true",
+        help="no diagnosis: which effects such recordings could show; REC may be an excitation (.toml)",
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
+    parser.add_argument(
+        "--device",
+        type=Path,
+        metavar="FILE",
+        help="device TOML in place of the recording's own; with --plan, or a name",
+    )
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    from recon.experiment_planning import plan_files
+
+    work = plan_files if args.plan else diagnose_files
+    return work(args.recordings, args.output, device=args.device, mapping=args.mapping, quiet=args.json)
+
+
+def diagnose_files(
+    paths: Sequence[Path],
+    output: Path,
+    device: Path | None = None,
+    mapping: Path | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Diagnose recordings of one device; write diagnosis.json, device.toml and report.html; return the diagnosis.
+
+    Args:
+        paths: recordings of one device, which are judged together.
+        output: folder.
+        device: file of the nominal device; None takes that of the first recording.
+        mapping: makes recordings of instruments' files, see :func:`recon.io.convert.open_any`.
+        quiet: show no progress.
+
+    Raises:
+        BadInput: a recording or the device cannot be used.
+    """
+    from contextlib import ExitStack
+
+    from tqdm import tqdm
+
+    from estimation.complete_diagnosis import diagnose_with_optics
+    from recon.io.convert import open_any
+    from recon.io.output import check_folder, replacing_folder
+    from recon.report.diagnosis import diagnosis_report
+    from scanner.device import Device
+
+    check_folder(output)
+    began = time.perf_counter()
+    with ExitStack() as stack:
+        recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
+        nominal = Device.load(device) if device is not None else None
+        with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
+            diagnosis = diagnose_with_optics(recordings, nominal, bar.set_description_str)
+            bar.set_description_str("report")
+            page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
+        content = diagnosis.to_json()
+        with replacing_folder(output) as folder:
+            text = json.dumps(content, indent=1, ensure_ascii=False)
+            (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
+            (folder / "device.toml").write_text(diagnosis.device.to_toml(), encoding="utf-8")
+            (folder / "report.html").write_text(page, encoding="utf-8")
+    return content | {"output": str(output), "seconds": time.perf_counter() - began}
+
+
+def format_summary(summary: dict[str, Any]) -> str:
+    return _format_plan(summary) if "excitations" in summary else _format_diagnosis(summary)
+
+
+def _format_plan(summary: dict[str, Any]) -> str:
+    from recon.report.conclusions import conclude_plan
+
+    lines = [conclude_plan(summary)]
+    lines += [
+        f"  {effect['axis']} {effect['effect']}: {effect['sigma']:.3g} sigma, {effect['distance']:.3g} from "
+        f"{effect['nearest']}" + (f" ({effect['advice']})" if effect["advice"] else "")
+        for effect in summary["effects"]
+    ]
+    return "\n".join([*lines, f"  report {summary['output']}/report.html"])
+
+
+def _format_diagnosis(summary: dict[str, Any]) -> str:
+    from recon.report.conclusions import conclude_diagnosis
+    from recon.report.numbers import format_interval, format_probability
+
+    lines = [conclude_diagnosis(summary), f"{summary['output']}: {summary['verdict']}"]
+    for finding in summary["findings"]:
+        chi2 = finding["heldout"]
+        lines.append(
+            f"  {finding['axis']} {finding['stage']}: {finding['effect']} (probability "
+            f"{format_probability(finding['probability'])}), "
+            f"held-out chi-square {chi2['before']:.3g} -> {chi2['after']:.3g}"
+        )
+        lines += [
+            f"    {p['name']} = {format_interval(p['value'], p['ci95'][0], p['ci95'][1], p['unit'])}"
+            for p in finding["parameters"]
+        ]
+        if finding["rivals"]:
+            rivals = [f"{r['effect']} ({format_probability(r['probability'])})" for r in finding["rivals"]]
+            lines.append(f"    or {', '.join(rivals)}")
+        if "advice" in finding:
+            lines.append(f"    to distinguish them: {finding['advice']}")
+    if summary["unexplained"]:
+        lines.append(f"  unexplained: {summary['unexplained']}")
+    lines.append(f"  report {summary['output']}/report.html")
+    return "\n".join(lines)

@@ -1,0 +1,103 @@
+"""``lissajous identify REC...``: measure a device's constants from recordings at rest, in free decay and driven."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from estimation.identification.calibrate import Identification
+
+UNITS = {
+    "J": "kg m²", "b": "N m s", "k": "N m/rad", "k_over_J": "1/s²", "b_over_J": "1/s",
+    "C0": "F", "theta0": "rad", "theta_th": "rad", "a_cir": "V/F", "b_cir": "V",
+    "noise_var": "V²", "noise_sd": "V", "delay": "s",
+}  # fmt: skip
+"""Units of the constants that can be identified."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="calibration recordings (.h5)")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the device")
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
+    parser.add_argument(
+        "--device", type=Path, metavar="FILE", help="nominal device TOML in place of the recordings' own"
+    )
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    return identify_files(args.recordings, args.output, device=args.device, mapping=args.mapping)
+
+
+def identify_files(
+    paths: Sequence[Path], output: Path, device: Path | None = None, mapping: Path | None = None
+) -> dict[str, Any]:
+    """Identify a device; write device.toml, summary.json and report.html into ``output``; return the summary.
+
+    Args:
+        paths: recordings of one device.
+        output: folder.
+        device: file of the nominal device; None takes that of the first recording that states one.
+        mapping: makes recordings of instruments' files, see :func:`recon.io.convert.open_any`.
+
+    Raises:
+        BadInput: a recording or the device cannot be used, or the recordings determine no constant.
+    """
+    from contextlib import ExitStack
+
+    from estimation.identification.calibrate import identify
+    from recon.io.convert import open_any
+    from recon.io.output import check_folder, replacing_folder, write_json
+    from recon.report.identification import identification_report
+    from scanner.device import Device
+    from scanner.errors import BadInput
+
+    check_folder(output)
+    with ExitStack() as stack:
+        recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
+        nominal = Device.load(device) if device else next((r.device for r in recordings if r.device), None)
+        if nominal is None:
+            hint = "give one with --device, or record it under /device"
+            raise BadInput("states no device", file=paths[0], channel="/device", hint=hint)
+        identification = identify(recordings, nominal)
+    summary = {
+        "recordings": [str(path) for path in paths],
+        "device": nominal.name,
+        "axes": _axes_summary(identification),
+        "notes": list(identification.notes),
+    }
+    with replacing_folder(output) as folder:
+        (folder / "device.toml").write_text(identification.device.to_toml(), encoding="utf-8")
+        write_json(folder / "summary.json", summary)
+        page = identification_report(summary, nominal, [path.name for path in paths])
+        (folder / "report.html").write_text(page, encoding="utf-8")
+    return summary | {"output": str(output)}
+
+
+def _axes_summary(identification: Identification) -> dict[str, Any]:
+    """By axis which recordings were used for what, and every identified constant."""
+    return {
+        axis: {
+            "used": list(identification.used[axis]),
+            "values": {
+                name: {"value": each.value, "sd": each.sd, "ci95": list(each.ci95), "unit": UNITS[name]}
+                for name, each in values.items()
+            },
+        }
+        for axis, values in identification.values.items()
+    }
+
+
+def format_summary(summary: dict[str, Any]) -> str:
+    from recon.report.conclusions import conclude_identification
+    from recon.report.numbers import format_interval
+
+    lines = [conclude_identification(summary), f"{summary['output']}: {summary['device']} identified"]
+    for name, axis in summary["axes"].items():
+        lines.append(f"  {name}: {'; '.join(axis['used'])}")
+        for key, value in axis["values"].items():
+            low, high = value["ci95"]
+            lines.append(f"    {key} = {format_interval(value['value'], low, high, value['unit'])}")
+    return "\n".join([*lines, *(f"  {note}" for note in summary["notes"])])

@@ -1,0 +1,90 @@
+"""``lissajous predict REC``: simulate the recording's drive through a device, open loop, and compare."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, help="the recording (.h5), or an instrument's file with --mapping")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the prediction")
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
+    parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    return predict_file(args.recording, args.output, device=args.device, mapping=args.mapping)
+
+
+def predict_file(
+    path: Path,
+    output: Path,
+    device: Path | None = None,
+    mapping: Path | None = None,
+) -> dict[str, Any]:
+    """Predict one recording and write predicted.h5 and summary.json into ``output``; return the summary.
+
+    Args:
+        path: the recording.
+        output: folder.
+        device: device file in place of the recording's own device.
+        mapping: makes a recording of an instrument's file, see :func:`recon.io.convert.open_any`.
+
+    Raises:
+        BadInput: the recording or the device cannot be used.
+    """
+    import numpy as np
+
+    from estimation.diagnosis.predict import beyond_measured_laws, predict
+    from recon.io.convert import open_any
+    from recon.io.output import check_folder, replacing_folder, write_json
+    from scanner.device import Device
+    from scanner.errors import BadInput
+    from scanner.recording import Recording
+
+    check_folder(output)
+    with open_any(path, mapping) as recording:
+        used = Device.load(device) if device is not None else recording.device
+        if used is None:
+            hint = "give one with --device, or record it under /device"
+            raise BadInput("states no device", file=path, channel="/device", hint=hint)
+        predictions = predict(recording, used)
+        channels = {name: (p.values, p.unit, p.sample_rate, p.start) for name, p in predictions.items()}
+        predicted = Recording.from_arrays(channels, device=used, name=f"{recording.name}, predicted")
+        summary: dict[str, Any] = {
+            "recording": str(path),
+            "device": used.name,
+            "terms": {name: sorted(axis.terms) for name, axis in used.axes.items() if axis.terms},
+            "beyond_measured_law": beyond_measured_laws(recording, used),
+            "channels": {
+                name: {
+                    "rmse": prediction.rmse,
+                    "nrmse": prediction.rmse / max(float(np.std(prediction.measured)), 1e-300),
+                    "noise_sd": prediction.noise_sd,
+                    "unit": prediction.unit,
+                }
+                for name, prediction in predictions.items()
+            },
+        }
+        with replacing_folder(output) as folder:
+            predicted.write(folder / "predicted.h5")
+            write_json(folder / "summary.json", summary)
+    return summary | {"output": str(output)}
+
+
+def format_summary(summary: dict[str, Any]) -> str:
+    from recon.report.conclusions import conclude_prediction
+
+    lines = [conclude_prediction(summary)]
+    lines.append(f"{summary['output']}: {len(summary['channels'])} channels predicted from the first samples on")
+    for name, fraction in summary["beyond_measured_law"].items():
+        if fraction > 0.0:
+            lines.append(f"  axis {name}: {fraction:.1%} of the samples lie beyond the range of its measured law")
+    for name, channel in summary["channels"].items():
+        line = f"  {name}: rmse {channel['rmse']:.4g} {channel['unit']}, {channel['nrmse']:.3%} of the signal's sd"
+        if channel["noise_sd"] is not None:
+            line += f"; noise sd {channel['noise_sd']:.4g} {channel['unit']}"
+        lines.append(line)
+    return "\n".join(lines)

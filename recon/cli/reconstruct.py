@@ -1,0 +1,205 @@
+"""``lissajous reconstruct REC...`` (= ``reconstruct-from-recording``): motion, picture, accuracy and report."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from recon.cli.argument_types import parse_count, parse_positive, parse_size
+
+if TYPE_CHECKING:
+    from recon.pipeline import Options
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="REC",
+        help="the recording (.h5), or an instrument's file with --mapping; several at once go to a folder each",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for pictures, motion, report"
+    )
+    several = parser.add_mutually_exclusive_group()
+    several.add_argument("--scheduler", metavar="ADDRESS", help="several: on the Dask cluster of this scheduler")
+    several.add_argument("--workers", type=parse_count, metavar="N", help="several: processes here (one a core)")
+    several.add_argument(
+        "--follow", action="store_true", help="show the frames of a recording that is still being written, then all"
+    )
+    frame_options = parser.add_mutually_exclusive_group()
+    frame_options.add_argument(
+        "--frames", type=parse_count, metavar="N", help="write N frames of the scan to frames.ome.tif"
+    )
+    frame_options.add_argument(
+        "--frame-time",
+        type=parse_positive,
+        metavar="S",
+        help="or frames of S seconds; follow: so long (the scan's repeat)",
+    )
+    parser.add_argument(
+        "--quiet-time",
+        type=parse_positive,
+        default=5.0,
+        metavar="S",
+        help="follow: end when nothing came for so long (5)",
+    )
+    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
+    parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
+    parser.add_argument("--estimator", metavar="NAME", help="tracker, ukf, ekf, ...; else by what was recorded")
+    parser.add_argument(
+        "--pixels", type=parse_size, default=(400, 400), metavar="WxH", help="size of the picture (400x400)"
+    )
+    parser.add_argument("--p", type=parse_positive, default=1.0, help="pixels of shift that are tolerated (1)")
+    parser.add_argument(
+        "--flip-x", action="store_true", help="turn the sign of x, which an even capacitance cannot know"
+    )
+    parser.add_argument("--flip-y", action="store_true", help="turn the sign of y")
+    parser.add_argument(
+        "--fill",
+        type=int,
+        default=0,
+        metavar="PX",
+        help="fill holes up to PX pixels wide, marked in fill.tif (0: none)",
+    )
+    parser.add_argument(
+        "--sense-only", action="store_true", help="do not correct the phase by the error that the picture shows"
+    )
+    parser.add_argument(
+        "--spot", type=parse_positive, metavar="PX", help="sd of the beam's spot in pixels, for the blur's account"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of whatever is drawn at random (nothing is, at present)")
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    from recon.pipeline import Options
+
+    options = Options(
+        device=args.device,
+        estimator=args.estimator,
+        pixels=args.pixels,
+        p=args.p,
+        flips={"x": args.flip_x, "y": args.flip_y},
+        fill_radius=args.fill,
+        spot=args.spot,
+        sense_only=args.sense_only,
+        frames=args.frames,
+        frame_time=args.frame_time,
+    )
+    if len(args.recordings) > 1 or args.scheduler or args.workers:
+        return _run_many(args, options)
+    live = None
+    if args.follow:
+        from recon.follow import follow_recording
+
+        times = {"frame_time": args.frame_time, "quiet_time": args.quiet_time}
+        live = follow_recording(args.recordings[0], args.output, options, args.mapping, **times).summary()
+    return reconstruct_file(args.recordings[0], args.output, options, args.mapping, live=live)
+
+
+def _run_many(args: argparse.Namespace, options: Options) -> dict[str, Any]:
+    from recon.cli.reconstruct_many import reconstruct_files
+    from scanner.errors import BadInput
+
+    if args.follow:
+        raise BadInput("follows one recording", channel="--follow", hint="start one command for each")
+    where = {"scheduler": args.scheduler, "workers": args.workers}
+    return reconstruct_files(args.recordings, args.output, options, args.mapping, **where)
+
+
+def reconstruct_file(
+    path: Path,
+    output: Path,
+    options: Options,
+    mapping: Path | None = None,
+    quiet: bool = False,
+    live: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Reconstruct one recording; write pictures, motion, summary and report into ``output``; return the summary.
+
+    Args:
+        path: the recording.
+        output: folder.
+        options: of the reconstruction.
+        mapping: makes a recording of an instrument's file, see :func:`recon.io.convert.open_any`.
+        quiet: show no progress.
+        live: summary of ``--follow``. The file may then still be open for writing, and no truth is read from it.
+
+    Raises:
+        BadInput: the recording or the device cannot be used.
+    """
+    import numpy as np
+
+    from recon.evaluation import load_truth
+    from recon.frames import write_scan_frames
+    from recon.imaging.picture import fill_holes
+    from recon.imaging.pixel_noise import pixel_sd
+    from recon.io.convert import open_any
+    from recon.io.output import finite, replacing_folder, write_json, write_motion, write_tiff
+    from recon.pipeline import reconstruct
+    from recon.report.conclusions import conclude_reconstruction
+    from recon.report.figures import save_picture
+    from recon.report.reconstruction import reconstruction_report
+    from recon.report.summary import summarise
+
+    growing = live is not None
+    with open_any(path, mapping, growing) as recording, replacing_folder(output) as folder:
+        result = reconstruct(recording, options, None if mapping or growing else load_truth(path), quiet)
+        origin = {"output": str(output), "recording": str(path)} | ({"live": live} if live else {})
+        summary: dict[str, Any] = finite(summarise(result) | origin)
+        summary["conclusion"] = conclude_reconstruction(summary)
+        grid = result.picture.grid
+        write_tiff(folder / "image.tif", result.picture.image, grid)
+        write_tiff(folder / "image_sd.tif", pixel_sd(result.picture, result.sample_noise), grid)
+        write_tiff(folder / "coverage.tif", result.picture.coverage, grid)
+        if options.fill_radius:
+            image, mask = fill_holes(result.picture, options.fill_radius)
+            write_tiff(folder / "filled.tif", image, grid)
+            write_tiff(folder / "fill.tif", mask.astype(np.uint8), grid)
+        if result.defects:
+            write_tiff(folder / "affected.tif", result.affected.astype(np.uint8), grid)
+        if options.frames or options.frame_time:
+            write_scan_frames(folder / "frames.ome.tif", result, options)
+        write_motion(folder / "motion.h5", result.motion)
+        write_json(folder / "summary.json", summary)
+        save_picture(folder / "image.png", result.picture, result.affected)
+        (folder / "report.html").write_text(reconstruction_report(result, summary), encoding="utf-8")
+    return summary
+
+
+def format_summary(summary: dict[str, Any]) -> str:
+    if "recordings" in summary:
+        from recon.cli.reconstruct_many import format_summary as format_many
+
+        return format_many(summary)
+    lines = [
+        summary["conclusion"],
+        f"{summary['output']}: {summary['estimator']}, {summary['samples']} samples, fill {summary['fill']:.1%}",
+    ]
+    lines += [_format_axis(name, summary[name]) for name in summary["axes"]]
+    if "live" in summary:
+        lines.append(_format_live(summary["live"]))
+    lines += [f"  {note}" for note in summary["notes"]]
+    lines.append(f"  picture {summary['output']}/image.png, report {summary['output']}/report.html")
+    return "\n".join(lines)
+
+
+def _format_axis(name: str, axis: Mapping[str, Any]) -> str:
+    line = f"  {name}: phase ±{axis['phase_sd_deg']:.3f}° (1 sd)"
+    line += f", bound {axis['bound_deg']:.3f}° satisfied for {axis['within_bound']:.1%} of the scan"
+    if "phase_rmse_deg" in axis:
+        line += f", true error {axis['phase_rmse_deg']:.3f}° rms"
+    measured = axis["picture_phase_error_deg"]
+    if measured["sd"] is not None:
+        line += f", phase error measured in the picture {measured['value']:+.3f}° ± {measured['sd']:.3f}°"
+    return f"{line}; sign {axis['sign']}"
+
+
+def _format_live(live: Mapping[str, Any]) -> str:
+    line = f"  live: {live['frames']} frames of {1e3 * (live['frame_s'] or 0.0):.4g} ms, {live['dropped']} dropped"
+    if live["frames"]:
+        line += f", {live['latency_s']['median']:.2f} s late (at most {live['latency_s']['max']:.2f} s)"
+    return f"{line}; {live['ended']}"

@@ -1,0 +1,75 @@
+"""``lissajous simulate``: simulate a scan of a target and write the recording together with its known truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from recon.cli.argument_types import parse_drive, parse_positive
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="REC", help="the recording to write (.h5)")
+    parser.add_argument(
+        "--device", default="imaging", metavar="NAME|FILE", help="a named device or a TOML file (imaging)"
+    )
+    parser.add_argument(
+        "--target", default="immunohistochemistry", metavar="NAME|FILE", help="what lies under the beam"
+    )
+    parser.add_argument(
+        "--drive-x",
+        type=parse_drive,
+        default=(27680.0, 30.0, 30.0),
+        metavar="HZ,V,V",
+        help="frequency, amplitude, offset (27680,30,30)",
+    )
+    parser.add_argument(
+        "--drive-y", type=parse_drive, default=(6540.0, 30.0, 30.0), metavar="HZ,V,V", help="likewise (6540,30,30)"
+    )
+    parser.add_argument("--duration", type=parse_positive, default=0.06, help="s (0.06)")
+    parser.add_argument("--rate", type=parse_positive, default=5e6, help="samples a second (5e6)")
+    parser.add_argument(
+        "--drift", type=float, default=-0.002, help="relative change of both stiffnesses in the end (-0.002)"
+    )
+    parser.add_argument("--drift-tau", type=parse_positive, default=0.025, help="its time constant, s (0.025)")
+    parser.add_argument(
+        "--field-um", type=parse_positive, default=250.0, help="width of the field on the sample, um (250)"
+    )
+    parser.add_argument("--spot-um", type=float, default=0.4, help="sd of the beam spot, um (0.4)")
+    parser.add_argument(
+        "--photons", type=parse_positive, default=1000.0, help="photons a sample at full brightness (1000)"
+    )
+    parser.add_argument("--angles", action="store_true", help="record the true angles as reference channels too")
+    parser.add_argument("--seed", type=int, default=0, help="of all noise (0)")
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    from phantoms.experiment import Experiment, device_named, simulate_experiment
+    from phantoms.optics import Detector
+    from phantoms.waveforms import Sine
+    from scanner.files import check_place
+
+    check_place(args.output)
+
+    experiment = Experiment(
+        device=device_named(args.device),
+        target=args.target,
+        drives={"x": Sine(*args.drive_x), "y": Sine(*args.drive_y)},
+        duration=args.duration,
+        sample_rate=args.rate,
+        drift={"x": args.drift, "y": args.drift},
+        drift_tau=args.drift_tau,
+        field_um=args.field_um,
+        spot_um=args.spot_um,
+        detector=Detector(photons_per_sample=args.photons, bits=12),
+        angles=args.angles,
+    )
+    recording, truth = simulate_experiment(experiment, args.seed)
+    recording.write(args.output, truth)
+    channels = {name: channel.size for name, channel in recording.channels.items()}
+    return {"recording": str(args.output), "duration": recording.duration, "seed": args.seed, "channels": channels}
+
+
+def format_summary(summary: dict[str, Any]) -> str:
+    return f"{summary['recording']}: {summary['duration']:.6g} s of {', '.join(summary['channels'])}, with its truth"

@@ -1,0 +1,127 @@
+"""Evaluation of an estimate against the truth of a simulated recording. No estimator reads the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanner.arrays import Array
+from scanner.errors import BadInput
+from scanner.lock_in import block_length, block_phasors
+from scanner.motion import AxisMotion
+from scanner.truth import read_truth
+
+CYCLES_PER_PHASE = 4.0
+"""Cycles of the motion in one block of the comparison: the blocks of the estimators' slow clock."""
+
+
+@dataclass(frozen=True)
+class AxisEvaluation:
+    """Comparison of one axis with its truth.
+
+    Attributes:
+        time: block centres, shape (n,) [s].
+        phase: phase of the truth minus phase of the estimate, shape (n,) [rad], after correction of a wrong sign.
+        amplitude: relative error, estimate over truth minus 1, shape (n,).
+        angle_rmse: of the angle at the intensity's samples, after correction of a wrong sign [rad].
+        mirrored: whether the estimate has the wrong one of the two signs that an even capacitance allows.
+    """
+
+    time: Array
+    phase: Array
+    amplitude: Array
+    angle_rmse: float
+    mirrored: bool
+
+    @property
+    def phase_rmse(self) -> float:
+        """Root mean square of ``phase`` [rad]."""
+        return float(np.sqrt(np.mean(self.phase**2)))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The known answer of a simulation.
+
+    Attributes:
+        angles: (values [rad], sample rate [Hz], start [s]) by axis.
+        scene: noiseless, over the whole field, blurred by the beam spot; None where not stored.
+        spot_sd: standard deviation of the spot as a fraction of the field's width; 0 where not stored.
+    """
+
+    angles: Mapping[str, tuple[Array, float, float]]
+    scene: Array | None
+    spot_sd: float
+
+
+def load_truth(path: Path) -> Truth | None:
+    """Return the truth in a recording's file; None where it contains no true angle.
+
+    Raises:
+        BadInput: a true angle has no sample_rate.
+    """
+    return truth_from_simulation(read_truth(path) or {}, path)
+
+
+def truth_from_simulation(simulated: Mapping[str, Any], path: Path | None = None) -> Truth | None:
+    """Return the truth from what a simulation returns; None where it contains no true angle.
+
+    Args:
+        simulated: values by name, alone or with their attributes: ``angle_x``, ``angle_y`` [rad], ``scene``,
+            ``spot_sd``.
+        path: of the file, for error messages.
+
+    Raises:
+        BadInput: a true angle has no sample_rate.
+    """
+    angles = {}
+    for axis in ("x", "y"):
+        value: Any = simulated.get(f"angle_{axis}")
+        if value is None:
+            continue
+        values, attrs = value if isinstance(value, tuple) else (value, {})
+        if "sample_rate" not in attrs:
+            raise BadInput(
+                "states no sample_rate", file=path, channel=f"/truth/angle_{axis}", hint="store it as attribute"
+            )
+        angles[axis] = (np.asarray(values, np.float64), float(attrs["sample_rate"]), float(attrs.get("start", 0.0)))
+    scene = simulated.get("scene")
+    scene = scene[0] if isinstance(scene, tuple) else scene
+    if not angles:
+        return None
+    return Truth(angles, None if scene is None else np.asarray(scene, np.float64), float(simulated.get("spot_sd", 0.0)))
+
+
+def evaluate_axis(axis: AxisMotion, angle: Array, rate: float, start: float) -> AxisEvaluation:
+    """Compare one axis with its true angle, both demodulated over the same blocks of ``CYCLES_PER_PHASE``.
+
+    Args:
+        axis: the estimate.
+        angle: true angle, shape (n,) [rad].
+        rate: sample rate of the true angle [Hz].
+        start: time of its first sample [s].
+    """
+    track, track_angle = axis.angle, axis.angle.read()
+    if (track.sample_rate, track.start, track.size) != (rate, start, angle.size):
+        time = track.start + np.arange(track.size) / track.sample_rate
+        angle = np.interp(time, start + np.arange(angle.size) / rate, angle, left=np.nan, right=np.nan)
+    both = np.isfinite(track_angle) & np.isfinite(angle)
+    first, last = int(both.argmax()), both.size - int(both[::-1].argmax())
+    begin = track.start + first / track.sample_rate
+    frequency = float(np.median(axis.frequency))
+    block = block_length(frequency, track.sample_rate, CYCLES_PER_PHASE)
+    time, estimated = block_phasors(track_angle[first:last], track.sample_rate, begin, frequency, block)
+    _, true = block_phasors(angle[first:last], track.sample_rate, begin, frequency, block)
+    mirrored = bool(np.sum((np.conj(estimated) * true).real) < 0.0)
+    sign = -1.0 if mirrored else 1.0
+    return AxisEvaluation(
+        time=time,
+        phase=np.angle(sign * np.conj(estimated) * true),
+        amplitude=np.abs(estimated) / np.abs(true) - 1.0,
+        angle_rmse=float(np.sqrt(np.nanmean((sign * track_angle - angle) ** 2))),
+        mirrored=mirrored,
+    )

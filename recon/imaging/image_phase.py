@@ -1,0 +1,189 @@
+"""Phases measured in the picture: forward against backward half-periods correct the motion until it converges.
+
+Grid the intensity with the current motion, measure the remaining phase error in each time slice
+(``bidirectional_phase``: least squares over all samples of one place), give phase plus error to the smoother as
+measurements, and repeat. Each round measures anew about a better motion, so no measurement counts twice. The derivation
+is in docs/explanation/image_phase.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from estimation.filters.baselines import resolve_signs
+from estimation.optics.correction import beam_motion
+from estimation.signals import phase_reference
+from estimation.term_compensation import estimate_with_terms
+from estimation.tracker import PhaseMeasurement, track
+from estimation.tracker.drive_only import track_drive_only
+from recon.imaging.bidirectional_phase import PERIODS_PER_SLICE, PhaseError, measure_motion_phase_errors, slow_period
+from recon.imaging.picture import Grid
+from scanner.arrays import Array
+from scanner.channel import Channel
+from scanner.device import AXES, Device
+from scanner.errors import BadInput
+from scanner.motion import AxisMotion, Motion
+from scanner.recording import Recording
+
+PERIODS_PER_PICTURE = 800
+"""Periods of the slower axis that share one picture. It bounds the memory and the change of the specimen within it."""
+
+MAX_ROUNDS = 6
+"""Rounds after which the iteration ends. Two or three are usual."""
+
+CONVERGENCE_RATIO = 0.5
+"""Change of a phase, relative to its smallest standard deviation, below which it has converged."""
+
+MAX_PHASE_ERROR_PX = 0.1
+"""Displacement by the phase's standard deviation, at the middle of a line, up to which an axis is not refined."""
+
+Smoother = Callable[[Recording, Device, Mapping[str, PhaseMeasurement]], Motion]
+"""From a recording, its device and measured phases by axis to a motion."""
+
+
+def refine_motion(
+    recording: Recording, device: Device, motion: Motion, intensity: Channel, grid: Grid, flips: Mapping[str, bool]
+) -> tuple[Motion, list[str]]:
+    """Refine a motion with the phases that the picture shows.
+
+    Axes whose sense signal determines the phase to ``MAX_PHASE_ERROR_PX`` are not changed, nor are motions of other
+    estimators than ``tracker`` and ``picture``. Otherwise the picture's phases are smoothed together with the sense
+    signal, or without it where it is worse than drive and picture.
+
+    Args:
+        recording: with its intensity corrected for the optics.
+        device: of the recording.
+        motion: result of ``estimate`` with these ``flips``.
+        intensity: shape (n,) or (n, detectors).
+        grid: the pixels.
+        flips: axes whose sign is inverted.
+
+    Returns:
+        The motion, and a line for each refined axis on what the picture showed.
+    """
+    pixels = {"x": grid.width / 2, "y": grid.height / 2}
+    refined = [name for name in AXES if _rms(motion.axes[name].phase_sd) * pixels[name] > MAX_PHASE_ERROR_PX]
+    smoothers = _available_smoothers(recording, device, motion.estimator) if refined else {}
+    if not smoothers:
+        return motion, []
+    initial_sd = {name: _rms(motion.axes[name].phase_sd) for name in refined}
+    rounds, converged = 0, False
+    smoothed_with: dict[str, str] = {}
+    while rounds < MAX_ROUNDS and not converged:
+        # In the first round amplitudes are wrong too and change, so slices far apart in time share no picture.
+        windows = registration_windows(motion, intensity, PERIODS_PER_PICTURE if rounds else PERIODS_PER_SLICE)
+        errors = measure_motion_phase_errors(beam_motion(motion, device, recording.start), intensity, grid, windows)
+        phases = {name: _measured_phase(errors, motion.axes[name], name, flips.get(name, False)) for name in refined}
+        smoothed = {way: _smooth(recording, device, smooth, phases, flips) for way, smooth in smoothers.items()}
+        smoothed_with = {name: _better_smoother(smoothed, name, initial_sd[name]) for name in refined}
+        axes = {name: smoothed[smoothed_with[name]].axes[name] for name in refined}
+        converged = all(_has_converged(motion.axes[name], axes[name]) for name in refined)
+        motion = replace(motion, axes={**motion.axes, **axes})
+        rounds += 1
+    measured = {name: int(np.isfinite(phases[name].sd).sum()) for name in refined}
+    info = {"rounds": rounds, "slices": len(errors), "told": measured, "smoothed_with": smoothed_with}
+    notes = [_note(name, measured[name], len(errors), smoothed_with[name] != motion.estimator) for name in refined]
+    return replace(motion, info={**motion.info, "picture": info}), notes
+
+
+def _available_smoothers(recording: Recording, device: Device, estimator: str) -> dict[str, Smoother]:
+    """Smoothers of measured phases by the estimator's name; "picture" only where the drive sustains the motion."""
+    if estimator not in ("tracker", "picture"):
+        return {}
+    smoothers: dict[str, Smoother] = {"picture": track_drive_only}
+    if estimator == "tracker":
+        smoothers["tracker"] = lambda recording, device, phases: track(recording, device, phases=phases)
+        try:
+            _smooth(recording, device, track_drive_only, {}, {})
+        except BadInput:
+            del smoothers["picture"]
+    return smoothers
+
+
+def _smooth(
+    recording: Recording,
+    device: Device,
+    smooth: Smoother,
+    phases: Mapping[str, PhaseMeasurement],
+    flips: Mapping[str, bool],
+) -> Motion:
+    """Estimate as ``estimate`` does, with measured phases; the device may have terms."""
+
+    def run(compensated: Recording, nominal: Device) -> Motion:
+        referred = {
+            name: _refer_to_effective_drive(measured, name, device, recording, compensated)
+            for name, measured in phases.items()
+        }
+        return resolve_signs(smooth(compensated, nominal, referred), compensated, flips)
+
+    return estimate_with_terms(recording, device, run)
+
+
+def _refer_to_effective_drive(
+    measured: PhaseMeasurement, name: str, device: Device, recording: Recording, compensated: Recording
+) -> PhaseMeasurement:
+    """Phases against the effective drive, where a term of the device changes the recorded drive."""
+    key = f"drive_{name}"
+    if key not in compensated or compensated[key] is recording[key]:
+        return measured
+    recorded, effective = (
+        phase_reference(each, device, name).phase(measured.time) for each in (recording, compensated)
+    )
+    return measured._replace(phase=measured.phase + recorded - effective)
+
+
+def registration_windows(motion: Motion, intensity: Channel, periods: int) -> list[tuple[int, int]]:
+    """Cut the scan into equal parts.
+
+    Args:
+        motion: of the scan.
+        intensity: whose samples are cut.
+        periods: approximate length of a part in periods of the slower axis.
+
+    Returns:
+        Samples (first, stop) of each part.
+    """
+    parts = max(1, round(intensity.size / intensity.sample_rate / slow_period(motion) / periods))
+    edges = np.linspace(0, intensity.size, parts + 1).round().astype(int)
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def _measured_phase(errors: list[PhaseError], axis: AxisMotion, name: str, flipped: bool) -> PhaseMeasurement:
+    """The motion's phase at the block nearest to the middle of each slice, plus the error measured there."""
+    middle = axis.angle.start + np.array([error.time for error in errors])
+    nearest = np.clip(
+        np.round(np.interp(middle, axis.time, np.arange(axis.time.size))).astype(int), 0, axis.time.size - 1
+    )
+    value, sd = np.array([getattr(error, name) for error in errors]).T
+    phase = axis.phase[nearest] - (np.pi if flipped else 0.0)  # smoothing happens before the user's flips
+    return PhaseMeasurement(axis.time[nearest], phase + value, sd)
+
+
+def _better_smoother(smoothed: Mapping[str, Motion], name: str, initial_sd: float) -> str:
+    """The smoother for an axis whose phase the sense signal alone gives with ``initial_sd`` [rad]."""
+    if "picture" in smoothed and _rms(smoothed["picture"].axes[name].phase_sd) < initial_sd:
+        return "picture"
+    return "tracker" if "tracker" in smoothed else "picture"
+
+
+def _rms(values: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _has_converged(before: AxisMotion, after: AxisMotion) -> bool:
+    """Whether a phase changed by less than ``CONVERGENCE_RATIO`` of its smallest standard deviation."""
+    if before.time.size != after.time.size:  # another smoother, with other blocks
+        return False
+    return _rms(after.phase - before.phase) < CONVERGENCE_RATIO * float(after.phase_sd.min())
+
+
+def _note(name: str, measured: int, slices: int, sense_ignored: bool) -> str:
+    """The line on what the picture showed of an axis."""
+    if measured == 0:
+        return f"the picture shows nothing of the phase of {name}: no feature across it, or too few samples"
+    note = f"the phase of {name} was measured in the picture itself, in {measured} of {slices} slices of the scan"
+    return f"{note}; the sense signal is less accurate and was not used" if sense_ignored else note

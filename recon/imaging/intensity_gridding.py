@@ -1,0 +1,77 @@
+"""From a motion and an intensity channel to a picture, a chunk at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.imaging.gridding import accumulate_samples, mean_picture
+from recon.imaging.phasor_gridding import accumulate_phasors
+from recon.imaging.picture import Grid, Picture
+from recon.sample_ranges import SampleRanges, subtract_ranges
+from scanner.channel import Channel
+from scanner.device import AXES
+from scanner.lock_in import contiguous_samples
+from scanner.motion import Motion
+
+CHUNK_SAMPLES = 1 << 22
+"""Samples gridded at a time. It bounds the memory (some 100 MB) for recordings of any length."""
+
+
+def grid_intensity(
+    beam: Motion,
+    intensity: Channel,
+    grid: Grid,
+    unlocated: SampleRanges,
+    first: int = 0,
+    stop: int | None = None,
+) -> Picture:
+    """Return the picture of the samples ``first`` up to ``stop``.
+
+    Args:
+        beam: motion whose angles are on the intensity's clock.
+        intensity: shape (n,) or (n, detectors). Samples that are not finite are left out.
+        grid: the pixels.
+        unlocated: samples that belong to no pixel because the beam's place is unknown.
+        first, stop: samples to grid; all where ``stop`` is None.
+    """
+    x, y = (beam.axes[axis].angle for axis in AXES)
+    phasors_x, phasors_y = x.phasors(), y.phasors()
+    sums = np.zeros((grid.height, grid.width, *intensity.shape[1:]))
+    counts = np.zeros((grid.height, grid.width), np.uint32)
+    samples = 0
+    located = subtract_ranges([(first, intensity.size if stop is None else stop)], unlocated)
+    for begin, end in _chunks(located):
+        values = contiguous_samples(intensity.stored(begin, end))
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            values = np.where(np.isinf(values), np.nan, values)  # accumulation leaves NaN out
+            samples += int(np.isfinite(values).reshape(len(values), -1).all(axis=1).sum())
+        else:
+            samples += len(values)
+        if phasors_x is not None and phasors_y is not None and values.ndim == 1:
+            accumulate_phasors(phasors_x, phasors_y, begin, values, grid, sums, counts)
+        else:
+            accumulate_samples(x.read(begin, end), y.read(begin, end), values, grid, sums, counts)
+    counts_of_sums = counts if sums.ndim == 2 else counts[..., None]
+    picture = mean_picture(intensity.gain * sums + intensity.offset * counts_of_sums, counts, grid)
+    return replace(picture, outside=samples - int(counts.sum()))
+
+
+def find_visited_pixels(beam: Motion, ranges: SampleRanges, grid: Grid) -> NDArray[np.bool_]:
+    """Return the pixels that the beam passed during ranges of samples, shape (height, width)."""
+    x, y = (beam.axes[axis].angle for axis in AXES)
+    counts = np.zeros((grid.height, grid.width), np.uint32)
+    for begin, end in _chunks(ranges):
+        accumulate_samples(x.read(begin, end), y.read(begin, end), np.zeros(end - begin), grid, counts=counts)
+    return counts > 0
+
+
+def _chunks(ranges: SampleRanges) -> SampleRanges:
+    """The ranges cut into parts of ``CHUNK_SAMPLES`` at most."""
+    return [
+        (begin, min(begin + CHUNK_SAMPLES, stop))
+        for first, stop in ranges
+        for begin in range(first, stop, CHUNK_SAMPLES)
+    ]

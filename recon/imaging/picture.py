@@ -1,0 +1,118 @@
+"""The picture: its pixels over the field of view, the mean intensity and sample count of each, and filling of holes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import BadInput
+
+MAX_PIXELS = 1 << 29
+"""Pixels of a picture have to be fewer than this: gridding counts them in an int32 and needs a value beyond them."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The pixels over the field of view. Column 0 is θ_x = -half_angle_x, row 0 is θ_y = -half_angle_y.
+
+    Attributes:
+        width, height: pixels.
+        half_angle_x, half_angle_y: mechanical angle at the edge of the field [rad].
+        metres_per_radian: displacement of the beam on the sample by mechanical angle [m/rad]; None if unknown.
+
+    Raises:
+        BadInput: a size or an angle is not positive and finite, or there are ``MAX_PIXELS`` pixels or more.
+    """
+
+    width: int
+    height: int
+    half_angle_x: float
+    half_angle_y: float
+    metres_per_radian: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint="give at least 1x1")
+        if self.width * self.height >= MAX_PIXELS:
+            raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint=f"give fewer than {MAX_PIXELS}")
+        if not all(math.isfinite(half) and half > 0 for half in (self.half_angle_x, self.half_angle_y)):
+            raise BadInput(
+                f"half angles of {self.half_angle_x} and {self.half_angle_y} rad", hint="give positive, finite angles"
+            )
+
+    @property
+    def pixel_angle(self) -> tuple[float, float]:
+        """Width and height of a pixel, mechanical angle [rad]."""
+        return 2 * self.half_angle_x / self.width, 2 * self.half_angle_y / self.height
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Mean intensity and sample count of each pixel.
+
+    Attributes:
+        image: mean intensity, shape (height, width) or (height, width, detectors), float32; NaN where never visited.
+        coverage: samples in each pixel, shape (height, width), uint32.
+        grid: the pixels over the field of view.
+        outside: number of samples that fell outside the field of view.
+    """
+
+    image: NDArray[np.float32]
+    coverage: NDArray[np.uint32]
+    grid: Grid
+    outside: int = 0
+
+    def __repr__(self) -> str:
+        grid, visited = self.grid, np.count_nonzero(self.coverage) / self.coverage.size
+        return (
+            f"Picture of {grid.width} x {grid.height} pixels, {visited:.1%} of them visited, "
+            f"{int(self.coverage.sum())} samples, half angles {grid.half_angle_x:.4g} x {grid.half_angle_y:.4g} rad"
+        )
+
+
+def fill_factor(coverage: NDArray[Any]) -> float:
+    """Return the fraction of the pixels with at least one sample."""
+    return float(np.count_nonzero(coverage)) / coverage.size
+
+
+def fill_holes(picture: Picture, radius: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Fill the small holes of a picture from their visited neighbours, by normalised convolution.
+
+    The value of a hole is the mean of the visited pixels at most ``radius`` columns and rows away, weighted by a
+    Gaussian of standard deviation radius/2 and by their sample counts. Visited pixels are not changed. Holes without a
+    visited pixel in reach remain NaN.
+
+    Args:
+        picture: with NaN where never visited.
+        radius: reach [px], at least 1.
+
+    Returns:
+        The filled image, shape of ``picture.image``, and the mask of the filled pixels, shape (height, width).
+
+    Raises:
+        BadInput: a radius below 1.
+
+    Source:
+        Knutsson & Westin 1993, "Normalized and differential convolution", with the sample count as certainty.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    if radius < 1:
+        raise BadInput(f"a fill radius of {radius} pixels", hint="give at least 1")
+    certainty = picture.coverage.astype(float)
+    values = picture.image.reshape(*certainty.shape, -1)
+    visited = certainty > 0
+
+    def spread(field: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(gaussian_filter(field, radius / 2, radius=radius, axes=(0, 1), mode="constant"))
+
+    weight = spread(certainty)
+    filled = ~visited & (weight > 0)
+    total = spread(np.where(visited[..., None], values, 0.0) * certainty[..., None])
+    image = values.copy()
+    image[filled] = total[filled] / weight[filled][:, None]
+    return image.reshape(picture.image.shape), filled

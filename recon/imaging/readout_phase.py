@@ -1,0 +1,302 @@
+"""The phase error of the readout, measured in the picture and removed from the motion.
+
+The sense signal follows fast changes of the phase to 0.01°. A delay, an amplifier pole, feedthrough of the drive or a
+curved characteristic that the device file does not state shifts its phase by an amount that varies slowly. The
+self-crossings of the scan (``bidirectional_phase``) measure the same phase without the readout. The model of an axis is
+
+    β(t) = c + g(t),   c ~ N(0, σ0²),   g a Gaussian process with the Matérn-3/2 covariance (σ1², τ),
+
+with β the true phase minus the phase of the estimator, measured with independent errors in short parts of the scan. The
+hyperparameters σ0, σ1, τ and a factor on the standard errors are averaged over by their marginal likelihood (Rasmussen
+and Williams 2006, eq. 2.30).
+σ0 = 0 and σ1 = 0, a readout as stated, have half of the prior probability each, so that a correct readout keeps the
+precision that the sense signal gives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from recon.imaging.bidirectional_phase import PhaseError, PhaseEstimate
+from scanner.arrays import Array
+from scanner.device import AXES
+from scanner.motion import AxisMotion, Motion
+
+OFFSET_SDS_RAD = np.radians([0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+"""Standard deviations σ0 that a constant phase error may have: half decades from a thirtieth of the usual bound of
+0.286°, below which no picture changes, to the reach of the registration."""
+DRIFT_SDS_RAD = np.radians([0.01, 0.03, 0.1, 0.3, 1.0])
+"""Standard deviations σ1 that the varying part may have: half decades; no readout varies by more."""
+DRIFT_TIMES_S = np.array([3e-3, 10e-3, 30e-3])
+"""Correlation times τ that it may have: half decades up to the length of a scan. The sense signal determines faster
+changes better than the picture."""
+NOISE_FACTORS = np.array([1.0, 2.0, 4.0])
+"""Factors on the standard errors of the measurements, equally probable. Detail that the registration does not resolve
+acts on short parts as additional noise."""
+MIN_DRIFT_SLICES = 3
+"""Slices from which the error may vary with time. In a shorter scan neighbouring parts have the holes of the picture in
+common, which resembles a drift."""
+PRIOR_PROBABILITY_AS_STATED = 0.5
+"""Prior probability that the constant, and independently that the varying part, is zero: no preference either way."""
+UNDESCRIBED_DELAY_SD_S = 0.5e-6
+"""Standard deviation of the delay of electronics that no device file describes, where no picture measures it: cables,
+converters and amplifiers are late by up to a microsecond."""
+REPORTED_SDS = 3.0
+"""A phase error beyond so many standard deviations is reported in words: 0.3 % of correct readouts exceed it."""
+MAX_ROUNDS = 3
+"""Registrations about an improved motion: an error of 10° needs two, because the picture itself sharpens."""
+CONVERGENCE_SD = 0.5
+"""Change of the phase in standard deviations at which the rounds end."""
+POSTERIOR_TIMES = 200
+"""Times at which the posterior is evaluated beside those of the measurements: 0.3 ms apart in a scan of 60 ms."""
+
+
+@dataclass(frozen=True)
+class ReadoutPhase:
+    """Posterior of the phase error of one axis: true phase minus estimated phase, positive for a late sense signal.
+
+    Attributes:
+        value, sd: of its mean over the scan [rad].
+        time: shape (n,), increasing [s].
+        mean, variance: at these times, shape (n,) [rad, rad²].
+    """
+
+    value: float
+    sd: float
+    time: Array
+    mean: Array
+    variance: Array
+
+
+def correlate_matern32(lag: Array, time: float) -> Array:
+    """Matérn-3/2 correlation at differences ``lag`` [s], of any shape, with the correlation time ``time`` [s]."""
+    scaled = math.sqrt(3.0) * np.abs(lag) / time
+    return np.asarray((1.0 + scaled) * np.exp(-scaled))
+
+
+def estimate_readout_phase(
+    time: Array, value: Array, sd: Array, at: Array, may_drift: bool = True
+) -> ReadoutPhase | None:
+    """Posterior of a phase error from measurements in the picture; None without a measurement.
+
+    Args:
+        time: of the measurements, shape (n,) [s].
+        value, sd: phase errors and standard deviations, shape (n,) [rad]; an infinite sd is no measurement.
+        at: times of the posterior, shape (m,), m > 1, increasing [s].
+        may_drift: whether the error may vary with time.
+    """
+    used = np.isfinite(value) & np.isfinite(sd)
+    if not used.any():
+        return None
+    time, value, noise = time[used], value[used], np.diag(sd[used] ** 2)
+    drifts = [(0.0, 1.0, PRIOR_PROBABILITY_AS_STATED)]  # standard deviation, correlation time, prior probability
+    share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / (DRIFT_SDS_RAD.size * DRIFT_TIMES_S.size)
+    if may_drift:
+        drifts += [(drift_sd, tau, share) for drift_sd in DRIFT_SDS_RAD for tau in DRIFT_TIMES_S]
+    hypotheses = [(*drift, factor) for drift in drifts for factor in NOISE_FACTORS]
+    offset_var = np.concatenate([[0.0], OFFSET_SDS_RAD**2])
+    share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / OFFSET_SDS_RAD.size
+    offset_prior = np.concatenate([[PRIOR_PROBABILITY_AS_STATED], np.full(OFFSET_SDS_RAD.size, share)])
+    average = np.gradient(at) / np.gradient(at).sum()
+    log_weight, means, variances, totals = [], [], [], []
+    for drift_sd, tau, prior, factor in hypotheses:
+        within = drift_sd**2 * correlate_matern32(time[:, None] - time, tau)
+        across = drift_sd**2 * correlate_matern32(time[:, None] - at, tau)
+        covariance = cho_factor(factor**2 * noise + within, lower=True)
+        solved_value, solved_one = cho_solve(covariance, value), cho_solve(covariance, np.ones_like(value))
+        log_det = 2.0 * np.log(np.diag(covariance[0])).sum()
+        left = 1.0 - across.T @ solved_one  # of a constant, what the varying part does not follow, shape (m,)
+        explained = (solve_triangular(covariance[0], across, lower=True) ** 2).sum(axis=0)
+        mean_across = across @ average
+        between = drift_sd**2 * (average @ correlate_matern32(at[:, None] - at, tau) @ average)
+        mean_variance = max(between - mean_across @ cho_solve(covariance, mean_across), 0.0)
+        # The constant adds σ0² 1 1ᵀ to the covariance: its posterior variance and mean follow from two inner products.
+        information, score = solved_one.sum(), solved_value.sum()
+        constant_var = offset_var / (1.0 + offset_var * information)
+        constant = constant_var * score
+        log_weight.append(
+            np.log(prior * offset_prior)
+            - 0.5 * (value @ solved_value - constant * score + log_det + np.log1p(offset_var * information))
+        )
+        means.append(across.T @ solved_value + constant[:, None] * left)
+        variances.append(np.maximum(drift_sd**2 - explained, 0.0) + constant_var[:, None] * left**2)
+        totals.append(mean_variance + constant_var * (left @ average) ** 2)
+    weight = np.exp(np.concatenate(log_weight) - np.max(log_weight))
+    weight /= weight.sum()
+    mean = np.concatenate(means)
+    overall, posterior = weight @ (mean @ average), weight @ mean
+    total_var = weight @ (np.concatenate(totals) + (mean @ average) ** 2) - overall**2
+    variance = weight @ (np.concatenate(variances) + mean**2) - posterior**2
+    return ReadoutPhase(float(overall), math.sqrt(max(total_var, 0.0)), at, posterior, np.maximum(variance, 0.0))
+
+
+def remove_readout_phase(
+    motion: Motion, errors: Sequence[PhaseError], register: Callable[[Motion], list[PhaseError]]
+) -> tuple[Motion, list[PhaseError], Mapping[str, ReadoutPhase]]:
+    """Correct a motion by the phase error of its readout that the picture shows.
+
+    Args:
+        motion: of both axes.
+        errors: its phase errors.
+        register: measures the phase errors of a corrected motion.
+
+    Returns:
+        The corrected motion, whose ``phase_sd`` includes the uncertainty of the correction; its phase errors; and the
+        error that was removed by axis, without the axes of which the picture determines none. Their ``phase_sd`` allows
+        for electronics that nobody described.
+    """
+    corrected, found = motion, dict[str, ReadoutPhase]()
+    for last in (False,) * (MAX_ROUNDS - 1) + (True,):
+        change, axes = 0.0, dict(motion.axes)
+        for column, name in enumerate(AXES):
+            axis = motion.axes[name]
+            measured = measured_phase_error(errors, column, axis, corrected.axes[name])
+            times = _posterior_times(axis, measured[0])
+            estimate = estimate_readout_phase(*measured, times, len(errors) >= MIN_DRIFT_SLICES)
+            if estimate is None:
+                axes[name] = widen_undetermined(axis)
+            else:
+                found[name] = estimate
+                axes[name] = advance_axis(axis, estimate)
+                moved = axes[name].phase - corrected.axes[name].phase
+                change = max(change, float(np.max(np.abs(moved) / axes[name].phase_sd)))
+        before, corrected = corrected, replace(motion, axes=axes)
+        if last or change < CONVERGENCE_SD:
+            break
+        errors = register(corrected)
+    return corrected, _errors_after(errors, before, corrected), found
+
+
+def apply_readout_phase(motion: Motion, known: Mapping[str, ReadoutPhase]) -> Motion:
+    """Correct a motion by phase errors that are known from an earlier part of the same scan.
+
+    Args:
+        motion: of the mirror.
+        known: phase errors by axis; the value at the end of each is used.
+    """
+    axes = dict(motion.axes)
+    for name, error in known.items():
+        axis = motion.axes[name]
+        ahead = axis.advanced(np.full(axis.time.size, error.mean[-1]))
+        axes[name] = replace(ahead, phase_sd=np.sqrt(axis.phase_sd**2 + error.variance[-1]))
+    return replace(motion, axes=axes)
+
+
+def update_readout_phase(
+    motion: Motion, corrected: Motion, errors: Sequence[PhaseError], known: Mapping[str, ReadoutPhase]
+) -> dict[str, ReadoutPhase]:
+    """Phase errors of the readout from a further part of a scan and from what the earlier parts showed.
+
+    Args:
+        motion, corrected: of the further part, before and after :func:`apply_readout_phase`.
+        errors: phase errors of the corrected motion.
+        known: phase errors by axis from the earlier parts. The end of each counts as one more measurement.
+    """
+    updated = dict(known)
+    for column, name in enumerate(AXES):
+        axis = motion.axes[name]
+        measured = measured_phase_error(errors, column, axis, corrected.axes[name])
+        if name in known:
+            earlier = known[name]
+            last = earlier.time[-1], earlier.mean[-1], math.sqrt(earlier.variance[-1])
+            time, value, sd = (np.append(first, rest) for first, rest in zip(last, measured, strict=True))
+            measured = time, value, sd
+        estimate = estimate_readout_phase(*measured, _posterior_times(axis, measured[0]), may_drift=False)
+        if estimate is not None:
+            updated[name] = estimate
+    return updated
+
+
+def measured_phase_error(
+    errors: Sequence[PhaseError], column: int, axis: AxisMotion, corrected: AxisMotion
+) -> tuple[Array, Array, Array]:
+    """Times [s], phase errors [rad] of ``axis`` and standard deviations [rad] from those of its corrected motion.
+
+    Args:
+        errors: of the corrected motion.
+        column: 0 for x, 1 for y.
+        axis, corrected: the motion before and after a correction.
+    """
+    parts = [error.parts for error in errors if error.parts is not None]
+    time, value, sd = (np.concatenate(column) for column in zip(*parts, strict=True))
+    time = axis.angle.start + time
+    return time, value[:, column] + np.interp(time, axis.time, corrected.phase - axis.phase), sd[:, column]
+
+
+def advance_axis(axis: AxisMotion, error: ReadoutPhase) -> AxisMotion:
+    """The motion ahead by a phase error, its standard deviation with that of the error."""
+    variance = np.interp(axis.time, error.time, error.variance)
+    ahead = axis.advanced(np.interp(axis.time, error.time, error.mean))
+    return replace(ahead, phase_sd=np.sqrt(axis.phase_sd**2 + variance))
+
+
+def widen_undetermined(axis: AxisMotion) -> AxisMotion:
+    """The motion with the uncertainty of a readout that the picture does not measure in its ``phase_sd``."""
+    undescribed = 2.0 * np.pi * axis.frequency * UNDESCRIBED_DELAY_SD_S
+    variance = axis.phase_sd**2 + (1.0 - PRIOR_PROBABILITY_AS_STATED) * undescribed**2
+    return replace(axis, phase_sd=np.sqrt(variance))
+
+
+def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) -> list[str]:
+    """What a reader has to know of the phase error of the readout, a line each.
+
+    Args:
+        motion: corrected.
+        found: the error that was removed, by axis.
+    """
+    notes = [
+        f"the picture determines no phase of {name}: no feature across it, or too few photons. The standard deviation "
+        f"of the phase allows for {UNDESCRIBED_DELAY_SD_S * 1e6:.2g} µs of readout delay that the device file does not "
+        "state; a specimen with detail, more light or a longer scan narrows it"
+        for name in AXES
+        if name not in found
+    ]
+    late = {name: error for name, error in found.items() if abs(error.value) > REPORTED_SDS * error.sd}
+    for name, error in late.items():
+        notes.append(
+            f"the signal of {name} is {abs(np.degrees(error.value)):.3g}° ± {np.degrees(error.sd):.1g}° "
+            f"{'late' if error.value > 0.0 else 'early'}; its phase was corrected by the picture"
+        )
+    delay = common_delay(motion, found) if late else None
+    if delay is not None:
+        pole = f" or a pole near {1e-3 / (2.0 * np.pi * delay):.2g} kHz" if delay > 0.0 else ""
+        notes.append(
+            f"a delay of {1e6 * delay:.2g} µs{pole} in the readout would explain the error of both axes; "
+            "run `lissajous diagnose`"
+        )
+    return notes
+
+
+def common_delay(motion: Motion, found: Mapping[str, ReadoutPhase]) -> float | None:
+    """The delay [s] that explains the phase errors of both axes within their uncertainty; None if none does."""
+    if len(found) < len(AXES):
+        return None
+    rate = np.array([2.0 * np.pi * np.median(motion.axes[name].frequency) for name in found])
+    value, sd = np.array([(error.value, error.sd) for error in found.values()]).T
+    delay = float(np.sum(rate * value / sd**2) / np.sum(rate**2 / sd**2))
+    misfit = np.sum(((value - rate * delay) / sd) ** 2)
+    return delay if misfit < REPORTED_SDS**2 else None
+
+
+def _posterior_times(axis: AxisMotion, measured: Array) -> Array:
+    """Times of the posterior: evenly over the scan, and those of the measurements, increasing [s]."""
+    return np.unique(np.concatenate([np.linspace(axis.time[0], axis.time[-1], POSTERIOR_TIMES), measured]))
+
+
+def _errors_after(errors: Sequence[PhaseError], before: Motion, after: Motion) -> list[PhaseError]:
+    """Phase errors of the motion ``after``, from those of the motion ``before`` that lies within their reach."""
+    moved = []
+    for error in errors:
+        values = {}
+        for name in AXES:
+            old, new = before.axes[name], after.axes[name]
+            shift = np.interp(old.angle.start + error.time, old.time, new.phase - old.phase)
+            estimate: PhaseEstimate = getattr(error, name)
+            values[name] = estimate._replace(value=estimate.value - float(shift))
+        moved.append(replace(error, x=values["x"], y=values["y"], parts=None))
+    return moved

@@ -1,0 +1,74 @@
+"""Ctrl-C and SIGTERM: make them stop a command reliably.
+
+Imports the standard library only, because the command line imports this module before it sets up numpy.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+REPEAT_INTERVAL_S = 1.0
+"""Time after which KeyboardInterrupt is raised again if the process still runs. Compiled code may swallow the first
+one in a callback; a second is long enough for an ordinary clean-up."""
+
+
+class StopRequest:
+    """Signal handler that records whether the process was asked to stop.
+
+    Attributes:
+        came: whether SIGINT or SIGTERM arrived.
+    """
+
+    came = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Raise KeyboardInterrupt, and again every ``REPEAT_INTERVAL_S`` until it is acknowledged.
+
+        Nothing is raised while another exception is handled, above all the first KeyboardInterrupt: its clean-up runs
+        to the end.
+        """
+        self.came = True
+        if hasattr(signal, "setitimer"):
+            signal.signal(signal.SIGALRM, self)
+            signal.setitimer(signal.ITIMER_REAL, REPEAT_INTERVAL_S)
+        if sys.exc_info()[0] is None:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def handle_interrupts() -> Iterator[StopRequest]:
+    """Make SIGINT and SIGTERM raise KeyboardInterrupt within the block.
+
+    Outside the main thread nothing is changed, because Python sets signal handlers there only.
+    """
+    stop = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    hook, sys.unraisablehook = sys.unraisablehook, _silence_interrupts(sys.unraisablehook)
+    try:
+        yield stop
+    finally:
+        sys.unraisablehook = hook
+        acknowledge_stop()
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+def _silence_interrupts(hook: Callable[[Any], object]) -> Callable[[Any], object]:
+    """The hook for unraisable exceptions without messages about KeyboardInterrupt, which is raised again anyway."""
+    return lambda lost: None if issubclass(lost.exc_type, KeyboardInterrupt) else hook(lost)
+
+
+def acknowledge_stop() -> None:
+    """End the repetition of a KeyboardInterrupt. Call it where the interrupted work has ended."""
+    if hasattr(signal, "setitimer") and isinstance(signal.getsignal(signal.SIGALRM), StopRequest):
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)

@@ -1,0 +1,226 @@
+"""Recordings from instruments' files, by a mapping that states which variable is which channel.
+
+A mapping (TOML) states for each channel the variable, its unit and its clock; it may contain the device::
+
+    format = "matlab"               # only if neither the file's beginning nor its name shows it
+    name = "afm-spiral"
+
+    [channels.sense_x]
+    variable = "x"
+    unit = "V"                      # after scaling
+    sample_rate = 20000.0           # Hz; or time = "t", the variable that holds the times [s]
+    start = 0.0                     # s
+    scale = 1.0                     # channel = scale * variable + offset
+    offset = 0.0
+
+    [device.x.readout]              # the device as in a device file, below [device]
+    ...
+
+Unit, rate and start may be omitted if the file states them. What neither states is not guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isfinite
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from recon.io.readers import read
+from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock
+from scanner.channel import Channel, make_channel
+from scanner.device import Device
+from scanner.errors import BadInput
+from scanner.files import read_toml
+from scanner.hdf5 import check_ends
+from scanner.recording import Recording
+
+TEXT_KEYS = ("format", "name", "notes", "acquired")
+MAPPING_KEYS = (*TEXT_KEYS, "channels", "device")
+CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "offset")
+
+Plan = Mapping[str, Any]
+"""Content of a mapping file."""
+
+
+def open_any(path: Path, mapping: Path | Plan | None = None, growing: bool = False) -> Recording:
+    """Open a recording, or, with a mapping, an instrument's file as a recording.
+
+    Samples are read when they are used. Close the recording, or use it in a ``with`` statement.
+
+    Args:
+        path: the file.
+        mapping: TOML file or its content; None for a recording of this program.
+        growing: the file is still being written, see :meth:`Recording.open`.
+
+    Raises:
+        BadInput: as :meth:`Recording.open` or :func:`convert`, or as :func:`scanner.hdf5.check_ends`.
+    """
+    check_ends(path)
+    return Recording.open(path, growing) if mapping is None else convert(path, mapping)
+
+
+def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, Any]:
+    """Write the recording that ``mapping`` makes of ``source``, chunk by chunk.
+
+    Returns:
+        Summary: ``recording``, ``source``, ``format``, ``duration`` [s], ``device`` (its name or None) and, for each of
+        ``channels``, ``variable``, ``unit``, ``sample_rate`` [Hz], ``start`` [s], ``shape``, ``stated_by`` (the source
+        of unit, rate and start) and ``overruled`` (statements of the file that the mapping contradicts).
+
+    Raises:
+        BadInput: as :func:`convert`.
+    """
+    check_ends(source)
+    plan, plan_source = _plan(mapping)
+    contents = _contents(source, plan, plan_source)
+    with _recording(contents, source, plan, plan_source) as recording:
+        recording.write(output)
+        return {
+            "recording": str(output),
+            "source": str(source),
+            "format": contents.kind,
+            "duration": recording.duration,
+            "device": None if recording.device is None else recording.device.name,
+            "channels": {
+                name: {key: getattr(channel, key) for key in ("unit", "sample_rate", "start", "shape")}
+                | _origin(plan["channels"][name], contents)
+                for name, channel in recording.channels.items()
+            },
+        }
+
+
+def convert(source: Path, mapping: Path | Plan) -> Recording:
+    """The recording that a mapping makes of an instrument's file; samples are read from that file when they are used.
+
+    Args:
+        source: the instrument's file.
+        mapping: TOML file or its content.
+
+    Raises:
+        BadInput: the file cannot be read, the mapping is incomplete or names a variable that the file does not hold,
+            or a variable is not a signal.
+        DeviceInvalid: the mapping's device cannot be used.
+        UnitUnknown: the mapping states a unit that the channel cannot have.
+    """
+    plan, plan_source = _plan(mapping)
+    return _recording(_contents(source, plan, plan_source), source, plan, plan_source)
+
+
+def _plan(mapping: Path | Plan) -> tuple[Plan, object]:
+    """Content of the mapping and its source, for messages."""
+    return (mapping, "arguments") if isinstance(mapping, Mapping) else (read_toml(mapping), mapping)
+
+
+def _contents(source: Path, plan: Plan, plan_source: object) -> Contents:
+    """Contents of ``source``, after the checks of the mapping that do not need them."""
+    if unknown := [key for key in plan if key not in MAPPING_KEYS]:
+        raise BadInput(
+            "is not a known key", file=plan_source, channel=unknown[0], hint=f"known: {', '.join(MAPPING_KEYS)}"
+        )
+    for key in TEXT_KEYS:
+        if not isinstance(plan.get(key, ""), str):
+            raise BadInput(f"is {plan[key]!r} and must be text", file=plan_source, channel=key, hint="put it in quotes")
+    if not isinstance(plan.get("channels"), dict) or not plan["channels"]:
+        raise BadInput("names no channels", file=plan_source, hint="add a table [channels.<name>] for each")
+    if not isinstance(plan.get("device", {}), dict):
+        raise BadInput("must be a table", file=plan_source, channel="device", hint="write [device.x.readout] and so on")
+    return read(source, plan.get("format"))
+
+
+def _recording(contents: Contents, source: Path, plan: Plan, plan_source: object) -> Recording:
+    try:
+        device = Device.from_table(plan["device"], source=str(plan_source)) if "device" in plan else None
+        channels = {
+            name: _channel(name, spec, contents, source, plan_source) for name, spec in plan["channels"].items()
+        }
+    except BaseException:
+        contents.close()
+        raise
+    attrs = {"name": source.stem, "source": source.name, "source_format": contents.kind} | dict(contents.about)
+    attrs |= {key: plan[key] for key in TEXT_KEYS if key in plan and key != "format"}
+    text = None if device is None else device.to_toml()
+    return Recording(MappingProxyType(channels), MappingProxyType(attrs), None, text, contents)
+
+
+def _origin(spec: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
+    """Which variable a channel comes from, and which source states its unit and clock."""
+    stated = {key: getattr(contents.variables[spec["variable"]], key) for key in ("unit", "sample_rate", "start")}
+    by = {key: "file" if value is not None else "nobody: 0" for key, value in stated.items()}
+    by |= {key: "mapping" for key in stated if key in spec}
+    by |= {key: f"variable {spec['time']}" for key in ("sample_rate", "start") if "time" in spec}
+    scaled = "scale" in spec or "offset" in spec
+    overruled = {
+        key: value
+        for key, value in stated.items()
+        if key in spec and value not in (None, spec[key]) and not (scaled and key == "unit")
+    }
+    return {"variable": spec["variable"], "stated_by": by, "overruled": overruled}
+
+
+def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Path, plan_source: object) -> Channel:
+    def bad(what: str, hint: str) -> BadInput:
+        return BadInput(what, file=plan_source, channel=f"channels.{name}", hint=hint)
+
+    holds = f"{source.name} holds {format_variables(contents.variables)}"
+    if not isinstance(spec, dict):
+        raise bad(f"is {spec!r} and must be a table", f"write [channels.{name}]")
+    if "/" in name or not name.strip(".") or not name.isprintable():
+        raise bad("is no name for a channel", "name it without / and control characters")
+    if unknown := [key for key in spec if key not in CHANNEL_KEYS]:
+        raise bad(f"{unknown[0]} is not a known key", f"known: {', '.join(CHANNEL_KEYS)}")
+    for key in ("variable", "unit", "time"):
+        if not isinstance(spec.get(key, ""), str):
+            raise bad(f"{key} is {spec[key]!r} and must be text", "put it in quotes")
+    if "variable" not in spec:
+        raise bad("says no variable", f"add variable = ...; {holds}")
+    for key in {"variable", "time"} & spec.keys():
+        if spec[key] not in contents.variables:
+            raise bad(f"there is no variable {spec[key]!r}", holds)
+    variable = contents.variables[spec["variable"]]
+    scaled = "scale" in spec or "offset" in spec
+    scale, offset = _number(spec.get("scale", 1.0)), _number(spec.get("offset", 0.0))
+    if not scale or offset is None:
+        raise bad("scale must be a number other than 0, offset a number", "channel = scale * variable + offset")
+    rate: Any
+    if "time" in spec:
+        if "sample_rate" in spec or "start" in spec:
+            raise bad("says time and sample_rate or start", "the times state both")
+        rate, start = _clock(contents.variables[spec["time"]], spec["time"], bad)
+    else:
+        rate, start = spec.get("sample_rate", variable.sample_rate), spec.get("start", variable.start or 0.0)
+    unit = spec.get("unit", None if scaled else variable.unit)  # the file states the unit before scaling
+    for key, value in (("sample_rate", rate), ("unit", unit)):
+        if value is None:
+            because = f", and the file states none{f' ({variable.note})' if variable.note else ''}"
+            raise bad(f"says no {key} of variable {spec['variable']!r}{because}", f"add {key} = ...; {holds}")
+    file = f"{source} by {plan_source}"
+    return make_channel(
+        name, flatten_row(variable.raw), unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file
+    )
+
+
+def _clock(times: Variable, name: str, bad: Any) -> tuple[float, float]:
+    column = flatten_row(times.raw)
+    if not times.is_signal or column.ndim != 1:
+        raise bad(f"time = {name!r} is no column of numbers", "name the variable that holds the times [s]")
+    rate, start, note = infer_clock(column)
+    if rate is None or start is None:
+        raise bad(f"time = {name!r} is no clock: {note}", "cut the file there, or state sample_rate")
+    return rate, start
+
+
+def format_variables(variables: Mapping[str, Variable]) -> str:
+    """Names and shapes of variables, of the first 20 if there are more."""
+    texts = [f"{name} {variable.raw.shape}" for name, variable in variables.items()]
+    return ", ".join(texts[:20]) + (f" and {len(texts) - 20} more" if len(texts) > 20 else "")
+
+
+def _number(value: object) -> float | None:
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return None
+    try:
+        return float(value) if isfinite(value) else None
+    except OverflowError:  # an integer in TOML may exceed the range of a float
+        return None

@@ -1,0 +1,99 @@
+"""Contents of a recording or an instrument's file, and a mapping to start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from recon.io.convert import open_any
+from recon.io.readers import read
+from recon.io.readers.contents import Variable
+from scanner.channel import CHANNEL_UNITS
+from scanner.hdf5 import attributes, check_ends, is_hdf5, open_hdf5
+from scanner.recording import FORMAT
+
+HEADING = f"""\
+# A suggestion to edit: name each channel by what it is, remove the others, state what is commented out.
+# Channels: {", ".join(CHANNEL_UNITS)}, intensity."""
+
+
+def info(path: Path, format: str | None = None, mapping: Path | None = None) -> dict[str, Any]:
+    """Variables of a file with size, and unit and clock if stated, and a mapping to start from.
+
+    Args:
+        path: the file.
+        format: of the file; None detects it.
+        mapping: list the recording that it makes of the file instead, see :func:`recon.io.convert.open_any`.
+
+    Returns:
+        ``file``, ``format``, ``about`` (name, device, start of the recording, ... as stated), ``variables`` (``shape``,
+        ``dtype``, ``unit``, ``sample_rate`` [Hz], ``start`` [s], ``note``; None if not stated) and
+        ``suggestion`` (TOML; None for a recording, which needs none).
+
+    Raises:
+        BadInput: as :func:`recon.io.readers.read` or :meth:`Recording.open`.
+    """
+    check_ends(path)
+    if mapping is not None or (format is None and _is_recording(path)):
+        return _of_recording(path, mapping)
+    contents = read(path, format)
+    try:
+        return {
+            "file": str(path),
+            "format": contents.kind,
+            "about": {key: value for key, value in contents.about.items() if value},
+            "variables": {name: _variable_summary(variable) for name, variable in contents.variables.items()},
+            "suggestion": suggestion(contents.variables, format),
+        }
+    finally:
+        contents.close()
+
+
+def suggestion(variables: Any, format: str | None = None) -> str:
+    """A mapping (TOML) of all signals; values that the file does not state are commented out, to be filled in."""
+    lines = [HEADING, *([f"format = {_quoted(format)}"] if format else [])]
+    for name, variable in variables.items():
+        if not variable.is_signal or variable.raw.shape[0] < 2:
+            continue
+        channel = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name) or "_"
+        lines += ["", f"[channels.{channel}]", f"variable = {_quoted(name)}"]
+        lines.append(f"unit = {_quoted(variable.unit)}" if variable.unit else '# unit = "V"')
+        rate = variable.sample_rate
+        lines.append(f"sample_rate = {float(rate)!r}" if rate else "# sample_rate = 1e6  # Hz")
+        lines += [f"start = {float(variable.start)!r}"] if variable.start is not None else []
+    return "\n".join(lines)
+
+
+def _is_recording(path: Path) -> bool:
+    if not is_hdf5(path):
+        return False
+    with open_hdf5(path) as file:
+        return attributes(file).get("format") == FORMAT
+
+
+def _of_recording(path: Path, mapping: Path | None) -> dict[str, Any]:
+    with open_any(path, mapping) as recording:
+        device = {} if recording.device is None else {"device": recording.device.name}
+        return {
+            "file": str(path),
+            "format": FORMAT,
+            "about": {key: str(value) for key, value in recording.attrs.items()} | device,
+            "variables": {
+                name: {key: getattr(channel, key) for key in ("shape", "unit", "sample_rate", "start")}
+                | {"dtype": str(channel.raw.dtype), "note": ""}
+                for name, channel in recording.channels.items()
+            },
+            "suggestion": None,
+        }
+
+
+def _variable_summary(variable: Variable) -> dict[str, Any]:
+    statements = {key: getattr(variable, key) for key in ("unit", "sample_rate", "start", "note")}
+    return {"shape": variable.raw.shape, "dtype": str(variable.raw.dtype)} | statements
+
+
+def _quoted(text: str) -> str:
+    """Text as TOML writes it."""
+    import tomli_w
+
+    return tomli_w.dumps({"_": text}).removeprefix("_ = ").rstrip("\n")

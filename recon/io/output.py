@@ -1,0 +1,177 @@
+"""Output files: pictures, frames, motion and summaries. A file is complete or does not exist."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.imaging.picture import Grid, Picture
+from scanner.errors import BadInput
+from scanner.files import check_writable
+from scanner.hdf5 import new_hdf5
+from scanner.motion import Motion
+
+CHUNK_SAMPLES = 1 << 20
+"""Samples of an angle that are computed and written at a time, 8 MB."""
+
+
+def check_folder(folder: Path) -> None:
+    """Check that a folder can be written.
+
+    Raises:
+        BadInput: it is a file, cannot be created or is not writable.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise BadInput("is a file where a folder should be", file=folder, hint="name another with -o")
+    if not folder.parent.is_dir():
+        raise BadInput("the folder to write into does not exist", file=folder.parent, hint="create it")
+    check_writable(folder if folder.exists() else folder.parent)
+
+
+@contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder to write into; its files replace those of ``folder`` when the block ends without an error.
+
+    If the block fails, ``folder`` is unchanged. Old files are deleted before the first new file is moved, so that a
+    process killed in between leaves no mixture of old and new files.
+
+    Raises:
+        BadInput: as :func:`check_folder`.
+    """
+    check_folder(folder)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
+    try:
+        yield temporary
+        if not folder.exists():
+            temporary.chmod(0o755)
+            temporary.replace(folder)
+        else:
+            written = sorted(temporary.iterdir())
+            for path in written:
+                (folder / path.name).unlink(missing_ok=True)
+            for path in written:
+                path.replace(folder / path.name)
+    except OSError as error:
+        # The error names no file, or one in the temporary folder; name the file that the user asked for.
+        error.filename = str(error.filename or folder).replace(str(temporary), str(folder))
+        raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_motion(path: Path, motion: Motion) -> None:
+    """Write motion.h5: a group an axis with time, phase, amplitude, frequency, phase_sd and angle."""
+    with new_hdf5(path) as file:
+        file.attrs["estimator"] = motion.estimator
+        for name, axis in motion.axes.items():
+            group = file.create_group(name)
+            group.attrs.update({"reference": axis.reference, "sign": axis.sign})
+            for key, unit in (
+                ("time", "s"),
+                ("phase", "rad"),
+                ("amplitude", "rad"),
+                ("frequency", "Hz"),
+                ("phase_sd", "rad"),
+            ):
+                group.create_dataset(key, data=getattr(axis, key)).attrs["unit"] = unit
+            angle = group.create_dataset("angle", (axis.angle.size,), np.float32)
+            for first in range(0, axis.angle.size, CHUNK_SAMPLES):
+                stop = min(first + CHUNK_SAMPLES, axis.angle.size)
+                angle[first:stop] = axis.angle.read(first, stop)
+            angle.attrs.update({"unit": "rad", "sample_rate": axis.angle.sample_rate, "start": axis.angle.start})
+
+
+def pixel_size(grid: Grid) -> tuple[float, float, str]:
+    """Width and height of a pixel and their unit: um on the sample if the scale is known, else rad of the mirror."""
+    scale, unit = (1.0, "rad") if grid.metres_per_radian is None else (1e6 * grid.metres_per_radian, "um")
+    width, height = grid.pixel_angle
+    return scale * width, scale * height, unit
+
+
+def write_tiff(path: Path, image: NDArray[Any], grid: Grid) -> None:
+    """Write a picture as TIFF with unchanged values and the pixel size in ImageJ's form.
+
+    Args:
+        path: the file.
+        image: shape (height, width), or (height, width, detectors); detectors become channels.
+        grid: of the picture.
+    """
+    import tifffile
+
+    width, height, unit = pixel_size(grid)
+    planes, axes = (image, "YX") if image.ndim == 2 else (np.moveaxis(image, -1, 0), "CYX")
+    if image.dtype == np.uint32:  # ImageJ reads it, but tifffile refuses to write it in ImageJ's form
+        form: dict[str, Any] = {"description": f"ImageJ=1.11a\nunit={unit}\n", "metadata": None}
+    else:
+        form = {"imagej": True, "metadata": {"axes": axes, "unit": unit}}
+    tifffile.imwrite(
+        path, planes, photometric="minisblack", resolution=(1 / width, 1 / height), resolutionunit="NONE", **form
+    )
+
+
+def write_frames(path: Path, frames: Iterable[Picture], count: int, frame_time: float) -> None:
+    """Write frames as OME-TIFF, float32 with NaN for pixels never visited; one frame at a time is in memory.
+
+    OME has no angles: the pixel size is written only if the scale of the sample is known.
+
+    Args:
+        path: the file.
+        frames: at least one, all of one shape.
+        count: number of frames.
+        frame_time: time from one frame to the next [s].
+    """
+    import tifffile
+
+    pictures = iter(frames)
+    first = next(pictures)
+    metadata: dict[str, Any] = {"TimeIncrement": frame_time, "TimeIncrementUnit": "s"}
+    if first.grid.metres_per_radian is not None:
+        width, height, _ = pixel_size(first.grid)
+        metadata |= {
+            "PhysicalSizeX": width,
+            "PhysicalSizeXUnit": "µm",
+            "PhysicalSizeY": height,
+            "PhysicalSizeYUnit": "µm",
+        }
+    planes = (plane for frame in chain([first], pictures) for plane in np.atleast_3d(frame.image).transpose(2, 0, 1))
+    shape, axes = (count, *first.image.shape[2:], *first.image.shape[:2]), "TCYX" if first.image.ndim == 3 else "TYX"
+    tifffile.imwrite(
+        path,
+        planes,
+        shape=shape,
+        dtype=np.float32,
+        ome=True,
+        photometric="minisblack",
+        metadata={"axes": axes, **metadata},
+    )
+
+
+def write_json(path: Path, summary: Mapping[str, Any]) -> None:
+    """Write a summary as JSON; numbers that are not finite become null."""
+    path.write_text(json.dumps(finite(summary), indent=1) + "\n", encoding="utf-8")
+
+
+def finite(value: Any) -> Any:
+    """The value with Python's types in place of numpy's, and None for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return finite(value.tolist())
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

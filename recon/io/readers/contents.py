@@ -1,0 +1,148 @@
+"""Contents of an instrument's file, in one form for all formats: variables whose samples are read when sliced.
+
+A unit or a sample rate that the file does not state is None.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.channel import READ_CHUNK_SAMPLES, LazySamples, SampleSource
+from scanner.errors import BadInput
+
+UNIT_SPELLINGS = {
+    "volt": "V", "volts": "V", "v": "V", "millivolt": "mV", "millivolts": "mV", "mv": "mV",
+    "radian": "rad", "radians": "rad", "rad": "rad", "degree": "deg", "degrees": "deg", "deg": "deg",
+    "ampere": "A", "amperes": "A", "amp": "A", "amps": "A", "a": "A",
+}  # fmt: skip
+"""Spelling of a unit in a recording, by the spelling in instruments' files in lower case."""
+
+MAX_CLOCK_DEVIATION_SAMPLES = 0.4
+"""Deviation of a time from the line through the first and the last time, above which the times are not uniform.
+
+One dropped or doubled sample moves at least one time by half a sample; the rounding of printed times moves them less.
+"""
+
+
+def _close_nothing() -> None:
+    """For contents without an open file."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable of an instrument's file.
+
+    Attributes:
+        raw: samples, of any type and shape.
+        unit: of the samples, as a recording spells it; None if the file states none.
+        sample_rate: [Hz]; None if the file states none.
+        start: time of the first sample [s]; None if the file states none.
+        note: remark for the user, for example why there is no sample rate.
+    """
+
+    raw: SampleSource
+    unit: str | None = None
+    sample_rate: float | None = None
+    start: float | None = None
+    note: str = ""
+
+    @property
+    def is_signal(self) -> bool:
+        """Whether it can become a channel: real numbers, one or two dimensions, not empty."""
+        return self.raw.dtype.kind in "iuf" and self.raw.ndim in (1, 2) and 0 not in self.raw.shape
+
+
+@dataclass(frozen=True)
+class Contents:
+    """Contents of a file.
+
+    Attributes:
+        kind: format in words, for example "Rigol CSV".
+        variables: by name, in the file's order.
+        about: other statements of the file: ``device``, ``acquired``, ``notes``.
+        close: closes the file; call it after the last read.
+    """
+
+    kind: str
+    variables: Mapping[str, Variable]
+    about: Mapping[str, str] = field(default_factory=dict)
+    close: Callable[[], None] = _close_nothing
+
+
+def flatten_row(raw: SampleSource) -> SampleSource:
+    """Samples of shape (1, n) as (n,); other shapes unchanged."""
+    if raw.ndim != 2 or raw.shape[0] != 1:
+        return raw
+    return LazySamples(raw.shape[1:], raw.dtype, lambda first, stop: raw[0:1][0, first:stop])
+
+
+def normalise_unit(unit: str) -> str | None:
+    """A unit as a recording spells it; an unknown unit unchanged; None for an empty text."""
+    return UNIT_SPELLINGS.get(unit.strip().lower(), unit.strip()) or None
+
+
+def map_blocks(blocks: Iterable[NDArray[Any]], file: Path) -> NDArray[Any]:
+    """Stack blocks of shape (n, columns) in a memory-mapped temporary file, so that memory holds one block at a time.
+
+    Raises:
+        BadInput: there are no rows.
+    """
+    # The memory map below keeps the unnamed file; the system deletes it with the map or the process.
+    store = tempfile.TemporaryFile()  # noqa: SIM115
+    rows, shape, dtype = 0, (0,), np.dtype(np.float64)
+    for block in blocks:
+        store.write(np.ascontiguousarray(block).data)
+        rows, shape, dtype = rows + len(block), block.shape[1:], block.dtype
+    if not rows:
+        raise BadInput("holds no samples", file=file, hint="record or export it again")
+    store.flush()
+    return np.memmap(store, dtype, mode="r", shape=(rows, *shape))
+
+
+def rate_from_step(step: object) -> float | None:
+    """Sample rate [Hz] from a sample interval [s], rounded to 15 digits as 1/5e-10 is not 2e9; None if not positive."""
+    if not isinstance(step, (int, float)) or not 0 < step < np.inf or not np.isfinite(1 / np.float64(step)):
+        return None
+    return float(f"{1 / step:.15g}")
+
+
+def infer_clock(times: SampleSource) -> tuple[float | None, float | None, str]:
+    """Sample rate [Hz] and start [s] of a column of times [s].
+
+    Returns:
+        Rate (None if the times are not uniform), start, and a note that says where they are not uniform, else empty.
+    """
+    size = times.shape[0]
+    first, last = (float(times[at : at + 1][0]) for at in (0, size - 1))
+    with np.errstate(all="ignore"):
+        step = (np.float64(last) - first) / max(size - 1, 1)
+        if size < 2 or not 0 < step < np.inf or not 0 < 1 / step < np.inf:
+            return None, None, "its times do not rise"
+        for low in range(0, size, READ_CHUNK_SAMPLES):
+            block = np.asarray(times[low : low + READ_CHUNK_SAMPLES], np.float64)
+            off = np.abs((block - first) / step - np.arange(low, low + len(block)))
+            if not (off < MAX_CLOCK_DEVIATION_SAMPLES).all():
+                row = int(np.argmin(off < MAX_CLOCK_DEVIATION_SAMPLES))
+                what = f"its times are not uniform: sample {low + row} lies {off[row]:.3g} samples off"
+                return None, first, what
+    return float(1 / step), first, ""
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Make names unique: a repeated name gets a number appended, an empty name becomes ``column N``."""
+    out: list[str] = []
+    for index, name in enumerate(names, 1):
+        base = name.strip() or f"column {index}"
+        candidate, number = base, 1
+        while candidate in out:
+            number += 1
+            candidate = f"{base} ({number})"
+        out.append(candidate)
+    return out

@@ -1,0 +1,227 @@
+"""CSV as oscilloscopes write it: Rigol, Tektronix (two ways), Keysight/Agilent InfiniiVision, Rohde & Schwarz.
+
+Each manufacturer writes names, units and clock to different places above the numbers; see the functions below.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from recon.io.readers.contents import (
+    Contents,
+    Variable,
+    infer_clock,
+    map_blocks,
+    normalise_unit,
+    rate_from_step,
+    unique_names,
+)
+from recon.io.readers.reader import Reader
+from recon.io.readers.text_table import is_numeric, parse_number, parse_number_blocks, read_lines, split_fields
+from scanner.arrays import Array
+from scanner.errors import BadInput
+
+MAX_HEADER_LINES = 200
+"""Lines in which the table has to begin; headers of oscilloscopes have tens of lines."""
+MAX_XML_HEADER_BYTES = 1 << 16
+"""Bytes of a Rohde & Schwarz .bin file that are searched for properties, so that a large file costs no memory."""
+ROHDE_SCHWARZ_UNITS = {"eRS_UNIT_LEVEL_V": "V", "eRS_UNIT_LEVEL_A": "A"}
+"""Units as Rohde & Schwarz names them."""
+_PROPERTY = re.compile(r'<Prop [^>]*?\bName="(\w+)"[^>]*? Value="([^"]*)"')
+NAMES_OF_SECONDS = ("s", "sec", "second", "seconds")
+"""Spellings of the unit of a column of times."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the columns and the clock of a table are stated.
+
+    Attributes:
+        kind: name of the format.
+        names, units: of the columns.
+        columns: their positions in a line.
+        first: number of lines before the table.
+        times: index of the column that holds times [s].
+        index: index of the column that counts samples.
+        rate: stated sample rate [Hz].
+        start: stated time of the first sample [s].
+        starts: start [s] by number of rows, if the header states it that way.
+        about: other statements of the header.
+    """
+
+    kind: str
+    names: Sequence[str]
+    units: Sequence[str]
+    columns: Sequence[int]
+    first: int
+    times: int | None = None
+    index: int | None = None
+    rate: float | None = None
+    start: float | None = None
+    about: dict[str, str] = field(default_factory=dict)
+    starts: Mapping[int, float] = field(default_factory=dict)
+
+
+def read_csv(path: Path) -> Contents:
+    """Columns of an oscilloscope's CSV file, or of another table with at most one line of names.
+
+    In a known format the column of times or sample numbers becomes the clock. In an unknown table no column does.
+
+    Raises:
+        BadInput: no such file, or a line that is no row of the table.
+    """
+    head = list(islice(read_lines(path), MAX_HEADER_LINES + 1))
+    if not head:
+        raise BadInput("the file is empty", file=path, hint="copy it again")
+    if _fields(head[0])[0].lower() == "record length":
+        layout, separator, decimal = _tektronix_beside(head), ",", "."
+    else:
+        first = next((at for at, line in enumerate(head) if is_numeric(line, *_marks(line))), None)
+        if first is None:
+            raise BadInput("holds no table of numbers", file=path, hint="name its format in the mapping")
+        separator, decimal = _marks(head[first])
+        above = [split_fields(line.lstrip("#"), separator) for line in head[:first]]
+        layout = _layout(path, above, head[first], separator)
+    rows = islice(read_lines(path), layout.first, None)
+    table = map_blocks(parse_number_blocks(rows, path, separator, layout.columns, layout.first + 1, decimal), path)
+    return Contents(layout.kind, _variables(layout, table), layout.about)
+
+
+def _variables(layout: Layout, table: Array) -> dict[str, Variable]:
+    rate, start, note = layout.rate, layout.starts.get(len(table), layout.start), ""
+    if layout.times is not None:
+        measured_rate, start, note = infer_clock(table[:, layout.times])
+        rate = None if measured_rate is None else rate or measured_rate
+    elif layout.index is not None:
+        samples_per_row, _, note = infer_clock(table[:, layout.index])
+        rate = None if samples_per_row is None else rate
+    signals = [at for at in range(len(layout.names)) if at not in (layout.times, layout.index)]
+    return {
+        name: Variable(table[:, at], normalise_unit(layout.units[at]), rate, start if rate is not None else None, note)
+        for at, name in zip(signals, unique_names(layout.names[at] for at in signals), strict=True)
+    }
+
+
+def _marks(line: str) -> tuple[str, str]:
+    """Separator and decimal mark of a line of numbers."""
+    for separator in ("\t", ";"):
+        if separator in line:
+            return separator, "," if "," in line else "."
+    return ",", "."
+
+
+def _fields(line: str) -> list[str]:
+    return split_fields(line, ",")
+
+
+def _layout(path: Path, head: list[list[str]], row: str, separator: str) -> Layout:
+    """The layout that the lines above the numbers state; the manufacturer is recognised by its keys."""
+    width = len(row.rstrip().rstrip(separator).split(separator))
+    keys = {line[0].lower(): line[1:] for line in head if line}
+    if not head:
+        return _rohde_schwarz(path, width)
+    if head[0][0] == "X" and {"Start", "Increment"} <= set(head[0]) and len(head) > 1:
+        return _rigol(head)
+    if head[0][0].lower() == "x-axis" and len(head) > 1:
+        units = _padded(head[1], width)
+        times = 0 if units[0].lower() in NAMES_OF_SECONDS else None
+        return Layout("Keysight InfiniiVision CSV", _padded(head[0], width), units, range(width), len(head), times)
+    if "sample interval" in keys and "horizontal units" in keys:
+        return _tektronix_above(head, keys, width)
+    return Layout("CSV", _padded(head[-1], width), [""] * width, range(width), len(head))
+
+
+def _padded(fields: Sequence[str], width: int) -> list[str]:
+    return [*fields, *[""] * width][:width]
+
+
+def _rigol(head: list[list[str]]) -> Layout:
+    """``X,CH1,CH2,Start,Increment`` over ``Sequence,Volt,Volt,-3e-07,5e-10``; the rows count samples."""
+    fields = dict(zip(head[0], head[1], strict=False))
+    width = head[0].index("Start")
+    rate, start = (
+        rate_from_step(parse_number(fields.get("Increment", ""))),
+        _finite(parse_number(fields.get("Start", ""))),
+    )
+    units = ["", *_padded(head[1][1:], width - 1)]
+    return Layout("Rigol CSV", head[0][:width], units, range(width), len(head), index=0, rate=rate, start=start)
+
+
+def _tektronix_above(head: list[list[str]], keys: dict[str, list[str]], width: int) -> Layout:
+    """MSO, DPO, MDO, TBS: lines of ``key,value``, the last one ``TIME,CH1``."""
+    seconds = "".join(keys["horizontal units"][:1]).lower() in NAMES_OF_SECONDS
+    units = ["", *_padded(keys.get("vertical units", []), width - 1)]
+    rate = rate_from_step(parse_number("".join(keys["sample interval"][:1]))) if seconds else None
+    device = " ".join(keys.get("model", [])[:1])
+    times = 0 if seconds and head[-1][0].lower() == "time" else None
+    names = _padded(head[-1], width)
+    about = {"device": device}
+    return Layout("Tektronix CSV", names, units, range(width), len(head), times, None, rate, None, about)
+
+
+def _tektronix_beside(head: list[str]) -> Layout:
+    """TDS: 18 lines of ``key,value,,time,volts``, then ``,,,time,volts``."""
+    header = {fields[0].lower(): "".join(fields[1:2]) for fields in map(_fields, head[:18])}
+    seconds = header.get("horizontal units", "").lower() in NAMES_OF_SECONDS
+    return Layout(
+        "Tektronix TDS CSV",
+        ["TIME", header.get("source") or "CH1"],
+        ["", header.get("vertical units", "")],
+        columns=(3, 4),
+        first=0,
+        times=0 if seconds else None,
+        rate=rate_from_step(parse_number(header.get("sample interval", ""))) if seconds else None,
+        about={"device": header.get("model number", "")},
+    )
+
+
+def _rohde_schwarz(path: Path, width: int) -> Layout:
+    """``NAME.Wfm.csv`` holds values only; unit and clock are in ``NAME.csv`` or ``NAME.bin`` beside it.
+
+    The values are those on the screen or all that were recorded; the number of rows decides which.
+    """
+    header = _read_header_beside(path)
+    rate = rate_from_step(parse_number(header.get("SignalResolution", "")))
+    screen_start, full_start = (_finite(parse_number(header.get(key, ""))) for key in ("XStart", "HardwareXStart"))
+    starts = {
+        int(rows): start
+        for rows, start in (
+            (header.get("RecordLength"), screen_start),
+            (header.get("SignalHardwareRecordLength"), full_start),
+        )
+        if rows and rows.isdecimal() and len(rows) < 20 and start is not None
+    }
+    unit = ROHDE_SCHWARZ_UNITS.get(header.get("BaseUnit", ""), "")
+    kind = "Rohde & Schwarz CSV" if header else "CSV without a header"
+    return Layout(
+        kind, [""] * width, [unit] * width, range(width), 0, rate=rate, start=None if starts else full_start,
+        starts=starts,
+    )  # fmt: skip
+
+
+def _read_header_beside(path: Path) -> dict[str, str]:
+    """Header beside ``NAME.Wfm.csv``: lines ``key:value:`` in NAME.csv, else XML in NAME.bin."""
+    if not path.name.lower().endswith(".wfm.csv"):
+        return {}
+    name = path.name[: -len(".Wfm.csv")]
+    text, xml = path.with_name(f"{name}.csv"), path.with_name(f"{name}.bin")
+    if text.is_file():
+        pairs = (line.split(":", 2) for line in islice(read_lines(text), MAX_HEADER_LINES))
+        return {pair[0]: pair[1] for pair in pairs if len(pair) > 1}
+    if xml.is_file():
+        with xml.open("rb") as file:
+            return dict(_PROPERTY.findall(file.read(MAX_XML_HEADER_BYTES).decode(errors="replace")))
+    return {}
+
+
+def _finite(number: float | None) -> float | None:
+    return number if number is not None and np.isfinite(number) else None
+
+
+READER = Reader("csv", read_csv, suffixes=(".csv", ".tsv", ".txt"))

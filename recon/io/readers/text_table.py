@@ -1,0 +1,100 @@
+"""Tables of numbers in text files, read block by block; errors name the line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from scanner.arrays import Array
+from scanner.errors import BadInput
+
+MAX_LINE_CHARACTERS = 1 << 16
+"""Limit of a line, which keeps a binary file without line ends out of memory."""
+
+LINES_PER_BLOCK = 1 << 14
+"""Lines parsed at a time: many enough for numpy's parser to be fast, few enough to bound memory."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
+
+
+def read_lines(path: Path) -> Iterator[str]:
+    """Lines of a text file, without line ends.
+
+    Raises:
+        BadInput: no such file, a line longer than ``MAX_LINE_CHARACTERS``, or a zero byte.
+    """
+    try:
+        file = path.open(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name the instrument's file") from None
+    with file:
+        for number, line in enumerate(iter(lambda: file.readline(MAX_LINE_CHARACTERS), ""), 1):
+            if len(line) == MAX_LINE_CHARACTERS or "\0" in line:
+                raise BadInput(f"line {number} is no line of a table", file=path, hint="check the file's format")
+            yield line.rstrip("\r\n")
+
+
+def split_fields(line: str, separator: str) -> list[str]:
+    """Fields of a line, without surrounding blanks and quotes."""
+    return [part.strip().strip('"').strip() for part in line.split(separator)]
+
+
+def parse_number(text: str, decimal: str = ".") -> float | None:
+    """The number in ``text``; NaN if it is empty, None if it is not a number."""
+    text = text.strip().strip('"').strip()
+    if not text:
+        return float("nan")
+    text = text.replace(decimal, ".") if decimal != "." else text
+    return float(text) if _NUMBER.fullmatch(text) else None
+
+
+def is_numeric(line: str, separator: str, decimal: str = ".") -> bool:
+    """Whether all fields of a line are numbers or empty, and at least one is a number."""
+    numbers = [parse_number(part, decimal) for part in line.split(separator)]
+    return None not in numbers and bool(line.replace(separator, "").strip())
+
+
+def parse_number_blocks(
+    lines: Iterable[str], path: Path, separator: str, columns: Sequence[int], line: int, decimal: str = "."
+) -> Iterator[Array]:
+    """Numbers of selected columns, in blocks of shape (n, columns). An empty field is NaN; empty lines are skipped.
+
+    Args:
+        lines: of the table.
+        path: of the file, for messages.
+        separator: between fields.
+        columns: positions of the columns, from 0.
+        line: number of the first line in the file, for messages.
+        decimal: decimal mark.
+
+    Raises:
+        BadInput: a field that is not a number, or a line that ends before the last column.
+    """
+    lines = iter(lines)
+    while block := list(islice(lines, LINES_PER_BLOCK)):
+        try:
+            if decimal != "." or not all(block):
+                raise ValueError
+            yield np.loadtxt(block, delimiter=separator, usecols=columns, ndmin=2, comments=None)
+        except (ValueError, IndexError):  # empty fields, quotes or an error: parse line by line, which is slower
+            rows = ((line + at, text) for at, text in enumerate(block) if text.strip())
+            numbers = [_row(text, at, path, separator, columns, decimal) for at, text in rows]
+            if numbers:
+                yield np.array(numbers)
+        line += len(block)
+
+
+def _row(text: str, line: int, path: Path, separator: str, columns: Sequence[int], decimal: str) -> list[float]:
+    parts = text.split(separator)
+    if len(parts) <= max(columns):
+        what = f"line {line} ends after {len(parts)} of {max(columns) + 1} columns"
+        raise BadInput(what, file=path, hint="the file may be cut; export it again")
+    numbers = [parse_number(parts[column], decimal) for column in columns]
+    if None in numbers:
+        wrong = parts[columns[numbers.index(None)]][:40]
+        raise BadInput(f"line {line}: {wrong!r} is no number", file=path, hint="repair or remove the line")
+    return numbers  # type: ignore[return-value]

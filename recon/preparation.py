@@ -1,0 +1,138 @@
+"""Preparation of a recording: check it once, and collect what estimation, gridding and assessment need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from estimation.optics.correction import correct_intensity
+from estimation.signals import require_device
+from recon.quality.clock_jumps import detect_clock_jumps, longest_segment
+from recon.quality.defects import Defect, find_defects
+from scanner import devices
+from scanner.channel import CHANNEL_UNITS, Channel, check_signal
+from scanner.device import AXES, Device
+from scanner.recording import Recording
+
+DeviceSource = str | Path | Device
+"""A device, the path of a TOML file, or the name of a device of ``scanner.devices``."""
+
+
+@dataclass(frozen=True)
+class PreparedRecording:
+    """A recording that was checked, cut to the segment in use and corrected for the device's optics.
+
+    Attributes:
+        recording: the segment in use; its intensity is corrected for the optics terms of the device.
+        uncorrected: the same segment with the intensity as it was recorded.
+        device: the device in use.
+        clock_jumps: phase jumps of the whole recording. The segment contains none of them.
+        defects: clock jumps, then gaps, clipping and missing parts of the segment's channels.
+        unknown_entries: a line for every channel and every device key that the program does not know.
+        origin: time at which the optics terms of the device begin [s].
+    """
+
+    recording: Recording
+    uncorrected: Recording
+    device: Device
+    clock_jumps: tuple[Defect, ...]
+    defects: tuple[Defect, ...]
+    unknown_entries: tuple[str, ...]
+    origin: float
+
+    @property
+    def intensity(self) -> Channel:
+        """The corrected intensity of the segment."""
+        return self.recording["intensity"]
+
+
+def prepare(recording: Recording, device: DeviceSource | None = None) -> PreparedRecording:
+    """Check a recording and cut it to its longest segment without a clock jump.
+
+    Args:
+        recording: with an intensity, and whatever channels the estimator needs.
+        device: in place of the recording's own.
+
+    Raises:
+        BadInput: no intensity, or one that is not a signal; no device, or a device without an x or a y axis.
+    """
+    check_signal(recording.require("intensity", "a picture needs it"), gaps_ok=True)
+    device = select_device(recording, device)
+    clock_jumps = detect_clock_jumps(recording)
+    if clock_jumps:
+        recording = recording.slice(*longest_segment(recording, clock_jumps))
+    for axis in AXES:
+        device.axis(axis)
+    return prepare_segment(recording, device, clock_jumps)
+
+
+def prepare_segment(segment: Recording, device: Device, clock_jumps: Sequence[Defect]) -> PreparedRecording:
+    """Correct and inspect a segment between clock jumps.
+
+    Args:
+        segment: with an intensity.
+        device: of the recording.
+        clock_jumps: of the whole recording.
+    """
+    recording = correct_intensity(segment, device)
+    return PreparedRecording(
+        recording=recording,
+        uncorrected=segment,
+        device=device,
+        clock_jumps=tuple(clock_jumps),
+        defects=(*clock_jumps, *find_defects(recording)),
+        unknown_entries=tuple(_unknown_entries(recording, device)),
+        origin=recording.start,
+    )
+
+
+def prepare_frame(recording: Recording, device: Device, start: float, stop: float) -> PreparedRecording:
+    """Prepare the part of a growing recording from ``start`` to ``stop`` [s], without a search for clock jumps.
+
+    Raises:
+        BadInput: the part holds no intensity.
+    """
+    frame = correct_intensity(recording, device).slice(start, stop)
+    frame.require("intensity", "a picture needs it")
+    return PreparedRecording(
+        recording=frame,
+        uncorrected=recording.slice(start, stop),
+        device=device,
+        clock_jumps=(),
+        defects=tuple(find_defects(frame)),
+        unknown_entries=(),
+        origin=recording.start,
+    )
+
+
+def select_device(recording: Recording, device: DeviceSource | None) -> Device:
+    """Return the given device, else the recording's own.
+
+    Raises:
+        BadInput: the file is not a valid device, or none is given and the recording has none.
+    """
+    if isinstance(device, str) and device in devices.names():
+        device = devices.load(device)
+    elif device is not None and not isinstance(device, Device):
+        device = Device.load(device)
+    return require_device(recording, device)
+
+
+def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:
+    """A line for every channel and every device key that the program does not know: most of them are misspelt."""
+    for name in recording.channels:
+        if name not in CHANNEL_UNITS and name != "intensity":
+            yield f"{name}: a channel of this name is not used"
+    for key in _dotted_keys({**device.extra, **{name: axis.extra for name, axis in device.axes.items()}}):
+        yield f"{key}: is no key of a device, and not used"
+
+
+def _dotted_keys(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Dotted keys of all values in nested tables."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _dotted_keys(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key

@@ -1,0 +1,156 @@
+"""Defects of a recording that a reconstruction can tolerate: missing and clipped samples, and where they matter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true
+from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, READ_CHUNK_SAMPLES, Channel
+from scanner.motion import Motion
+from scanner.recording import Recording
+
+MERGE_GAP_S = 1e-3
+"""Intervals of one kind that are closer than this are reported as one: a signal that clips clips in every period."""
+
+MAX_PHASE_SD_RAD = 0.25
+"""Standard deviation of the phase above which a sample gets no pixel. It corresponds to 50 pixels of 400."""
+
+EXTRAPOLATION_BLOCKS = 2.0
+"""Blocks of the slow motion beyond its first and last one over which its phase is extrapolated."""
+
+PHASE_JUMP = "leap"
+"""Kind of a phase jump. summary.json contains this text, and programs that read it depend on it."""
+
+KIND_NAMES = {PHASE_JUMP: "phase jump"}
+"""Names of kinds in messages, where they differ from the text in summary.json."""
+
+
+@dataclass(frozen=True)
+class Defect:
+    """An interval of one channel that cannot be used as it is.
+
+    Attributes:
+        channel: name of the channel.
+        kind: ``"gap"`` (samples that are not finite), ``"clipped"``, ``"missing"`` (the channel begins later or ends
+            earlier than the intensity) or ``PHASE_JUMP`` (see :mod:`recon.quality.clock_jumps`; of the intensity, see
+            :mod:`recon.quality.dropped_samples`).
+        start, stop: [s] on the recording's clock.
+    """
+
+    channel: str
+    kind: str
+    start: float
+    stop: float
+
+
+def find_defects(recording: Recording) -> list[Defect]:
+    """Return gaps, clipping and missing parts of the channels that a picture is made of.
+
+    Args:
+        recording: with an intensity.
+
+    Returns:
+        The defects channel by channel, those of one kind in order of time.
+    """
+    intensity = recording["intensity"]
+    defects: list[Defect] = []
+    for name, channel in recording.channels.items():
+        if name.startswith(("sense", "drive_", "angle_")) or name == "intensity":
+            defects += _find_missing_ends(channel, intensity)
+            defects += _as_defects(channel, "gap", _find_gaps(channel))
+            if name.startswith("sense"):
+                defects += _as_defects(channel, "clipped", _find_clipped_runs(channel))
+    return defects
+
+
+def unrecoverable_intervals(motion: Motion, defects: Sequence[Defect]) -> list[tuple[float, float]]:
+    """Return the intervals [s] of defects in which the mirror's angle is unknown: their samples belong to no pixel.
+
+    The angle is unknown where the phase has a standard deviation above ``MAX_PHASE_SD_RAD``, and beyond the ends of
+    the slow motion. Defects of the intensity leave the angle known.
+    """
+    unknown = []
+    for axis in motion.axes.values():
+        half_block = 0.5 * float(axis.time[1] - axis.time[0])
+        margin = 2 * EXTRAPOLATION_BLOCKS * half_block
+        unknown += [(-np.inf, float(axis.time[0]) - margin), (float(axis.time[-1]) + margin, np.inf)]
+        known = np.nan_to_num(axis.phase_sd, nan=np.inf) <= MAX_PHASE_SD_RAD
+        unknown += [
+            (float(axis.time[first]) - half_block, float(axis.time[stop - 1]) + half_block)
+            for first, stop in runs_of_true(~known)
+        ]
+    return [
+        (max(low, defect.start), min(high, defect.stop))
+        for defect in defects
+        if defect.channel != "intensity"
+        for low, high in unknown
+        if max(low, defect.start) < min(high, defect.stop)
+    ]
+
+
+def describe_defects(defects: Sequence[Defect]) -> Iterator[str]:
+    """Yield a line of text for each channel and kind of defect."""
+    for (channel, kind), group in groupby(defects, lambda defect: (defect.channel, defect.kind)):
+        same = list(group)
+        total = sum(defect.stop - defect.start for defect in same)
+        places = "one interval" if len(same) == 1 else f"{len(same)} intervals"
+        name = KIND_NAMES.get(kind, kind)
+        yield f"{channel}: {name} for {1e3 * total:.4g} ms in {places}, the first at {same[0].start:.6g} s"
+
+
+def _find_missing_ends(channel: Channel, intensity: Channel) -> list[Defect]:
+    """The parts of the intensity's time that the channel does not cover."""
+    tolerance = 2.0 / min(channel.sample_rate, intensity.sample_rate)
+    ends = ((intensity.start, channel.start), (channel.end, intensity.end))
+    return [Defect(channel.name, "missing", start, stop) for start, stop in ends if stop - start > tolerance]
+
+
+def _as_defects(channel: Channel, kind: str, ranges: SampleRanges) -> list[Defect]:
+    """Ranges of samples as defects of one kind, merged where they are close together."""
+    rate = channel.sample_rate
+    merged = merge_ranges(ranges, round(MERGE_GAP_S * rate))
+    return [
+        Defect(channel.name, kind, channel.start + first / rate, channel.start + stop / rate) for first, stop in merged
+    ]
+
+
+def _read_chunks(channel: Channel) -> Iterator[tuple[int, NDArray[Any]]]:
+    """First sample and stored values of every chunk. Gaps and clipping show in them, and they are fast to read."""
+    for first in range(0, channel.size, READ_CHUNK_SAMPLES):
+        yield first, channel.stored(first, first + READ_CHUNK_SAMPLES)
+
+
+def _find_gaps(channel: Channel) -> SampleRanges:
+    """Samples that are not finite, in any detector."""
+    if channel.raw.dtype.kind != "f":
+        return []
+    gaps: SampleRanges = []
+    for first, values in _read_chunks(channel):
+        bad = ~np.isfinite(values)
+        if bad.any():
+            gaps += [(first + a, first + b) for a, b in runs_of_true(bad.reshape(len(bad), -1).any(axis=1))]
+    return gaps
+
+
+def _find_clipped_runs(channel: Channel) -> SampleRanges:
+    """Runs of MIN_CLIPPED_RUN_SAMPLES or more equal samples at the smallest and the largest value of the channel."""
+    extremes = [np.inf, -np.inf]
+    clipped: tuple[SampleRanges, SampleRanges] = ([], [])
+    for first, values in _read_chunks(channel):
+        for side, reduce_extreme, is_beyond in ((0, np.fmin, np.less), (1, np.fmax, np.greater)):
+            extreme = float(reduce_extreme.reduce(values))
+            if is_beyond(extreme, extremes[side]):
+                extremes[side] = extreme
+                clipped[side].clear()
+            at_extreme = values == extremes[side]
+            if np.count_nonzero(at_extreme) >= MIN_CLIPPED_RUN_SAMPLES:
+                clipped[side].extend(
+                    (first + a, first + b) for a, b in runs_of_true(at_extreme) if b - a >= MIN_CLIPPED_RUN_SAMPLES
+                )
+    return sorted(clipped[0] + clipped[1])

@@ -1,0 +1,4 @@
+"""Self-contained HTML pages and their figures.
+
+Draws and writes results; computes none.
+"""

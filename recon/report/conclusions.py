@@ -1,0 +1,192 @@
+"""One sentence, or a few, that say what a command found and what to do about it: the start of reports and summaries.
+
+Every function takes the content of the command's JSON file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from recon.report.numbers import format_interval, format_uncertain, format_value
+
+SHARP_FRACTION = 0.99
+"""Fraction of the scan within the bound p/m from which a picture is called sharp: blur in the remaining hundredth of
+the samples is not visible."""
+
+MIN_READOUT_ERROR_SD = 3.0
+"""Phase error of the readout in standard deviations from which it is stated: chance exceeds it in 0.3 % of readouts."""
+
+SUFFICIENT_FILL = 0.9
+"""Fraction of visited pixels below which a longer recording or fewer pixels are advised. Isolated holes up to this
+number are filled from their neighbours without visible loss."""
+
+
+def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
+    """How sharp the picture is, and what would improve it."""
+    axes = summary["axes"]
+    within = min(summary[axis]["within_bound"] for axis in axes)
+    measured = all("phase_rmse_deg" in summary[axis] for axis in axes)
+    key, what = ("phase_rmse_deg", "the phase error is") if measured else ("phase_sd_deg", "the phase is known to")
+    errors = " and ".join(f"{_degrees(summary[axis][key])} in {axis}" for axis in axes)
+    bounds = sorted({f"{summary[axis]['bound_deg']:.3f}°" for axis in axes})
+    verdict = "sharp" if within >= SHARP_FRACTION else "partly blurred" if within >= 0.5 else "blurred"
+    text = _describe_readout_phase(summary) + (
+        f"The picture is {verdict}: {what} {errors} ({'rms' if measured else '1 sd'}), and {within:.1%} of the scan "
+        f"lies within the bound of {' / '.join(bounds)}."
+    )
+    if verdict != "sharp":
+        text += " Run lissajous diagnose on this recording to find what the device file lacks."
+    if summary["fill"] < SUFFICIENT_FILL:
+        text += f" Only {summary['fill']:.0%} of the pixels were visited: record longer or ask for fewer pixels."
+    return text
+
+
+def _describe_readout_phase(summary: Mapping[str, Any]) -> str:
+    """A sentence on the phase error of the readout that was removed; empty where none was significant."""
+    late = []
+    for axis in summary["axes"]:
+        error = summary[axis].get("readout_phase_deg")
+        if error is not None and abs(error["value"]) > MIN_READOUT_ERROR_SD * error["sd"]:
+            word = "late" if error["value"] > 0.0 else "early"
+            late.append(f"{format_uncertain(abs(error['value']), error['sd'], '°')} {word} in {axis}")
+    if not late:
+        return ""
+    return f"The sense signal is {' and '.join(late)}; the picture was used instead. "
+
+
+def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] | None = None) -> str:
+    """What the nominal device lacks, and what to do.
+
+    Args:
+        content: of diagnosis.json.
+        blur_px: rms blur by the phase error of an open-loop prediction in a picture of 400 pixels, before and after.
+    """
+    findings = content["findings"]
+    if not findings and content["verdict"] == "consistent":
+        return (
+            "The recordings agree with the nominal device within their noise and the tolerances of its values; "
+            "no correction is needed."
+        )
+    if not findings:
+        text = "The recordings contradict the nominal device, but no single effect explains the difference."
+    else:
+        text = "The nominal device lacks " + "; and ".join(_describe_finding(finding) for finding in findings) + "."
+    if blur_px is not None and findings:
+        text += (
+            f" Predicted from the drive alone, the nominal motion is wrong by {blur_px[0]:.2g} px rms in a picture of "
+            f"400 pixels, the corrected one by {blur_px[1]:.1g} px."
+        )
+    if findings:
+        text += " Use the corrected device.toml in place of the nominal one."
+    if content.get("unexplained"):
+        text += f" Not explained: {content['unexplained']}."
+    return text
+
+
+def _describe_finding(finding: Mapping[str, Any]) -> str:
+    values = ", ".join(
+        f"{p['name']} = {format_interval(p['value'], p['ci95'][0], p['ci95'][1], p['unit'])}"
+        for p in finding["parameters"]
+    )
+    name = "an effect that is not in the catalogue" if finding["effect"] == "unknown" else finding["effect"]
+    return f"{name} in the {finding['stage']} of axis {finding['axis']}" + (f" ({values})" if values else "")
+
+
+def conclude_plan(content: Mapping[str, Any]) -> str:
+    """How many effects planned recordings could identify."""
+    effects = content["effects"]
+    separable = sum(effect["distance"] >= content["apart"] for effect in effects)
+    text = f"These recordings could identify {separable} of {len(effects)} effects of typical size unambiguously."
+    if separable < len(effects):
+        text += " The others need a further excitation or channel, listed below."
+    return text
+
+
+def conclude_identification(summary: Mapping[str, Any]) -> str:
+    """How many constants were measured, and the least certain of them."""
+    values = {f"{axis}.{name}": v for axis, r in summary["axes"].items() for name, v in r["values"].items()}
+    relative = {name: v["sd"] / abs(v["value"]) for name, v in values.items() if v["value"] and v["sd"]}
+    text = f"{_count(len(values), 'constant')} of {summary['device']} measured"
+    if relative:
+        worst = max(relative, key=lambda name: relative[name])
+        text += f", the least certain {worst} to {100 * relative[worst]:.2g} %"
+    return text + ". Use device.toml in place of the nominal device."
+
+
+def conclude_prediction(summary: Mapping[str, Any]) -> str:
+    """How well the device predicts the channels from the drive alone."""
+    channels = summary["channels"]
+    if not channels:
+        return "The recording has no channel that the device predicts."
+    worst = max(channels, key=lambda name: channels[name]["nrmse"])
+    channel = channels[worst]
+    text = (
+        f"From the drive alone {summary['device']} predicts "
+        + {1: "the channel", 2: "both channels"}.get(len(channels), f"all {len(channels)} channels")
+        + f" to {100 * channel['nrmse']:.2g} % of the signal or better (worst: {worst}, "
+        f"{format_value(channel['rmse'], 3)} {channel['unit']} rms)"
+    )
+    if channel["noise_sd"] and channel["rmse"] > 1.5 * channel["noise_sd"]:
+        ratio = channel["rmse"] / channel["noise_sd"]
+        return text + f", {ratio:.2g} times its noise. Run lissajous diagnose to find what the device lacks."
+    return text + "."
+
+
+def conclude_design(summary: Mapping[str, Any]) -> str:
+    """The drive frequencies to use, and the fill that they reach."""
+    best, fill = summary["candidates"][0], summary["wanted"]["fill"]
+    drive = best["drive_hz"]
+    text = (
+        f"Drive x at {drive['x']:.4f} Hz and y at {drive['y']:.4f} Hz: {best['frame_rate']:.4g} pictures a second, "
+        f"{best['fill']['worst']:.1%} to {best['fill']['best']:.1%} of the pixels visited, depending on the phase "
+        "between the axes."
+    )
+    if best["fill_reached"] == "no":
+        text += f" The wanted {fill:.1%} is not reached: ask for fewer pixels or a lower frame rate."
+    return text
+
+
+def conclude_study(summary: Mapping[str, Any]) -> str:
+    """Which estimator was best, and how often it satisfied the bound."""
+    statistics = {
+        name: values
+        for name, values in summary["estimators"].items()
+        if values["phase_rmse_deg_median"] is not None and values["within_bound"] is not None
+    }
+    if not statistics:
+        return f"None of {_count(summary['cells'], 'cell')} was computed; the reasons are listed below."
+    best = min(statistics, key=lambda name: statistics[name]["phase_rmse_deg_median"])
+    values = statistics[best]
+    text = (
+        f"Use {best}: its phase error is the smallest, {_degrees(values['phase_rmse_deg_median'])} rms (median), "
+        f"with {values['within_bound']:.1%} of the scan within the bound p/m."
+    )
+    if summary["failed"]:
+        text += f" {summary['failed']} of {_count(summary['cells'], 'cell')} failed."
+    return text
+
+
+def conclude_many(summary: Mapping[str, Any]) -> str:
+    """How many recordings were reconstructed, and which one needs a look."""
+    rows: Sequence[Mapping[str, Any]] = summary["recordings"]
+    done = [row for row in rows if not row["failed"]]
+    text = f"{len(done)} of {_count(len(rows), 'recording')} reconstructed."
+    if done:
+        worst = min(done, key=lambda row: min(row["within_bound"].values()))
+        share = min(worst["within_bound"].values())
+        name = worst["output"].rsplit("/", 1)[-1]
+        text += f" At least {share:.1%} of every scan lies within the bound p/m" + (
+            f"; look at {name} first." if share < SHARP_FRACTION else "."
+        )
+    if len(done) < len(rows):
+        text += " The reasons of the others are listed below."
+    return text
+
+
+def _degrees(value: float) -> str:
+    return f"{value:.2g}°" if value < 1.0 else f"{value:.2f}°"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")

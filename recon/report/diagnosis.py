@@ -1,0 +1,261 @@
+"""The reports of a diagnosis and of a planned measurement: conclusion, effects, then the evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from estimation.diagnosis.diagnose import Diagnosis, Finding
+from estimation.diagnosis.effect_curve import effect_curve
+from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability, detectability
+from estimation.diagnosis.posterior import PICTURE_HALF_WIDTH_PX, PhaseError, phase_error, phase_portrait, waveform
+from estimation.diagnosis.selection import SelectionResult, SelectionStep
+from recon.report.conclusions import conclude_diagnosis, conclude_plan
+from recon.report.diagnosis_figures import (
+    detectability_figure,
+    effect_figure,
+    measured_curve_figure,
+    phase_error_figure,
+    portrait_figure,
+    residual_over_time_figure,
+    residual_spectrum_figure,
+    waveform_figure,
+)
+from recon.report.numbers import format_interval, format_probability
+from recon.report.page import Figure, Section, Table, render
+from scanner.terms import catalogue
+
+EXCLUDED_NEG2_LOG_EVIDENCE, UNLIKELY_NEG2_LOG_EVIDENCE = 10.0, 6.0
+"""Differences in -2 log evidence above which an effect is called excluded and unlikely: odds of 150 and of 20 to 1."""
+
+MAX_SHOWN_DIFFERENCE = 1000.0
+"""Differences in -2 log evidence above this are shown as "more than 1000": the number has no further meaning."""
+
+UNITS = {"sense": "V", "angle": "rad"}
+"""Unit of a channel by its kind."""
+
+
+def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
+    """One diagnosis as a page.
+
+    Args:
+        diagnosis: of the recordings.
+        names: of the recordings.
+    """
+    search = diagnosis.search
+    errors = _phase_errors(search) if search is not None and diagnosis.findings else {}
+    largest = max(errors.values(), key=lambda e: e.blur_px(e.before), default=None)
+    blur = None if largest is None else (largest.blur_px(largest.before), largest.blur_px(largest.after))
+    sections = [_overview(diagnosis.findings)] if diagnosis.findings else []
+    sections += [_finding_section(finding, i, search) for i, finding in enumerate(diagnosis.findings)]
+    if search is not None:
+        sections += _motion_sections(diagnosis, search, errors)
+    sections += [_optics_section(table) for table in diagnosis.optics]
+    conclusion = conclude_diagnosis(diagnosis.to_json(), blur)
+    return render(f"Diagnosis of {diagnosis.device.name}", conclusion, sections, subject=f"From {', '.join(names)}.")
+
+
+def _overview(findings: Sequence[Finding]) -> Section:
+    rows = [
+        [
+            finding.effect,
+            f"{finding.stage} of axis {finding.axis}",
+            format_probability(finding.probability),
+            f"{finding.heldout['before']:.3g}",
+            f"{finding.heldout['after']:.3g}",
+        ]
+        for finding in findings
+    ]
+    head = ["effect", "where", "probability", "misfit before", "misfit after"]
+    text = "Misfit: reduced chi-square on samples that were not used in the fit; noise alone gives 1."
+    return Section("Effects", text, Table(head, rows))
+
+
+def _finding_section(finding: Finding, index: int, search: SelectionResult | None) -> Section:
+    text = f"{finding.equation}. {finding.where}. Source: {finding.source}."
+    if finding.advice:
+        text += f" To distinguish it from its alternatives: {finding.advice}."
+    rows = [[p.name, format_interval(p.value, *p.ci95, p.unit)] for p in finding.parameters]
+    for rival in finding.rivals:
+        distance = "" if rival.distance is None else f"; differs from it by {rival.distance:.1f} σ at most"
+        probability = f"probability {format_probability(rival.probability)}" if rival.probability > 1e-4 else ""
+        rows.append([f"alternative: {rival.effect}", (probability or "fits as well, with more parameters") + distance])
+    figures = [measured_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []
+    if search is not None:
+        figures += _effect_figures(finding, search)
+    table = Table(["parameter", "value ± standard deviation"], rows) if rows else None
+    return Section(f"{index + 1}. {finding.effect}", text, table, figures, least="24rem")
+
+
+def _effect_figures(finding: Finding, search: SelectionResult) -> list[Figure]:
+    key = (finding.axis, finding.effect, finding.channel)
+    candidates = [c for c in search.final.model.candidates if (c.axis, c.term.effect, c.channel) == key]
+    curves = [curve for c in candidates if (curve := effect_curve(search.final, c)) is not None]
+    return [effect_figure(curve, finding.effect) for curve in curves]
+
+
+def _motion_sections(diagnosis: Diagnosis, search: SelectionResult, errors: Mapping[str, PhaseError]) -> list[Section]:
+    """The evidence from drive to readout."""
+    sections = [_waveforms(search)]
+    if search.steps:
+        sections.append(_blur_section(errors))
+    sections += [_residuals(search), _portraits(search)]
+    if search.steps:
+        text = (
+            "Difference of −2 log evidence to the chosen effect: above 6 an effect is unlikely (odds 1 to 20), above "
+            "10 it is excluded (odds 1 to 150)."
+        )
+        head = ["effect", "difference", "judgement"]
+        sections.append(Section("Effects compared", text, Table(head, evidence_rows(search.steps))))
+    effects = detectability(search.comparison, search.final, catalogue().values())
+    return [*sections, _detectability(effects), _nominal_values(diagnosis)]
+
+
+def _phase_errors(search: SelectionResult) -> dict[str, PhaseError]:
+    """Phase errors of open-loop predictions by recording and axis."""
+    errors = {}
+    for r, run in enumerate(search.comparison.runs):
+        for axis in run.inputs:
+            error = phase_error(search.nominal, search.final, axis, r)
+            if error is not None:
+                errors[f"{run.name}, axis {axis}"] = error
+    return errors
+
+
+def _waveforms(search: SelectionResult) -> Section:
+    figures = [
+        waveform_figure(
+            waveform(search.nominal, search.final, r, channel),
+            f"{run.name}, {output.name}" if len(search.comparison.runs) > 1 else output.name,
+            UNITS.get(output.kind, ""),
+        )
+        for r, run in enumerate(search.comparison.runs)
+        for channel, output in enumerate(run.outputs)
+    ]
+    return Section("Measured and simulated waveforms", figures=figures, least="26rem")
+
+
+def _blur_section(errors: Mapping[str, PhaseError]) -> Section:
+    """The consequence for a picture."""
+    heading = "Blur of a picture without feedback"
+    if not errors:
+        return Section(heading, "The axis is driven far below its resonance and follows its drive: no phase to lose.")
+    rows, figures = [], []
+    for name, error in errors.items():
+        rows.append([name, f"{error.blur_px(error.before):.2g}", f"{error.blur_px(error.after):.1g}"])
+        figures.append(phase_error_figure(error, f"{name}: blur at the centre of a line"))
+    text = (
+        f"A phase error δφ displaces the centre of a line by m δφ pixels, with m = {PICTURE_HALF_WIDTH_PX} in a "
+        f"picture of {2 * PICTURE_HALF_WIDTH_PX} pixels. Nominal: the motion that the fitted nominal device predicts "
+        "from the drive alone, against the improved device. Improved: 95 % limit of its own uncertainty."
+    )
+    table = Table(["rms blur (pixels)", "nominal device", "improved device"], rows)
+    return Section(heading, text, table, figures, least="24rem")
+
+
+def _residuals(search: SelectionResult) -> Section:
+    figures = []
+    first = 0
+    for run, whiteners in zip(search.comparison.runs, search.comparison.whiteners, strict=True):
+        for output, whitener in zip(run.outputs, whiteners, strict=True):
+            part = slice(first, first + whitener.samples)
+            first += whitener.samples
+            pair = [search.nominal.residual[part], search.final.residual[part]]
+            frequency = np.arange(whitener.psd.size) / (output.data.size * output.step)
+            name = f"{run.name}, {output.name}"
+            figures.append(residual_over_time_figure(name, whitener.time * run.duration, pair))
+            figures.append(residual_spectrum_figure(name, frequency, pair))
+    text = "Differences between recording and simulation, divided by the noise at each frequency: noise alone gives 1."
+    return Section("Residuals over time and frequency", text, figures=figures, least="24rem")
+
+
+def _portraits(search: SelectionResult) -> Section:
+    pair = (search.nominal.residual, search.final.residual)
+    figures = []
+    for r, run in enumerate(search.comparison.runs):
+        for channel, output in enumerate(run.outputs):
+            before, after = phase_portrait(search.comparison, search.final, pair, r, channel)
+            caption = f"{run.name}, {output.name}: residual over angle and rate of axis {output.axes[0]}"
+            figures.append(portrait_figure(before, after, caption))
+    return Section("Residuals over the state of the mirror", figures=figures, least="24rem")
+
+
+def evidence_rows(rounds: Sequence[SelectionStep]) -> list[list[str]]:
+    """Every chosen effect, then its alternatives with their difference of -2 log evidence and what it means."""
+    rows = []
+    for step in rounds:
+        gain = step.before.neg2_log_evidence - step.after.neg2_log_evidence
+        rows.append([step.candidate.key, "0", f"chosen; no effect at all is worse by {_difference(gain)}"])
+        rows += [
+            [rival.candidate.key, _difference(rival.evidence_gap), _judgement(rival.evidence_gap)]
+            for rival in step.rivals
+        ]
+    return rows
+
+
+def _difference(value: float) -> str:
+    return f"{value:.1f}" if value < MAX_SHOWN_DIFFERENCE else f"more than {MAX_SHOWN_DIFFERENCE:.0f}"
+
+
+def _judgement(difference: float) -> str:
+    if difference > EXCLUDED_NEG2_LOG_EVIDENCE:
+        return "excluded"
+    return "unlikely" if difference > UNLIKELY_NEG2_LOG_EVIDENCE else "possible alternative"
+
+
+def _optics_section(table: Mapping[str, Any]) -> Section:
+    rows = [
+        [f"{e['effect']}, axis {e['axis']}", f"{e['sigma']:.1f}", "detectable" if e["told"] else "not detectable here"]
+        for e in table["effects"]
+    ]
+    text = (
+        f"{table['recording']}: samples of one place at different times and in different directions must agree. The "
+        "table shows how many standard deviations an effect of typical size would have. A distorted field or a wrong "
+        "amplitude changes every picture alike: they need a known target, and this recording cannot tell them."
+    )
+    return Section("Optics: detectability", text, Table(["effect", "σ", "in this recording"], rows))
+
+
+def _nominal_values(diagnosis: Diagnosis) -> Section:
+    rows = [[name, f"{value['pull']:+.2f}".replace("-", "−")] for name, value in diagnosis.nominal.items()]
+    text = "Change of every nominal value in the fit, in units of its tolerance (1 standard deviation)."
+    return Section("Nominal values", text, Table(["value", "change / tolerance"], rows))
+
+
+def _detectability(effects: Sequence[Detectability]) -> Section:
+    text = (
+        "For every effect of typical size: how many standard deviations it would have in these recordings, and how "
+        f"many of them its nearest confounder cannot imitate. From {DISCRIMINATION_SIGMA:g} σ on it is identified "
+        "unambiguously; below, a further measurement is needed."
+    )
+    return Section("What these recordings can show", text, figures=[detectability_figure(effects)], least="34rem")
+
+
+def plan_report(plan: Mapping[str, Any], effects: Sequence[Detectability]) -> str:
+    """The page of a planned measurement.
+
+    Args:
+        plan: content of plan.json.
+        effects: behind its table.
+    """
+    runs = [[run["name"], f"{1e3 * run['duration']:.4g}", ", ".join(run["channels"])] for run in plan["excitations"]]
+    ambiguous = [
+        [
+            effect["effect"],
+            f"{effect['stage']} of axis {effect['axis']}",
+            f"{effect['sigma']:.3g}",
+            f"{effect['distance']:.3g}",
+            effect["nearest"],
+            effect["advice"] or "another excitation, or a further channel",
+        ]
+        for effect in plan["effects"]
+        if effect["distance"] < DISCRIMINATION_SIGMA
+    ]
+    sections = [_detectability(effects)]
+    if ambiguous:
+        head = ["effect", "where", "detectability (σ)", "distance (σ)", "confounder", "what would distinguish them"]
+        sections.append(Section("What would remain ambiguous", "", Table(head, ambiguous)))
+    sections.append(Section("Planned recordings", "", Table(["excitation", "duration (ms)", "channels"], runs)))
+    return render("What a measurement can show", conclude_plan(plan), sections, subject=f"Device: {plan['device']}.")

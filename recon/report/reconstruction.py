@@ -1,0 +1,168 @@
+"""The page of one reconstruction: pictures, phase, blur and the phase sliders."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.imaging.picture import Grid
+from recon.io.output import pixel_size
+from recon.pipeline import AXES, Reconstruction
+from recon.report.conclusions import conclude_reconstruction
+from recon.report.figures import (
+    blur_figure,
+    contrast_limits,
+    coverage_to_rgb,
+    coverage_white_level,
+    data_uri,
+    encode_png,
+    fill_small_holes,
+    highlight_pixels,
+    phase_figure,
+    to_rgb,
+)
+from recon.report.numbers import format_uncertain
+from recon.report.page import Figure, Section, Table, render
+from recon.report.phase_slider import phase_slider_data
+
+
+def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) -> str:
+    """The page of one reconstruction; a segment of the intensity is part of it, for the phase sliders."""
+    grid = result.picture.grid
+    subject = (
+        f"{summary['samples']} samples in {result.duration * 1e3:.4g} ms on {grid.width} × {grid.height} pixels, "
+        f"{summary['fill']:.1%} of them visited. Estimator: {result.motion.estimator}; computed in "
+        f"{result.seconds:.2f} s."
+    )
+    filled = fill_small_holes(result.picture)
+    image, limits = to_rgb(filled), contrast_limits(filled)
+    bar, unit = scale_bar(grid), result.intensity.unit
+    pictures = [
+        Figure(
+            data_uri(encode_png(image)),
+            "picture; blue: pixels never visited",
+            scale_bar=bar,
+            grey_scale=(f"{limits[0]:.3g} {unit}", f"{limits[1]:.3g} {unit}"),
+        ),
+        coverage_figure(result.picture.coverage, bar),
+    ]
+    if result.affected.any():
+        highlighted = encode_png(highlight_pixels(image, result.affected))
+        caption = "orange: pixels that the defects listed above affect"
+        pictures.append(Figure(data_uri(highlighted), caption, scale_bar=bar))
+    blur = blur_figure_of({axis: summary[axis]["blur_px"] for axis in AXES}, result.p)
+    phases = phase_figures({result.motion.estimator: result})
+    sections = [
+        Section("Picture", _fill_text(summary), figures=pictures, least="20rem", pixelated=True),
+        Section("Phase", _phase_text(result), axis_table(summary), phases, "26rem"),
+        Section("Blur", BLUR_TEXT, figures=[blur], least="30rem"),
+        phase_slider_section(result),
+    ]
+    return render(result.name, conclude_reconstruction(summary), sections, summary["notes"], subject)
+
+
+BLUR_TEXT = (
+    "Displacement of the samples in pixels, rms over the scan, by cause. The causes add in quadrature. A constant "
+    "error of the amplitude changes the magnification only and is not counted."
+)
+
+
+def scale_bar(grid: Grid, part: float = 1.0) -> tuple[str, float]:
+    """Label and length of a scale bar: a round length of about a quarter of the picture.
+
+    Args:
+        grid: of the picture.
+        part: fraction of the picture's width that is shown.
+
+    Returns:
+        The label, and the length as a fraction of the shown width.
+    """
+    width, _, unit = pixel_size(grid)
+    width, unit = (width * grid.width * part, "µm") if unit == "um" else (1e3 * width * grid.width * part, "mrad")
+    power = 10.0 ** math.floor(math.log10(width / 4.0))
+    length = max(step * power for step in (1.0, 2.0, 5.0) if step * power <= width / 4.0)
+    return f"{length:g} {unit}", length / width
+
+
+def coverage_figure(coverage: NDArray[Any], bar: tuple[str, float]) -> Figure:
+    """Samples a pixel as a picture."""
+    white = f"{coverage_white_level(coverage):.3g} samples a pixel"
+    caption = "number of samples in each pixel; blue: never visited"
+    return Figure(data_uri(encode_png(coverage_to_rgb(coverage))), caption, scale_bar=bar, grey_scale=("0", white))
+
+
+def phase_slider_section(result: Reconstruction) -> Section:
+    """Sliders that add to the phases, for the manual correction that chen2020 describes."""
+    heading = "Phase by hand"
+    data = phase_slider_data(result)
+    if data is None:
+        return Section(heading, "The scan is too short for the phase sliders.")
+    first, stop = (1e3 * seconds for seconds in data["seconds"])
+    text = (
+        f"The scan from {first:.4g} to {stop:.4g} ms, mapped again when a slider moves: forward half-periods in "
+        "magenta, backward half-periods in green. A wrong phase displaces them against each other; where they agree "
+        "the sum is grey, which should be at the estimate, 0°. Arrow keys move by 0.01°."
+    )
+    return Section(heading, text, phase_slider=data)
+
+
+def axis_table(summary: Mapping[str, Any]) -> Table:
+    """Accuracy and motion of both axes."""
+    rows = [["standard deviation of the phase [°]", *(f"{summary[a]['phase_sd_deg']:.2g}" for a in AXES)]]
+    if all("phase_rmse_deg" in summary[a] for a in AXES):
+        rows.append(["true phase error, rms [°]", *(f"{summary[a]['phase_rmse_deg']:.2g}" for a in AXES)])
+    measured = (_format_picture_phase(summary[a]["picture_phase_error_deg"]) for a in AXES)
+    rows += [
+        ["bound p/m [°]", *(f"{summary[a]['bound_deg']:.3f}" for a in AXES)],
+        ["scan within the bound", *(f"{summary[a]['within_bound']:.1%}" for a in AXES)],
+        ["phase error measured in the picture", *measured],
+        ["drift of the phase over the scan [°]", *(f"{summary[a]['phase_drift_deg']:.3g}" for a in AXES)],
+        ["amplitude [mrad]", *(f"{1e3 * summary[a]['amplitude_rad']:.2f}" for a in AXES)],
+        ["frequency [Hz]", *(f"{summary[a]['frequency_hz']:.3f}" for a in AXES)],
+        ["sign of the angle", *(summary[a]["sign"] for a in AXES)],
+    ]
+    return Table(["", *AXES], rows)
+
+
+def phase_figures(results: Mapping[str, Reconstruction]) -> list[Figure]:
+    """Phase against time, a figure an axis."""
+    figures = []
+    first = next(iter(results.values()))
+    for axis in AXES:
+        motions = {name: result.motion.axes[axis] for name, result in results.items()}
+        errors = {name: result.evaluation[axis] for name, result in results.items() if axis in result.evaluation}
+        shown = [(e.time, *getattr(e, axis)) for e in first.phase_errors] if len(results) == 1 else []
+        uri = phase_figure(motions, first.phase_bound(axis), errors, shown, axis)
+        figures.append(
+            Figure(uri, f"axis {axis}: phase with ±2 standard deviations, and its error with the bound ±p/m")
+        )
+    return figures
+
+
+def blur_figure_of(parts: Mapping[str, Mapping[str, float]], p: float) -> Figure:
+    """Bars of blur by cause."""
+    return Figure(blur_figure(parts, p), "blur by cause; dashed: the tolerated p pixels")
+
+
+def _fill_text(summary: Mapping[str, Any]) -> str:
+    times = {fill: seconds for fill, seconds in summary["seconds_to_fill"].items() if seconds is not None}
+    reached = ", ".join(f"{float(fill):.0%} after {1e3 * seconds:.3g} ms" for fill, seconds in times.items())
+    return f"Pixels visited: {reached}." if reached else ""
+
+
+def _phase_text(result: Reconstruction) -> str:
+    bounds = ", ".join(f"{np.degrees(result.phase_bound(a)):.3f}° in {a}" for a in AXES)
+    return (
+        "A phase error δφ displaces a sample by up to m δφ pixels, where m is half the pixels across. A displacement "
+        f"of p = {result.p:g} pixel allows {bounds}."
+    )
+
+
+def _format_picture_phase(value: Mapping[str, Any]) -> str:
+    if value["value"] is None or value["sd"] is None:
+        return "not determined"
+    return format_uncertain(value["value"], value["sd"], "°")

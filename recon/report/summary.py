@@ -1,0 +1,148 @@
+"""The figures of a reconstruction for summary.json and the tables of the report."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from recon.evaluation import AxisEvaluation
+from recon.imaging import blur
+from recon.imaging.bidirectional_phase import PhaseError
+from recon.imaging.coverage import fill_against_time
+from recon.imaging.picture import fill_factor
+from recon.pipeline import AXES, Reconstruction
+from scanner.motion import AxisMotion
+
+FILL_FRACTIONS = (0.25, 0.5, 0.75, 0.9, 0.99)
+"""Fractions of visited pixels for which the time is stated."""
+
+MAX_FILL_SAMPLES = 1 << 22
+"""Samples from the start of the scan in which these times are searched: 0.8 s at 5 MS/s, longer than any frame."""
+
+
+def picture_phase_error(errors: list[PhaseError], axis: str) -> dict[str, Any]:
+    """Phase error that the picture shows [degrees]: of each time slice, and the mean of the slices that determine one.
+
+    Each has its standard error, which is infinite where the picture determines nothing.
+    """
+    estimates = [getattr(error, axis) for error in errors]
+    slices = [
+        {"time": error.time, "value": math.degrees(estimate.value), "sd": math.degrees(estimate.sd)}
+        for error, estimate in zip(errors, estimates, strict=True)
+    ]
+    determined = [estimate for estimate in estimates if np.isfinite(estimate.sd)]
+    if not determined:
+        return {"value": math.nan, "sd": math.inf, "slices": slices}
+    value, sd = (np.array(column) for column in zip(*determined, strict=True))
+    mean_sd = math.sqrt(float(np.sum(sd**2))) / sd.size
+    return {"value": math.degrees(value.mean()), "sd": math.degrees(mean_sd), "slices": slices}
+
+
+AXIS_QUANTITIES = (
+    "phase_sd_deg", "bound_deg", "within_bound", "sign", "readout_phase_deg", "phase_rmse_deg", "angle_rmse_rad",
+)  # fmt: skip
+"""Quantities of an axis that the summary also lists by quantity (CONTRACT, summary.json)."""
+
+
+def readout_phase_summary(result: Reconstruction, axis: str) -> dict[str, Any] | None:
+    """Phase error of the readout that was found and removed [degrees]; None where nothing determined it."""
+    found = result.readout_phase.get(axis)
+    if found is None:
+        return None
+    return {"value": math.degrees(found.value), "sd": math.degrees(found.sd), "from": "picture"}
+
+
+def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
+    """What the summary says of one axis."""
+    own, bound = result.motion.axes[axis], result.phase_bound(axis)
+    error = result.evaluation.get(axis)
+    summary: dict[str, Any] = {
+        "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(own.phase_sd**2)))),
+        "bound_deg": float(np.degrees(bound)),
+        "within_bound": blur.within_bound(bound, sd=own.phase_sd)
+        if error is None
+        else blur.within_bound(bound, error=error.phase),
+        "sign": own.sign,
+        "amplitude_rad": float(np.mean(own.amplitude)),
+        "frequency_hz": float(np.mean(own.frequency)),
+        "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
+        "picture_phase_error_deg": picture_phase_error(result.phase_errors, axis),
+        "readout_phase_deg": readout_phase_summary(result, axis),
+        "blur_px": blur_parts(result, own, axis, error),
+    }
+    if error is not None:
+        summary |= {
+            "phase_rmse_deg": float(np.degrees(error.phase_rmse)),
+            "phase_bias_deg": float(np.degrees(np.mean(error.phase))),
+            "amplitude_rmse": float(np.sqrt(np.mean(error.amplitude**2))),
+            "angle_rmse_rad": error.angle_rmse,
+            "mirrored": error.mirrored,
+        }
+    return summary
+
+
+def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEvaluation | None) -> dict[str, float]:
+    """Blur of one axis in pixels, by its causes (see ``recon.imaging.blur``)."""
+    grid = result.picture.grid
+    half = grid.half_angle_x if axis == "x" else grid.half_angle_y
+    phase = own.phase_sd if error is None else error.phase
+    amplitude = np.zeros(1) if error is None else error.amplitude - np.mean(error.amplitude)
+    spot = result.truth.spot_sd * result.pixels("x") if result.spot is None and result.truth else result.spot or 0.0
+    return blur.blur_by_cause(float(np.mean(own.amplitude)), half, result.pixels(axis), phase, amplitude, spot)
+
+
+def summarise(result: Reconstruction) -> dict[str, Any]:
+    """The summary: quantities by axis, and the same grouped by quantity as CONTRACT names them."""
+    axes = {axis: axis_summary(result, axis) for axis in AXES}
+    grouped = {
+        key: {axis: axes[axis][key] for axis in AXES}
+        for key in AXIS_QUANTITIES
+        if all(key in own for own in axes.values())
+    }
+    return {
+        "estimator": result.motion.estimator,
+        "name": result.name,
+        "axes": list(AXES),
+        **grouped,
+        **axes,
+        "fill": fill_factor(result.picture.coverage),
+        "seconds_to_fill": seconds_to_fill(result),
+        "samples": int(result.picture.coverage.sum()),
+        "outside": result.picture.outside,
+        "dropped": result.unlocated_samples,
+        "trouble": [asdict(each) for each in result.defects],
+        "affected": float(np.mean(result.affected)),
+        "seconds": result.seconds,
+        "recorded_seconds": result.duration,
+        "picture": _picture_score(result),
+        "notes": result.notes,
+        "info": dict(result.motion.info),
+    }
+
+
+def seconds_to_fill(result: Reconstruction) -> dict[str, float | None]:
+    """Frame time after which each of ``FILL_FRACTIONS`` was reached [s]; None where the scan was too short for it."""
+    x, y = (result.motion.axes[axis].angle for axis in AXES)
+    time, fill = fill_against_time(
+        x.read(0, MAX_FILL_SAMPLES), y.read(0, MAX_FILL_SAMPLES), x.sample_rate, result.picture.grid
+    )
+    at = np.searchsorted(fill, FILL_FRACTIONS)
+    return {
+        f"{wanted:g}": float(time[k]) if k < time.size else None for wanted, k in zip(FILL_FRACTIONS, at, strict=True)
+    }
+
+
+def _picture_score(result: Reconstruction) -> dict[str, Any] | None:
+    """Rms error of the picture against the noiseless scene of a simulation, and its magnification; None without one."""
+    if result.truth is None or result.truth.scene is None:
+        return None
+    return asdict(blur.compare_with_scene(result.picture, result.truth.scene, *is_mirrored(result)))
+
+
+def is_mirrored(result: Reconstruction) -> tuple[bool, bool]:
+    """Whether the picture shows the scene mirrored in x, in y, as far as a truth tells."""
+    x, y = (axis in result.evaluation and result.evaluation[axis].mirrored for axis in AXES)
+    return x, y

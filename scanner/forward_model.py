@@ -1,0 +1,358 @@
+"""The forward model: from a drive voltage to the recorded channels, stage by stage, with any set of terms.
+
+Simulation, prediction and diagnosis use this one chain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from scanner.arrays import Array
+from scanner.device import Amdm, Axis, Position, Readout
+from scanner.errors import BadInput, DeviceInvalid
+from scanner.integrator.nodes import nodes_to_samples
+from scanner.laws import amdm_voltage, capacitance, capacitance_slope, position_voltage, transimpedance_voltage
+from scanner.lowpass import apply_lowpass
+from scanner.terms import STAGES, SignalContext, Term, catalogue
+from scanner.terms.measured_law import EFFECT, measured_law
+
+_EMPTY = np.empty(0)
+
+COUPLING_ITERATIONS = 2
+"""Repeated simulations of coupled axes. Each reduces the error by the square of the relative coupling, which is 1e-4
+for a coupling of 1 %."""
+
+
+@dataclass(frozen=True)
+class ActiveTerm:
+    """A term with the values of its parameters, acting on one axis.
+
+    Attributes:
+        term: the physics.
+        values: of its parameters, in the term's order [SI].
+        channel: which of ``term.channels`` its output law acts on.
+        hidden_state: its hidden states at the start.
+    """
+
+    term: Term
+    values: tuple[float, ...]
+    channel: str = "sense"
+    hidden_state: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class DriveInput:
+    """The voltage that drives one axis.
+
+    Attributes:
+        voltage: at the start, middle and end of every step, shape (n, 3) [V].
+        step: length of a step [s].
+        t0: start on the recording's clock, which is the time origin of all drifts [s].
+    """
+
+    voltage: Array
+    step: float
+    t0: float = 0.0
+
+    @property
+    def time(self) -> Array:
+        """Times of the n + 1 samples, shape (n + 1,) [s]."""
+        return self.t0 + self.step * np.arange(len(self.voltage) + 1, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class AxisTrajectory:
+    """The motion of one axis and the drive that caused it.
+
+    Attributes:
+        axis: with the constants that its terms change.
+        active_terms: its terms.
+        drive: as recorded, before the drive terms.
+        angle, rate: shape (n + 1,) [rad, rad/s].
+        voltage: on the actuator, after the drive terms, shape (n + 1,) [V].
+    """
+
+    axis: Axis
+    active_terms: tuple[ActiveTerm, ...]
+    drive: DriveInput
+    angle: Array
+    rate: Array
+    voltage: Array
+
+    def from_step(self, first: int) -> AxisTrajectory:
+        """Return the trajectory from step ``first`` on."""
+        drive = replace(self.drive, voltage=self.drive.voltage[first:], t0=self.drive.t0 + first * self.drive.step)
+        return replace(
+            self, drive=drive, angle=self.angle[first:], rate=self.rate[first:], voltage=self.voltage[first:]
+        )
+
+    def joined_with(self, later: AxisTrajectory) -> AxisTrajectory:
+        """Return this trajectory and ``later``, which starts where this one ends, as one."""
+        return replace(
+            self,
+            drive=replace(self.drive, voltage=np.concatenate([self.drive.voltage, later.drive.voltage])),
+            angle=np.concatenate([self.angle[:-1], later.angle]),
+            rate=np.concatenate([self.rate[:-1], later.rate]),
+            voltage=np.concatenate([self.voltage[:-1], later.voltage]),
+        )
+
+
+def stated_terms(axis: Axis) -> tuple[ActiveTerm, ...]:
+    """Return the terms that a device file states for an axis under ``[x.terms.<effect>]``.
+
+    Raises:
+        BadInput: the catalogue has no such effect, or the file lacks one of its parameters.
+    """
+    known = catalogue()
+    return tuple(_stated_term(axis, effect, dict(values), known) for effect, values in axis.terms.items())
+
+
+def _stated_term(axis: Axis, effect: str, values: dict[str, Any], known: dict[str, Term]) -> ActiveTerm:
+    key = f"{axis.name}.terms.{effect}"
+    if effect == EFFECT:
+        try:
+            law, packed = measured_law(values)
+        except DeviceInvalid as error:
+            raise DeviceInvalid(error.what, file=axis.source, channel=key, hint=error.hint) from None
+        return ActiveTerm(law, packed, law.channels[0])
+    if effect not in known:
+        near = get_close_matches(effect, known) or known
+        hint = f"known effects: {', '.join(near)}; a term file of your own is given with --terms"
+        raise BadInput("is not an effect of the catalogue", file=axis.source, channel=key, hint=hint)
+    term = known[effect]
+    if missing := [p.name for p in term.parameters if p.name not in values]:
+        hint = f"{effect} needs {', '.join(p.name for p in term.parameters)}"
+        raise BadInput(f"lacks {missing[0]}", file=axis.source, channel=key, hint=hint)
+    variant = int(values.get("variant", 0))
+    if not 0 <= variant < len(term.channels):
+        raise BadInput(f"variant {variant} is unknown", file=axis.source, channel=key, hint="count from 0")
+    return ActiveTerm(term, tuple(values[p.name] for p in term.parameters), term.channels[variant])
+
+
+def in_stage_order(terms: Iterable[ActiveTerm]) -> list[ActiveTerm]:
+    """Return terms in the order of their stages, which is the order in which a signal passes them."""
+    return sorted(terms, key=lambda active: STAGES.index(active.term.stage))
+
+
+def simulate_axis(
+    axis: Axis,
+    terms: Sequence[ActiveTerm],
+    drive: DriveInput,
+    start: tuple[float, float],
+    other_angle: Array | None = None,
+) -> AxisTrajectory:
+    """Return the motion of one axis under its drive.
+
+    Args:
+        axis: nominal values, with the readout that senses it.
+        terms: physics beyond the nominal laws.
+        drive: the recorded drive.
+        start: angle [rad] and rate [rad/s] at the first sample.
+        other_angle: angle of the other axis, at the nodes of every step, shape (n, 3) [rad].
+    """
+    return simulate_batch([(axis, terms, start)], drive, other_angle)[0]
+
+
+def simulate_batch(
+    cases: Sequence[tuple[Axis, Sequence[ActiveTerm], tuple[float, float]]],
+    drive: DriveInput,
+    other_angle: Array | None = None,
+) -> list[AxisTrajectory]:
+    """Return :func:`simulate_axis` of several (axis, terms, start) in one call of the integrator.
+
+    The cases have the same terms and differ in numbers only. The values of their drive terms do not differ. Up to
+    ``scanner.integrator.runge_kutta.LANES`` cases take little longer than one.
+    """
+    # Imported here because loading the compiled kernels takes half a second.
+    from scanner.integrator.trajectories import CapacitanceTerm, TorqueTerm, TrajectorySpec, integrate_batch
+
+    voltage, specs = None, []
+    for nominal, terms, start in cases:
+        axis = with_constants(nominal, terms)
+        if voltage is None:
+            voltage = effective_drive(axis, terms, drive)
+        torques = [
+            TorqueTerm(
+                active.term.torque, active.values, active.hidden_state if active.term.hidden_state_scales else None
+            )
+            for active in terms
+            if active.term.torque is not None
+        ]
+        capacitances = [
+            CapacitanceTerm(active.term.capacitance, active.values)
+            for active in terms
+            if active.term.capacitance is not None
+        ]
+        specs.append(TrajectorySpec(axis, start, torques, capacitances))
+    assert voltage is not None
+    motions = integrate_batch(specs, voltage, drive.step, drive.t0, other_angle)
+    at_samples = nodes_to_samples(voltage)
+    return [
+        AxisTrajectory(spec.axis, tuple(terms), drive, angle, rate, at_samples)
+        for spec, (_, terms, _), (angle, rate) in zip(specs, cases, motions, strict=True)
+    ]
+
+
+def with_constants(axis: Axis, terms: Iterable[ActiveTerm]) -> Axis:
+    """Return the axis with the constants that its terms change."""
+    for active in terms:
+        if active.term.constants is not None:
+            axis = active.term.constants(axis, active.values)
+    return axis
+
+
+def effective_drive(axis: Axis, terms: Sequence[ActiveTerm], drive: DriveInput) -> Array:
+    """Return the voltage on the actuator, after the drive terms, at the nodes of every step, shape (n, 3) [V]."""
+    recorded = nodes_to_samples(drive.voltage)
+    context = SignalContext(drive.time, drive.step, axis.readout, _EMPTY, recorded, _EMPTY, _EMPTY)
+    voltage = drive.voltage
+    for active in in_stage_order(terms):
+        if active.term.voltage is not None:
+            voltage = active.term.voltage(voltage, active.values, context)
+    return voltage
+
+
+AxisSimulator = Callable[[str, DriveInput, tuple[float, float], "Array | None"], AxisTrajectory]
+"""(axis name, drive, start, the other axis's angle at the nodes) -> the axis's motion."""
+
+
+def simulate_coupled(
+    drives: Mapping[str, DriveInput],
+    starts: Mapping[str, tuple[float, float]],
+    coupled: bool,
+    simulate: AxisSimulator,
+) -> dict[str, AxisTrajectory]:
+    """Return the motion of every axis. Coupled axes are simulated alternately until the coupling has converged.
+
+    Args:
+        drives: by axis name.
+        starts: angle [rad] and rate [rad/s] at the first sample, by axis name.
+        coupled: whether a term depends on the angle of the other axis.
+        simulate: simulates one axis.
+    """
+    motions = {name: simulate(name, drives[name], starts[name], None) for name in drives}
+    for _ in range(COUPLING_ITERATIONS if coupled and len(motions) > 1 else 0):
+        previous = dict(motions)
+        for name in drives:
+            (other,) = (motion for other_name, motion in previous.items() if other_name != name)
+            motions[name] = simulate(name, drives[name], starts[name], _angle_at_nodes(other))
+    return motions
+
+
+def _angle_at_nodes(motion: AxisTrajectory) -> Array:
+    """Angle at the nodes of every step, by cubic Hermite interpolation, shape (n, 3) [rad]."""
+    a, b = motion.angle[:-1], motion.angle[1:]
+    middle = 0.5 * (a + b) + motion.drive.step / 8.0 * (motion.rate[:-1] - motion.rate[1:])
+    return np.stack([a, middle, b], axis=1)
+
+
+def sense_signal(readout: Readout, motions: Sequence[AxisTrajectory], background: Array | float = 0.0) -> Array:
+    """Return the sense channel, shape (n + 1,) [V].
+
+    Args:
+        readout: nominal. A term that changes its constants or its signal may belong to any of the axes.
+        motions: of the axis that the readout senses, or of all axes whose combs share its electrode.
+        background: as in :func:`apply_channel_terms`.
+    """
+    readout = effective_readout(readout, motions)
+    match readout:
+        case Amdm():
+            signal = np.sum([_capacitance(motion) for motion in motions], axis=0)
+            for motion in motions:
+                for active in motion.active_terms:
+                    if active.term.pre_demodulation is not None:
+                        context = _signal_context(motion, readout)
+                        signal = active.term.pre_demodulation(signal, active.values, context)
+            for corner in readout.lpf_hz:
+                signal = apply_lowpass(signal, corner, motions[0].drive.step)
+            signal = amdm_voltage(signal, readout.a_cir, readout.b_cir)
+        case Position():
+            signal = position_voltage(motions[0].angle, readout.gain, readout.offset)
+        case _:
+            # The bias of the current is the voltage on the comb. Without a recorded one that is the nominal bias.
+            currents = [
+                transimpedance_voltage(_capacitance_slope(motion), motion.rate, readout.R_s, motion.voltage)
+                for motion in motions
+            ]
+            signal = np.sum(currents, axis=0)
+    return apply_channel_terms("sense", signal, motions, readout, background)
+
+
+def effective_readout(readout: Readout, motions: Sequence[AxisTrajectory]) -> Readout:
+    """Return the readout with the constants that the terms of all its axes change."""
+    for motion in motions:
+        terms = [active for active in motion.active_terms if active.term.stage == "readout"]
+        readout = with_constants(replace(motion.axis, readout=readout), terms).require_readout()
+    return readout
+
+
+def angle_signal(motion: AxisTrajectory) -> Array:
+    """Return the reference angle channel, shape (n + 1,) [rad]."""
+    return apply_channel_terms("angle", motion.angle, [motion], motion.axis.readout)
+
+
+def apply_channel_terms(
+    channel: str,
+    signal: Array,
+    motions: Sequence[AxisTrajectory],
+    readout: Readout | None,
+    background: Array | float = 0.0,
+) -> Array:
+    """Return ``signal`` after the terms that act on ``channel``, in the order of their stages.
+
+    Args:
+        channel: ``"sense"`` or ``"angle"``.
+        signal: shape (n + 1,), in the unit of the channel.
+        motions: of all axes whose terms may act on the channel.
+        readout: of the channel.
+        background: what adds to the channel independently of the motion (hum). Terms with ``after_noise``, such as the
+            saturation of the converter, act on the sum.
+    """
+    pairs = [
+        (active, motion)
+        for motion in motions
+        for active in motion.active_terms
+        if active.channel.partition(":")[0] == channel
+    ]
+    pairs.sort(key=lambda pair: STAGES.index(pair[0].term.stage))
+    for after_noise in (False, True):
+        for active, motion in pairs:
+            if active.term.after_noise is after_noise:
+                variant = active.channel.partition(":")[2]
+                signal = active.term.apply(signal, active.values, _signal_context(motion, readout, variant))
+        if not after_noise:
+            signal = signal + background
+    return signal
+
+
+def _capacitance(motion: AxisTrajectory) -> Array:
+    comb = motion.axis.require_capacitance()
+    return capacitance(motion.angle, comb.C0, comb.Cb, comb.theta0, comb.theta_th) + _term_capacitance(motion, 0)
+
+
+def _capacitance_slope(motion: AxisTrajectory) -> Array:
+    comb = motion.axis.require_capacitance()
+    return capacitance_slope(motion.angle, comb.C0, comb.theta0, comb.theta_th) + _term_capacitance(motion, 1)
+
+
+def _term_capacitance(motion: AxisTrajectory, derivative: int) -> Array | float:
+    """Capacitance [F] (``derivative`` 0) or slope [F/rad] (1) that the capacitance terms add, shape (n + 1,)."""
+    from scanner.integrator.trajectories import CapacitanceTerm
+
+    terms = [
+        CapacitanceTerm(active.term.capacitance, active.values)
+        for active in motion.active_terms
+        if active.term.capacitance is not None
+    ]
+    return sum((term.evaluate(motion.angle, motion.axis)[derivative] for term in terms), start=0.0)
+
+
+def _signal_context(motion: AxisTrajectory, readout: Readout | None, variant: str = "") -> SignalContext:
+    drive = motion.drive
+    recorded = nodes_to_samples(drive.voltage)
+    return SignalContext(drive.time, drive.step, readout, motion.voltage, recorded, motion.angle, motion.rate, variant)

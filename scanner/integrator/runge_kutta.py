@@ -1,0 +1,252 @@
+"""The compiled integrator: Runge-Kutta of order 4 for up to eight motions in the lanes of the processor's vectors.
+
+Within one motion the stages of a step depend on each other, so the processor waits for most of the time. Motions that
+have the same laws and differ in numbers only, such as those of a Jacobian by differences, are computed in parallel
+lanes: eight take little longer than one. A law is written for one motion. It is compiled once more into a function that
+evaluates it in all lanes, because a call takes longer than most laws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from math import factorial
+from typing import Any
+
+import numpy as np
+from numba import carray, njit, types
+from numba.extending import intrinsic, register_jitable
+
+from scanner.integrator.abi import MAX_TERMS_PER_STAGE, TORQUE_LAW, Nominal
+from scanner.integrator.function_addresses import FunctionAddress
+from scanner.laws import angular_acceleration, electrostatic_torque, gaussian_slope
+
+LANES = 8
+"""Motions that are integrated together: two AVX registers or one AVX-512 register of doubles."""
+
+BYTES_PER_FLOAT = 8
+
+_f8, _i8 = types.float64, types.int64
+
+_LANE_LAW = types.void(_i8, _f8, _f8, _f8, *[_i8] * 8)
+"""(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used): one law in all used lanes.
+
+It adds its result to the row ``TERM_TORQUE`` or ``TERM_SLOPE`` of the state. state, p and nominal are addresses, which
+are cheaper to pass than arrays: of the state (``ROWS``, ``LANES``), of the first lane's parameters in a table with
+``p_stride`` places for each term, and of the nominal values. The rows say which angle, rate and hidden states of the
+state the law is evaluated at."""
+
+_LANE_LAWS = types.UniTuple(types.FunctionType(_LANE_LAW), MAX_TERMS_PER_STAGE)
+
+_LAWS = types.Tuple(
+    [_LANE_LAWS, _f8[:, :, ::1], _i8, _LANE_LAWS, _f8[:, :, ::1], _i8, _f8[:, ::1], _f8, _i8]
+)  # fmt: skip
+"""Torque laws, their parameters by lane and term, their number; the same of the capacitance laws; nominal values by
+lane; 1.0 for an electrostatic drive and 0.0 for another; number of hidden states."""
+
+_COMPILER_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+
+_MIN_EXPONENT = -700.0
+"""Exponents below are taken as this: exp(-700) = 1e-304 is zero beside any capacitance and still a normal number."""
+
+_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+"""ln 2 in two parts. The last bits of the first are zero, so its product with an exponent is exact (Cody & Waite)."""
+
+_ROUNDER = 1.5 * 2.0**52
+"""Added to a number, it rounds it to an integer, which then stands in the lowest bits of the sum."""
+
+_ROUNDER_BITS = int(np.float64(_ROUNDER).view(np.int64))
+
+C2, C3, C4, C5, C6, C7, C8, C9, C10, C11, C12, C13 = (1.0 / factorial(n) for n in range(2, 14))
+# Taylor coefficients of exp; the first one left out is below 1e-17 for |r| <= ln(2) / 2.
+
+(THETA, OMEGA, TERM_TORQUE, TERM_SLOPE, ALPHA1, ALPHA2, ALPHA3, OMEGA2, OMEGA3, OMEGA4, STAGE_THETA,
+ J, B, K, C0, THETA0, THETA_TH, TORQUE_PER_VOLT) = range(18)  # fmt: skip
+Z, STAGE_Z, DZ1, DZ2, DZ3, DZ4 = (18 + 2 * MAX_TERMS_PER_STAGE * i for i in range(6))
+ROWS = 18 + 12 * MAX_TERMS_PER_STAGE
+"""Rows of the state, shape (ROWS, LANES).
+
+Angle and rate at the start of the step; torque and slope of the capacitance that the terms add; accelerations and rates
+of the four stages of the step, and the angle of the present stage; nominal values; then, two for each torque law, the
+hidden states at the start of the step and at the present stage, and their derivatives at the four stages."""
+
+
+@njit(forceinline=True, **_COMPILER_OPTIONS)
+def negative_exponential(x):  # type: ignore[no-untyped-def]
+    """Return exp(x) for x <= 0 with a relative error of 3e-16, and 1e-304 below x = -700.
+
+    It calls no library function, so the compiler evaluates it in all lanes at once.
+    """
+    x = x if x > _MIN_EXPONENT else _MIN_EXPONENT
+    rounded = x * (1.0 / (_LN2_HIGH + _LN2_LOW)) + _ROUNDER
+    k = rounded - _ROUNDER
+    r = (x - k * _LN2_HIGH) - k * _LN2_LOW
+    p = C6 + r * (C7 + r * (C8 + r * (C9 + r * (C10 + r * (C11 + r * (C12 + r * C13))))))
+    p = 1.0 + r * (1.0 + r * (C2 + r * (C3 + r * (C4 + r * (C5 + r * p)))))
+    power = np.int64((np.float64(rounded).view(np.int64) - _ROUNDER_BITS + 1023) << 52)  # the bits of 2^k
+    return p * power.view(np.float64)
+
+
+@intrinsic
+def _pointer(context, address):  # type: ignore[no-untyped-def]
+    """A pointer to doubles from an address."""
+
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(_f8)(_i8), code
+
+
+@njit(inline="always")
+def _data_address(array):  # type: ignore[no-untyped-def]
+    return np.int64(array.ctypes.data)
+
+
+@njit(_LANE_LAW, cache=True)
+def no_law(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used):  # type: ignore[no-untyped-def]
+    """The law in the place of a term that is not there. The kernel never calls it."""
+
+
+@cache
+def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
+    """Return the address of a function that evaluates ``law``, which has a signature of ``abi``, in all lanes.
+
+    numba caches the function on disk under the values in its closure: the name of the law, and ``law_content``, which
+    changes whenever the law's code does.
+    """
+    inlined, code = register_jitable(law.py_func), law.py_func.__code__  # type: ignore[attr-defined]
+    law_content = repr((code.co_code, code.co_consts, code.co_names))
+
+    def torque(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used):  # type: ignore[no-untyped-def]
+        law_content  # noqa: B018
+        s, own = carray(_pointer(state), (ROWS, LANES)), carray(_pointer(nominal), (LANES, 7))
+        for lane in range(used):
+            values = carray(_pointer(p + lane * MAX_TERMS_PER_STAGE * p_stride * BYTES_PER_FLOAT), (p_stride,))
+            n = Nominal(
+                own[lane, 0], own[lane, 1], own[lane, 2], own[lane, 3], own[lane, 4], own[lane, 5], own[lane, 6]
+            )
+            added, s[dz_row, lane], s[dz_row + 1, lane] = inlined(
+                t, s[theta_row, lane], s[omega_row, lane], other, volt, s[z_row, lane], s[z_row + 1, lane], values, n
+            )
+            s[TERM_TORQUE, lane] += added
+
+    def slope(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used):  # type: ignore[no-untyped-def]
+        law_content  # noqa: B018
+        s, own = carray(_pointer(state), (ROWS, LANES)), carray(_pointer(nominal), (LANES, 7))
+        for lane in range(used):
+            values = carray(_pointer(p + lane * MAX_TERMS_PER_STAGE * p_stride * BYTES_PER_FLOAT), (p_stride,))
+            n = Nominal(
+                own[lane, 0], own[lane, 1], own[lane, 2], own[lane, 3], own[lane, 4], own[lane, 5], own[lane, 6]
+            )
+            s[TERM_SLOPE, lane] += inlined(s[theta_row, lane], values, n)[1]
+
+    lane_law = torque if law.nopython_signatures[0] == TORQUE_LAW else slope  # type: ignore[attr-defined]
+    return FunctionAddress(njit(_LANE_LAW, cache=True, nogil=True, **_COMPILER_OPTIONS)(lane_law))
+
+
+@njit(forceinline=True, **_COMPILER_OPTIONS)
+def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, laws, s, used):  # type: ignore[no-untyped-def]
+    """Set ``TERM_TORQUE``, ``TERM_SLOPE`` and the derivatives ``dz_row`` of the hidden states, in all used lanes."""
+    # Unpacked, because an index into the tuple would copy all of its functions at every call.
+    (first, second, third, fourth), n, capacitance_laws = laws[0], laws[2], laws[3]
+    state, nominal = _data_address(s), _data_address(laws[6])
+    s[TERM_TORQUE], s[TERM_SLOPE] = 0.0, 0.0
+    p, stride = _data_address(laws[1]), laws[1].shape[2]
+    term = stride * BYTES_PER_FLOAT
+    if n > 0:
+        first(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, stride, nominal, used)
+    if n > 1:
+        second(state, t, other, volt, theta_row, omega_row, z_row + 2, dz_row + 2, p + term, stride, nominal, used)
+    if n > 2:
+        third(state, t, other, volt, theta_row, omega_row, z_row + 4, dz_row + 4, p + 2 * term, stride, nominal, used)
+    if n > 3:
+        fourth(state, t, other, volt, theta_row, omega_row, z_row + 6, dz_row + 6, p + 3 * term, stride, nominal, used)
+    p, stride = _data_address(laws[4]), laws[4].shape[2]
+    term = stride * BYTES_PER_FLOAT
+    for i in range(laws[5]):
+        capacitance_laws[i](
+            state, t, other, volt, theta_row, omega_row, z_row, dz_row, p + i * term, stride, nominal, used
+        )
+
+
+@njit(forceinline=True, **_COMPILER_OPTIONS)
+def _acceleration(s, lane, theta_row, omega_row, volt, electrostatic_volt):  # type: ignore[no-untyped-def]
+    """Angular acceleration in one lane [rad/s2], from the nominal laws and what the terms add."""
+    u = (s[theta_row, lane] - s[THETA_TH, lane]) / s[THETA0, lane]
+    slope = gaussian_slope(u, negative_exponential(-u * u), s[C0, lane], s[THETA0, lane]) + s[TERM_SLOPE, lane]
+    torque = s[TORQUE_PER_VOLT, lane] * volt + electrostatic_torque(slope, electrostatic_volt) + s[TERM_TORQUE, lane]
+    return angular_acceleration(s[theta_row, lane], s[omega_row, lane], torque, s[J, lane], s[B, lane], s[K, lane])
+
+
+@njit(forceinline=True, **_COMPILER_OPTIONS)
+def _set_stage_z(dz_row, h, s, hidden_states, width):  # type: ignore[no-untyped-def]
+    """Set the hidden states at the next stage, ``h`` after the start of the step, from their derivatives."""
+    for i in range(hidden_states):
+        for lane in range(width):
+            s[STAGE_Z + i, lane] = s[Z + i, lane] + h * s[dz_row + i, lane]
+
+
+@njit(
+    types.void(_f8[:, ::1], _f8[:, ::1], _f8[:, ::1], _f8, _f8, _LAWS, _i8, _f8[:, ::1], _f8[:, ::1]),
+    cache=True, nogil=True, **_COMPILER_OPTIONS,
+)  # fmt: skip
+def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # type: ignore[no-untyped-def]
+    """Integrate all motions through all steps and store angle and rate, shape (motions, n + 1).
+
+    ``start``: angle, rate and hidden states, shape (motions, 2 + 2 MAX_TERMS_PER_STAGE). ``voltage``, ``other``: at the
+    nodes of every step, shape (n, 3). ``width``: lanes computed; those beyond the number of motions fill a vector.
+    """
+    half, used, any_term, hidden_states = 0.5 * step, start.shape[0], laws[2] + laws[5] > 0, laws[8]
+    s = np.zeros((ROWS, LANES))
+    for lane in range(width):
+        motion = min(lane, used - 1)
+        s[THETA, lane], s[OMEGA, lane] = start[motion, 0], start[motion, 1]
+        s[Z : Z + 2 * MAX_TERMS_PER_STAGE, lane] = start[motion, 2:]
+        s[J : TORQUE_PER_VOLT + 1, lane] = laws[6][motion]
+    s[STAGE_Z : STAGE_Z + 2 * MAX_TERMS_PER_STAGE] = s[Z : Z + 2 * MAX_TERMS_PER_STAGE]
+    angle[:, 0], rate[:, 0] = start[:, 0], start[:, 1]
+    for i in range(voltage.shape[0]):
+        v0, v1, v2 = voltage[i, 0], voltage[i, 1], voltage[i, 2]
+        e0, e1, e2 = laws[7] * v0, laws[7] * v1, laws[7] * v2
+        o0, o1, o2 = other[i, 0], other[i, 1], other[i, 2]
+        if any_term:
+            _evaluate_terms(t, THETA, OMEGA, Z, DZ1, o0, v0, laws, s, used)
+            _set_stage_z(DZ1, half, s, hidden_states, width)
+        for lane in range(width):
+            s[ALPHA1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, e0)
+            s[OMEGA2, lane] = s[OMEGA, lane] + half * s[ALPHA1, lane]
+            s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA, lane]
+        if any_term:
+            _evaluate_terms(t + half, STAGE_THETA, OMEGA2, STAGE_Z, DZ2, o1, v1, laws, s, used)
+            _set_stage_z(DZ2, half, s, hidden_states, width)
+        for lane in range(width):
+            s[ALPHA2, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA2, v1, e1)
+            s[OMEGA3, lane] = s[OMEGA, lane] + half * s[ALPHA2, lane]
+            s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA2, lane]
+        if any_term:
+            _evaluate_terms(t + half, STAGE_THETA, OMEGA3, STAGE_Z, DZ3, o1, v1, laws, s, used)
+            _set_stage_z(DZ3, step, s, hidden_states, width)
+        for lane in range(width):
+            s[ALPHA3, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA3, v1, e1)
+            s[OMEGA4, lane] = s[OMEGA, lane] + step * s[ALPHA3, lane]
+            s[STAGE_THETA, lane] = s[THETA, lane] + step * s[OMEGA3, lane]
+        if any_term:
+            _evaluate_terms(t + step, STAGE_THETA, OMEGA4, STAGE_Z, DZ4, o2, v2, laws, s, used)
+            for k in range(hidden_states):
+                for lane in range(width):
+                    rates = s[DZ1 + k, lane] + 2.0 * s[DZ2 + k, lane] + 2.0 * s[DZ3 + k, lane] + s[DZ4 + k, lane]
+                    s[Z + k, lane] += step / 6.0 * rates
+        for lane in range(width):
+            alpha4 = _acceleration(s, lane, STAGE_THETA, OMEGA4, v2, e2)
+            omegas = s[OMEGA, lane] + 2.0 * s[OMEGA2, lane] + 2.0 * s[OMEGA3, lane] + s[OMEGA4, lane]
+            alphas = s[ALPHA1, lane] + 2.0 * s[ALPHA2, lane] + 2.0 * s[ALPHA3, lane] + alpha4
+            s[THETA, lane] += step / 6.0 * omegas
+            s[OMEGA, lane] += step / 6.0 * alphas
+        for lane in range(used):
+            angle[lane, i + 1], rate[lane, i + 1] = s[THETA, lane], s[OMEGA, lane]
+        t += step
+
+
+(run_kernel,) = (compiled.entry_point for compiled in _integrate.overloads.values())  # type: ignore[attr-defined]
+# The compiled kernel without numba's dispatcher. The dispatcher would determine the types of all laws at every call,
+# which takes as long as a thousand steps and blocks other threads. All arguments must have exactly the types above.

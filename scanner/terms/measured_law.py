@@ -1,0 +1,133 @@
+"""A law without a name, as a diagnosis measured it: a polynomial of the stage's variables with the range it holds in.
+
+A device file states it under ``[x.terms.measured-law]``:
+
+    stage = "mechanics"                  # adds to the torque of the spring and damper [N m]
+    variables = ["angle", "rate"]        # [rad, rad/s]
+    centre = [0.0, 0.0]                  # the polynomial's origin
+    lower = [-0.2, -3000.0]              # the range in which the law was measured
+    upper = [0.2, 3000.0]
+    powers = [[2, 0], [3, 0]]            # of (angle - centre) and (rate - centre), one pair a coefficient
+    coefficients = [1e-9, 2e-9]          # SI units: N m / (rad^i (rad/s)^j)
+    coefficients_sd = [1e-11, 3e-11]     # standard deviations; no law uses them
+
+Other stages have one variable. ``readout`` adds to the signal [V] a law of the signal [V], ``drive`` adds to the
+voltage a law of the voltage [V], ``optics`` adds to the reference angle a law of the angle [rad]. Beyond its range a
+law continues with the slope at the edge. It is not part of the catalogue that a diagnosis searches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from scanner.arrays import Array
+from scanner.errors import DeviceInvalid
+from scanner.integrator.abi import TORQUE_LAW
+from scanner.terms.term import Parameter, SignalContext, Term
+
+EFFECT = "measured-law"
+VARIABLES = {
+    "mechanics": ("angle", "rate"),
+    "readout": ("signal",),
+    "drive": ("voltage",),
+    "optics": ("angle",),
+}
+"""Variables of a law by its stage."""
+
+_HEAD = 7
+"""Numbers before the coefficients: how many there are, centres, lower and upper ends of two variables."""
+
+
+@njit(cache=True)
+def polynomial(p, first, second):  # type: ignore[no-untyped-def]
+    """Value of a packed law at two variables: a polynomial within its range, straight beyond it."""
+    a, b = min(max(first, p[3]), p[5]), min(max(second, p[4]), p[6])
+    x, y = a - p[1], b - p[2]
+    value, slope_a, slope_b = 0.0, 0.0, 0.0
+    for n in range(int(p[0])):
+        i, j, c = int(p[7 + 3 * n]), int(p[8 + 3 * n]), p[9 + 3 * n]
+        value += c * x**i * y**j
+        if i > 0:
+            slope_a += c * i * x ** (i - 1) * y**j
+        if j > 0:
+            slope_b += c * j * x**i * y ** (j - 1)
+    return value + slope_a * (first - a) + slope_b * (second - b)
+
+
+@njit(TORQUE_LAW, cache=True)
+def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
+    return -polynomial(p, theta, omega), 0.0, 0.0
+
+
+@njit(cache=True)
+def _along(p, values):  # type: ignore[no-untyped-def]
+    out = np.empty_like(values)
+    for i in range(values.size):
+        out[i] = polynomial(p, values[i], p[2])
+    return out
+
+
+def added(values: Array, p: Sequence[float]) -> Array:
+    """What a law of one variable adds at ``values``, of their shape."""
+    return np.asarray(_along(np.asarray(p, float), np.ascontiguousarray(values, float).ravel()).reshape(values.shape))
+
+
+def _output(signal: Array, p: Sequence[float], view: SignalContext) -> Array:
+    return signal + added(signal, p)
+
+
+def _voltage(voltage: Array, p: Sequence[float], view: SignalContext) -> Array:
+    return voltage + added(voltage, p)
+
+
+_LAWS: dict[str, dict[str, Any]] = {
+    "mechanics": {"torque": torque},
+    "readout": {"output": _output},
+    "drive": {"voltage": _voltage},
+    "optics": {"output": _output, "channels": ("angle",)},
+}
+
+
+def measured_law(table: Mapping[str, Any]) -> tuple[Term, tuple[float, ...]]:
+    """Return the term that a table of a device file states, and its packed values.
+
+    Raises:
+        DeviceInvalid: a stage that has no measured law, a key missing, or lists of different lengths.
+    """
+    stage = table.get("stage")
+    if stage not in VARIABLES:
+        hint = f"stages with a measured law: {', '.join(VARIABLES)}"
+        raise DeviceInvalid(f"stage {stage!r} is unknown", channel=EFFECT, hint=hint)
+    needed = ("centre", "lower", "upper", "powers", "coefficients")
+    if missing := [key for key in needed if key not in table]:
+        raise DeviceInvalid(f"lacks {missing[0]}", channel=EFFECT, hint=f"it needs {', '.join(needed)}")
+    count, width = len(table["coefficients"]), len(VARIABLES[stage])
+    ends = [list(map(float, table[key])) for key in ("centre", "lower", "upper")]
+    powers: list[list[int]] = [list(map(int, each)) for each in table["powers"]]
+    if len(powers) != count or {len(each) for each in powers} | {len(each) for each in ends} != {width}:
+        hint = (
+            f"one power of {' and '.join(VARIABLES[stage])} a coefficient, one centre, lower and upper end a variable"
+        )
+        raise DeviceInvalid("has lists of the wrong length", channel=EFFECT, hint=hint)
+    centre, lower, upper = ([*each, 0.0][:2] for each in ends)
+    packed = [float(count), *centre, *lower, *upper]
+    for each, coefficient in zip(powers, table["coefficients"], strict=True):
+        packed += [*map(float, [*each, 0][:2]), float(coefficient)]
+    names = [Parameter(f"p{i}", "SI", lambda scales: 0.0) for i in range(len(packed))]
+    return Term(EFFECT, stage, "law as measured, no name", tuple(names), "a diagnosis", **_LAWS[stage]), tuple(packed)
+
+
+def beyond(table: Mapping[str, Any], values: Sequence[Array]) -> float:
+    """Fraction of samples that lie beyond a law's range.
+
+    Args:
+        values: of each of its variables, shape (n,) each.
+    """
+    outside = np.zeros(np.shape(values[0]), bool)
+    for lower, upper, each in zip(table["lower"], table["upper"], values, strict=True):
+        outside |= (np.asarray(each) < lower) | (np.asarray(each) > upper)
+    return float(outside.mean())

@@ -1,0 +1,332 @@
+"""The diagnosis of short recordings simulated with scipy's integrator, and the commands that use it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.diagnosis.data import decimate, is_steady, prepare_run, resample_drive, strongest_line
+from estimation.diagnosis.diagnose import diagnose
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.exchange import fit_exchanges
+from estimation.diagnosis.fit import Comparison, fit_model
+from estimation.diagnosis.initial import (
+    estimate_whiteners,
+    fit_initial_state,
+    fit_progressively,
+    flat_whiteners,
+    window_schedule,
+)
+from estimation.diagnosis.interference import strongest_foreign_line
+from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.noise import make_whitener, noise_psd
+from estimation.diagnosis.screening import all_candidates
+from recon.cli import main
+from scanner.device import Device
+from scanner.recording import Recording
+from scanner.terms import catalogue
+from tests.support.bench import DEVICE, RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES, STIFFNESS, bench_recording, bench_signals
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "coloured"), [(1, False), (2, False), (3, True), (4, True)])
+def test_a_complete_model_is_consistent_and_has_no_findings(seed: int, coloured: bool) -> None:
+    diagnosis = diagnose([bench_recording(seed=seed, coloured=coloured)])
+    assert (diagnosis.verdict, diagnosis.findings, diagnosis.unexplained) == ("consistent", (), None)
+    assert diagnosis.search.final.validation_chi2 == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.slow
+def test_a_cubic_spring_is_found_and_its_interval_contains_the_true_value() -> None:
+    size = np.abs(bench_signals(0.0, 0.0)[1]).max()
+    k3 = 0.06 * STIFFNESS / size**2
+    diagnosis = diagnose([bench_recording(k3=k3, seed=6)])
+    (finding,) = diagnosis.findings
+    assert (finding.effect, finding.stage, finding.axis) == ("cubic-stiffness", "mechanics", "x")
+    low, high = finding.parameters[0].ci95
+    assert low < k3 < high
+    assert high - low < 0.4 * k3
+    assert finding.heldout["after"] < 1.1 < finding.heldout["before"]
+    assert diagnosis.device.axis("x").terms["cubic-stiffness"]["k3"] == finding.parameters[0].value
+
+
+@pytest.mark.slow
+def test_the_improved_device_is_consistent_with_its_own_recording() -> None:
+    size = np.abs(bench_signals(0.0, 0.0)[1]).max()
+    made = bench_recording(k3=0.06 * STIFFNESS / size**2, seed=7)
+    improved = diagnose([made]).device
+    again = diagnose([made], Device.from_toml(improved.to_toml()))
+    assert again.verdict == "consistent"
+
+
+@pytest.mark.slow
+def test_a_gain_drift_is_found_in_the_readout() -> None:
+    diagnosis = diagnose([bench_recording(gain_drift=0.1, seed=8)])
+    assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("gain-drift", "readout")]
+    assert diagnosis.findings[0].parameters[0].value == pytest.approx(0.1, rel=0.15)
+
+
+@pytest.mark.slow
+def test_an_offset_drift_is_not_reported_as_hum_or_noise() -> None:
+    """Hum at both mains frequencies approximates the drift, and the remainder can be fitted as coloured noise."""
+    diagnosis = diagnose([bench_recording(offset_drift=0.03, seed=8)])
+    assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("offset-drift", "readout")]
+    low, high = diagnosis.findings[0].parameters[0].ci95
+    assert low < 0.03 < high
+
+
+@pytest.mark.slow
+def test_hum_is_clipped_together_with_the_signal() -> None:
+    """Hum added after the clipping would leave a residual that interference or an offset drift explains."""
+    size = 20.0 * np.abs(bench_signals(0.0, 0.0)[1]).max()
+    diagnosis = diagnose([bench_recording(clip_level=0.6 * size, hum=2e-3, seed=9)])
+    assert [finding.effect for finding in diagnosis.findings] == ["saturation"]
+    (limit,) = diagnosis.findings[0].parameters
+    assert limit.ci95[0] < 0.6 * size < limit.ci95[1]
+    assert diagnosis.search.final.validation_chi2 == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_nominal_fit_recovers_resonance_and_quality() -> None:
+    made = bench_recording(seed=9)
+    run = prepare_run(made, DEVICE)
+    model = Model([run], DEVICE)
+    comparison = Comparison([run], flat_whiteners(model))
+    stops = window_schedule(model)
+    fit = fit_progressively(comparison, model, fit_initial_state(comparison, model, stops[0]).x, stops)[-1]
+    axis = model.nominal("x", fit.x)
+    assert axis.resonance / RESONANCE_HZ == pytest.approx(np.sqrt(1.004), abs=2e-4)
+    assert axis.quality == pytest.approx(40 / 1.05 * np.sqrt(1.004), rel=0.01)
+
+
+def test_outputs_prepared_in_advance_equal_outputs_computed_on_demand() -> None:
+    run = prepare_run(bench_recording(seed=9), DEVICE)
+    candidate = Candidate(catalogue()["second-mode"], "x", "sense")
+    ahead, model = (Model([run], DEVICE, [candidate]) for _ in range(2))
+    points = np.random.default_rng(0).normal(0.0, 0.3, (11, len(model.parameters)))
+    ahead.prefetch_trajectories(list(points), 0.5)
+    assert len(ahead._prefetched) == len(points)
+    for x in points:
+        np.testing.assert_array_equal(ahead.outputs(x, 0.5)[0][0], model.outputs(x, 0.5)[0][0])
+    assert not ahead._prefetched
+
+
+def test_halving_the_integration_step_changes_outputs_by_less_than_a_tenth_of_the_noise() -> None:
+    made = bench_recording(seed=10)
+    values = []
+    for finer in (1, 2):
+        run = prepare_run(made, DEVICE, oversample=finer)
+        model = Model([run], DEVICE)
+        x = np.zeros(len(model.parameters))
+        x[[i for i, f in enumerate(model.parameters) if f.kind == "start"]] = 0.1
+        values.append(model.outputs(x)[0][0])
+    n = min(v.size for v in values)
+    assert np.abs(values[0][:n] - values[1][:n]).max() < 0.1 * 2e-3
+
+
+def test_whitened_noise_is_white_with_unit_variance() -> None:
+    from scipy.signal import lfilter
+
+    rng = np.random.default_rng(11)
+    noise = lfilter([1.0], [1.0, -0.9], rng.normal(0, 0.1, 20000))
+    psd, _ = noise_psd(noise, 8001, 1e-4, [100.0], 5.0)
+    white = make_whitener(psd, noise.size, (20, 20))(noise)
+    assert white.std() == pytest.approx(1.0, abs=0.03)
+    assert abs(np.corrcoef(white[:-1], white[1:])[0, 1]) < 0.05
+
+
+def test_a_strong_drift_does_not_change_the_noise_estimate() -> None:
+    """A window alone does not suppress it: the noise in the ten lowest bins would be a hundred times too large."""
+    noise = np.random.default_rng(12).normal(0.0, 1.0, 4000)
+    turn = np.pi * (np.arange(4000) + 0.5) / 4000
+    drift = 300.0 * np.cos(turn) - 100.0 * np.cos(2 * turn) + 200.0 * np.cos(3 * turn)
+    still, _ = noise_psd(noise, 2001, 1e-4, [100.0], 5.0)
+    drifting, _ = noise_psd(noise + drift, 2001, 1e-4, [100.0], 5.0)
+    np.testing.assert_allclose(drifting, still, rtol=1e-6)
+    settling = 300.0 * np.exp(-turn / (0.3 * np.pi))  # not a sum of a few cosines; a window alone gives a factor of 14
+    drifting, _ = noise_psd(noise + settling, 2001, 1e-4, [100.0], 5.0)
+    assert (drifting[9:] / still[9:]).max() < 2.0
+
+
+def test_red_noise_is_whitened_at_the_ends_too() -> None:
+    """Whitening would amplify a step from noise to zero at the ends above the noise, like a drift."""
+    from scipy.signal import lfilter
+
+    n, guard = 4000, (25, 25)
+    rng = np.random.default_rng(8)
+    frequency = np.arange(n // 2 + 1) / n
+    psd = n / np.abs(1.0 - 0.998 * np.exp(-2j * np.pi * frequency)) ** 2
+    whiten = make_whitener(psd, n, guard)
+    ends = [
+        whiten(lfilter([1.0], [1.0, -0.998], rng.normal(size=3 * n))[-n:])[whiten.keep][[0, 1, -2, -1]]
+        for _ in range(200)
+    ]
+    assert np.mean(np.square(ends)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_low_frequency_misfit_is_attributed_to_noise_as_far_as_a_steeper_spectrum_explains_it() -> None:
+    n = 4000
+    white = np.random.default_rng(5).normal(0.0, 1.0, n)
+    turn = 2 * np.pi * np.arange(n) / n
+    whiten = make_whitener(np.full(n // 2 + 1, float(n)), n, (0, 0), first=10.0)
+    slow, measured = 4.0 * np.sqrt(2 / n) * np.cos(turn), 4.0 * np.sqrt(2 / n) * np.cos(12 * turn)
+    assert whiten.low_frequency_excess_allowance(white) < 2.0
+    assert whiten.low_frequency_excess_allowance(white + measured) < 2.0
+    chi2_by_noise = whiten.low_frequency_excess_allowance(white + slow)  # the slow cosine adds 16 to chi-square
+    assert 4.0 < chi2_by_noise < 16.0
+    assert (
+        whiten.low_frequency_excess_allowance(white + 10.0 * slow) < 0.99 * 1600.0
+    )  # a large drift is never attributed to noise entirely
+    assert replace(whiten, first=0.0).low_frequency_excess_allowance(white + slow) == 0.0
+
+
+def test_red_noise_is_measured_between_the_lines_of_a_multisine() -> None:
+    from scipy.signal import lfilter
+
+    noise = lfilter([1.0], [1.0, -0.95], np.random.default_rng(3).normal(0, 1e-3, SAMPLES))
+    run = prepare_run(bench_recording(), DEVICE)
+    model = Model([run], DEVICE)
+    x = np.zeros(len(model.parameters))
+    data = model.outputs(x)[0][0] + noise[: run.outputs[0].data.size]
+    noisy = replace(run, outputs=(replace(run.outputs[0], data=data),))
+    whiten = estimate_whiteners(Model([noisy], DEVICE), x)[0][0]
+    white = whiten(noise[: data.size])
+    slow = np.abs(np.fft.rfft(white))[2:100] ** 2 / white.size  # below 500 Hz; the lines are 62.5 Hz apart
+    assert 0.6 < slow.mean() < 1.3
+
+
+def test_decimation_preserves_the_compared_band() -> None:
+    t = np.arange(20_000)
+    for f in (0.02, 0.1, 0.3):  # relative to the decimated rate; frequencies up to 0.35 are compared
+        shown = decimate(np.sin(2 * np.pi * f / 4 * t), 4)[50:-50]
+        assert np.abs(shown - np.sin(2 * np.pi * f / 4 * t[::4])[50:-50]).max() < 1e-4
+
+
+@pytest.mark.slow
+def test_a_free_term_is_replaced_by_two_named_terms() -> None:
+    """Linearised about a fit with a free torque, the screening finds the pair of named terms that replaces it."""
+    size = np.abs(bench_signals(0.0, 0.0)[1]).max()
+    run = prepare_run(bench_recording(k3=0.06 * STIFFNESS / size**2, gain_drift=0.15, seed=4), DEVICE)
+    nominal = Model([run], DEVICE)
+    comparison = Comparison([run], flat_whiteners(nominal))
+    stops = window_schedule(nominal)
+    early = fit_progressively(comparison, nominal, fit_initial_state(comparison, nominal, stops[0]).x, stops)[-1]
+    free = Candidate(DISCREPANCY_TERMS["free-mechanics"], "x", "sense")
+    model = Model([run], DEVICE, [free], nominal.mains)
+    free_fit = fit_model(comparison, model, model.map_parameters_from(early.model, early.x), max_iterations=20)
+    pool = [c for c in all_candidates(DEVICE, nominal, catalogue().values()) if not c.channel.startswith("angle")]
+    best = fit_exchanges(comparison, free_fit, [free], pool, pairs=True)[0]
+    assert {candidate.term.effect for candidate in best.model.candidates} == {"cubic-stiffness", "gain-drift"}
+    assert best.neg2_log_evidence < free_fit.neg2_log_evidence - 100.0
+
+
+def test_a_foreign_tone_among_the_lines_of_a_multisine_is_detected() -> None:
+    """A multisine of many lines leaves few bins free, and the tone is one line next to a line of the drive."""
+    rng = np.random.default_rng(7)
+    time, lines = np.arange(SAMPLES) / SAMPLE_RATE_HZ, 20.0 + 15.0 * np.arange(80)
+    drive = 0.3 * np.sin(2 * np.pi * np.multiply.outer(time, lines) + rng.uniform(0, 2 * np.pi, 80)).sum(-1)
+    channels = {
+        "drive_x": (drive, "V", SAMPLE_RATE_HZ, 0.0),
+        "sense_x": (rng.normal(0, 2e-3, SAMPLES), "V", SAMPLE_RATE_HZ, 0.0),
+    }
+    run = prepare_run(Recording.from_arrays(channels, device=DEVICE, name="tone"), DEVICE)
+    model = Model([run], DEVICE)
+    moved = model.outputs(np.zeros(len(model.parameters)))[0][0]
+    wave = np.cos(2 * np.pi * 336.0 * run.outputs[0].step * np.arange(moved.size))
+    for tone, detected in ((0.0, False), (5e-3, True)):
+        data = moved + rng.normal(0, 2e-3, moved.size) + tone * wave
+        disturbed = Model([replace(run, outputs=(replace(run.outputs[0], data=data),))], DEVICE)
+        comparison = Comparison(disturbed.runs, flat_whiteners(disturbed))
+        line = strongest_foreign_line(
+            fit_model(comparison, disturbed, np.zeros(len(disturbed.parameters)), max_iterations=1)
+        )
+        assert (line is not None and abs(line - 336.0) < 3.0) == detected
+
+
+@pytest.mark.parametrize("seconds", [0.005, 0.02, 0.3])  # 3e5 samples are more than the line search uses
+@pytest.mark.parametrize(
+    ("drive", "steady"),
+    [
+        (lambda t: np.sin(2 * np.pi * 27680.37 * t), True),
+        (lambda t: 20.0 * (np.sin(2 * np.pi * 27680.37 * t) > 0.0), True),
+        (lambda t: 20.0 * ((27680.37 * t) % 1.0 < 0.25), True),
+        (lambda t: np.sin(2 * np.pi * (27000.0 + 4000.0 * t / t[-1]) * t), False),
+        (lambda t: sum(np.cos(2 * np.pi * f * t + f) for f in np.linspace(22e3, 33e3, 23)), False),
+        (lambda t: np.random.default_rng(1).standard_normal(t.size), False),
+    ],
+    ids=["sine", "square", "pulses", "sweep", "multisine", "noise"],
+)
+def test_a_steady_drive_is_distinguished_from_a_sweep_at_any_length(
+    drive: Callable[[np.ndarray], np.ndarray], steady: bool, seconds: float
+) -> None:
+    values = drive(np.arange(0.0, seconds, 1e-6))
+    assert is_steady(strongest_line(values, 1e6), values, 1e6) == steady
+
+
+def test_interpolation_keeps_steps_sharp_and_sines_exact() -> None:
+    at = np.arange(0.0, 900.0, 0.5)
+    step = np.repeat([1.0, 3.0], 500)
+    assert set(resample_drive(step, at)) == {1.0, 3.0}
+    sine = np.sin(0.9 * np.arange(1000))
+    np.testing.assert_allclose(resample_drive(sine, at)[100:], np.sin(0.9 * at)[100:], atol=2e-3)
+
+
+@pytest.mark.slow
+def test_diagnose_and_predict_write_the_documented_files_and_keys(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    size = np.abs(bench_signals(0.0, 0.0)[1]).max()
+    file = tmp_path / "bench.h5"
+    bench_recording(k3=0.06 * STIFFNESS / size**2, seed=12).write(file)
+    assert main(["diagnose", str(file), "-o", str(tmp_path / "out"), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert written["schema"] == "lissajous-diagnosis/1"
+    assert written["verdict"] == answer["verdict"] == "mismatch"
+    (finding,) = written["findings"]
+    assert set(finding) >= {
+        "axis",
+        "stage",
+        "effect",
+        "equation",
+        "parameters",
+        "where",
+        "probability",
+        "rivals",
+        "heldout",
+    }
+    assert set(finding["parameters"][0]) == {"name", "value", "ci95", "unit"}
+    assert written["unexplained"] is None
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "bench &lt;b&gt;" in report
+    assert "bench <b>" not in report
+
+    errors = {}
+    for name, device in (("nominal", []), ("improved", ["--device", str(tmp_path / "out" / "device.toml")])):
+        assert main(["predict", str(file), "-o", str(tmp_path / name), *device, "--json"]) == 0
+        errors[name] = json.loads(capsys.readouterr().out)["channels"]["sense_x"]["rmse"]
+        with Recording.open(tmp_path / name / "predicted.h5") as predicted:
+            assert predicted["sense_x"].size == SAMPLES
+    assert errors["improved"] < 1.1 * 2e-3 < 2 * errors["improved"] < errors["nominal"]
+
+
+@pytest.mark.parametrize(
+    ("drop", "complaint"),
+    [("drive_x", "linear drive"), ("sense_x", "no channel that the device could be held against")],
+)
+def test_a_missing_channel_is_reported_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], drop: str, complaint: str
+) -> None:
+    whole = bench_recording(seed=13)
+    channels = {n: (c.read(), c.unit, c.sample_rate, c.start) for n, c in whole.channels.items() if n != drop}
+    file = tmp_path / "part.h5"
+    Recording.from_arrays(channels, device=DEVICE).write(file)
+    assert main(["diagnose", str(file), "-o", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert complaint in error
+    assert str(file) in error
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,130 @@
+"""Distances between findings and confounders, measurements that separate them, and profile likelihood intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimation.diagnosis.data import prepare_run
+from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals, rank_experiments
+from estimation.diagnosis.fit import Comparison, Fit, fit_model
+from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
+from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.profile_likelihood import Z_95, profile_interval
+from scanner.terms import catalogue
+from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
+
+CUBIC, QUINTIC = (Candidate(catalogue()[f"{name}-stiffness"], "x", "sense") for name in ("cubic", "quintic"))
+
+
+def cubic_spring(share: float) -> float:
+    """k3 that raises the stiffness at the largest amplitude by the fraction ``share``."""
+    return share * STIFFNESS / np.abs(bench_signals(0.0, 0.0)[1]).max() ** 2
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Comparison, Fit]:
+    """A weak cubic spring, fitted with its own term."""
+    run = prepare_run(bench_recording(k3=cubic_spring(0.012), seed=6), DEVICE)
+    nominal, model = Model([run], DEVICE), Model([run], DEVICE, [CUBIC])
+    comparison = Comparison([run], flat_whiteners(nominal))
+    stops = window_schedule(nominal)
+    start = fit_progressively(comparison, nominal, fit_initial_state(comparison, nominal, stops[0]).x, stops)[-1]
+    return comparison, fit_model(comparison, model, model.map_parameters_from(nominal, start.x))
+
+
+def test_the_squared_distance_predicts_the_evidence_gain_over_a_confounder(fitted: tuple[Comparison, Fit]) -> None:
+    comparison, fit = fitted
+    (distance,) = distances_to_rivals(comparison, fit, CUBIC, [QUINTIC])
+    rival = Model(fit.model.runs, DEVICE, [QUINTIC])
+    instead = fit_model(comparison, rival, rival.map_parameters_from(fit.model, fit.x))
+    lead = instead.chi2 + instead.penalty - fit.chi2 - fit.penalty
+    assert abs(lead - distance**2) < 2 * Z_95 * distance + 1.0  # noise scatters the gain by twice the distance
+    assert distance < 4.5
+
+
+def test_the_advice_names_measurements_that_separate_confounders(fitted: tuple[Comparison, Fit]) -> None:
+    comparison, fit = fitted
+    (distance,) = distances_to_rivals(comparison, fit, CUBIC, [QUINTIC])
+    distances = dict(rank_experiments(comparison, fit, CUBIC, QUINTIC))
+    assert (
+        distances["with its angle recorded, noise 0.001 of the swing"]
+        > 4.5
+        > distances["beside a recording at half the drive"]
+    )
+    assert min(distances.values()) > distance
+    text = discrimination_advice(comparison, fit, CUBIC, QUINTIC, distance)
+    assert text.startswith(f"quintic-stiffness lies {distance:.1f} σ away, 4.5 are needed; with its angle recorded")
+    assert "second, larger amplitude" in text
+
+
+def test_the_profile_rises_by_the_95_percent_threshold_at_the_interval_ends(fitted: tuple[Comparison, Fit]) -> None:
+    """Compared with a refit with the value fixed at each end of the interval."""
+    comparison, fit = fitted
+    i = fit.model.index("term", CUBIC.key, "k3")
+    assert i is not None
+    for end in profile_interval(comparison, fit, i):
+        x, free = fit.x.copy(), np.arange(fit.x.size) != i
+        x += fit.covariance[:, i] / fit.covariance[i, i] * (end - fit.x[i])
+        for _ in range(2):
+            residual = comparison.residual(fit.model, x)[fit.rows]
+            part, precision = fit.jacobian[np.ix_(fit.rows, free)], fit.model.precision[free]
+            push = part.T @ residual + precision * x[free]
+            x[free] -= np.linalg.solve(part.T @ part + np.diag(precision), push)
+        residual = comparison.residual(fit.model, x)[fit.rows]
+        rise = residual @ residual + fit.model.precision @ x**2 - fit.chi2 - fit.penalty
+        assert rise == pytest.approx(Z_95**2, rel=0.1)
+    low, high = profile_interval(comparison, fit, i)
+    scale = CUBIC.term.parameters[0].value(1.0, fit.model.scales("x"))
+    assert low * scale < cubic_spring(0.012) < high * scale
+
+
+class Posterior:
+    """A comparison of two samples with a model of two numbers, and that model; both samples are fitted."""
+
+    validation_rows, precision = np.zeros(2, bool), np.full(2, 1e-12)
+
+    def fitted(self, stop: float) -> np.ndarray:
+        return ~self.validation_rows
+
+    def best(self, *x: float) -> Fit:
+        """The fit at ``x``, where the residual is zero."""
+        at = np.array(x)
+        return Fit(
+            self, at, 0.0, 0.0, np.zeros(2), self.jacobian(self, at), ~self.validation_rows, self.validation_rows, 0.0
+        )  # type: ignore[arg-type]
+
+
+class Skewed(Posterior):
+    """-2 log posterior (x - 1)^2 / 0.04 above 1 and four times that below."""
+
+    def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
+        return np.array([(x[0] - 1.0) / (0.2 if x[0] > 1.0 else 0.1), x[1]])
+
+    def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
+        return np.diag([10.0 if x[0] < 1.0 else 5.0, 1.0])
+
+
+class Bent(Posterior):
+    """-2 log posterior 4 (x - 1)^2 + 1e4 (y - x^2)^2: the first term alone determines the interval of x."""
+
+    def residual(self, model: object, x: np.ndarray, stop: float = 1.0) -> np.ndarray:
+        return np.array([2.0 * (x[0] - 1.0), 100.0 * (x[1] - x[0] ** 2)])
+
+    def jacobian(self, model: object, x: np.ndarray, *_: object) -> np.ndarray:
+        return np.array([[2.0, 0.0], [-200.0 * x[0], 100.0]])
+
+
+def test_a_skewed_profile_has_a_skewed_interval() -> None:
+    skewed = Skewed()
+    low, high = profile_interval(skewed, skewed.best(1.0, 0.0), 0)  # type: ignore[arg-type]
+    assert high - 1.0 == pytest.approx(Z_95 * 0.2, rel=1e-6)
+    assert 1.0 - low == pytest.approx(Z_95 * 0.1, rel=1e-6)
+
+
+def test_a_curved_ridge_is_followed_to_both_interval_ends() -> None:
+    bent = Bent()
+    fit = bent.best(1.0, 1.0)
+    assert profile_interval(bent, fit, 0) == pytest.approx((1.0 - 0.5 * Z_95, 1.0 + 0.5 * Z_95), rel=1e-3)  # type: ignore[arg-type]
+    _, high = profile_interval(bent, fit, 1)  # type: ignore[arg-type]
+    assert high == pytest.approx((1.0 + 0.5 * Z_95) ** 2, rel=0.1)

@@ -1,0 +1,84 @@
+"""Short segments of measured recordings whose nominal device omits effects; the examples use whole recordings."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.diagnosis import selection as searching
+from estimation.diagnosis.data import prepare_run
+from estimation.diagnosis.diagnose import Diagnosis, build_diagnosis
+from estimation.diagnosis.predict import predict
+from recon.io.convert import convert
+from scanner.device import Axis, Device, Mechanics, Position
+from scanner.recording import Recording
+from scanner.terms import catalogue
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "examples"))
+
+
+@pytest.fixture
+def diagnose_among(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    """A diagnosis restricted to the given effects; the whole catalogue takes minutes."""
+    monkeypatch.setattr(searching, "DISCREPANCY_TERMS", {})
+
+    def diagnosed(recording: Recording, *effects: str) -> Diagnosis:
+        device = recording.device
+        assert device is not None
+        terms = {effect: catalogue()[effect] for effect in effects}
+        return build_diagnosis(searching.select_terms([prepare_run(recording, device)], device, terms))
+
+    return diagnosed
+
+
+@pytest.mark.slow
+def test_the_silverbox_has_a_cubic_spring(measured_data: Path, diagnose_among) -> None:  # type: ignore[no-untyped-def]
+    from silverbox import MAPPING, multisines, off
+
+    with convert(measured_data / "silverbox/multisine.npz", MAPPING) as whole:
+        parts = multisines(whole)
+        assert len(parts) == 10
+        short = [part.slice(part.start, part.start + 2.5) for part in parts[2:4]]
+        diagnosis = diagnose_among(short[0], "cubic-stiffness", "quintic-stiffness", "cubic-damping", "sensor-cubic")
+        assert diagnosis.findings[0].effect == "cubic-stiffness"
+        linear, cubic = (np.nanstd(off(predict(short[1], d)["sense_x"])) for d in (whole.device, diagnosis.device))
+        assert cubic < 0.4e-3 < 10e-3 < linear
+
+
+@pytest.mark.slow
+def test_the_beam_has_a_cubic_spring_and_quadratic_drag(measured_data: Path, diagnose_among) -> None:  # type: ignore[no-untyped-def]
+    from beam_decay import FROM, MAPPING, held_out, simulated, slow_motion
+
+    with convert(next((measured_data / "beam_decay").glob("*.lvm")), MAPPING) as whole:
+        diagnosis = diagnose_among(
+            whole.slice(FROM, FROM + 3.0), "cubic-stiffness", "quadratic-drag", "coulomb-friction"
+        )
+    assert {finding.effect for finding in diagnosis.findings} == {"cubic-stiffness", "quadratic-drag"}
+    weights = [finding.heldout["before"] for finding in diagnosis.findings]  # misfit without the effect
+    assert weights == sorted(weights, reverse=True)
+    assert weights[-1] > 10.0 * diagnosis.findings[0].heldout["after"]
+    data = diagnosis.search.comparison.runs[0].outputs[0].data
+    frequency, modelled = (slow_motion(s - s.mean(), 1000.0)[1] for s in (data, simulated(diagnosis.search.final)))
+    held_out_samples = held_out(data.size, 1000.0)
+    assert (
+        np.sqrt(np.mean((frequency - modelled)[held_out_samples] ** 2)) < 0.07 < 0.3 < frequency[held_out_samples].std()
+    )
+
+
+def test_hysteresis_and_drift_terms_explain_the_piezo_stage(measured_data: Path) -> None:
+    from afm_model import LAWS, by_laws, missed, recordings
+
+    recording = recordings(measured_data / "afm_spiral/spiral_20hz.mat")["x"]
+    assert missed(by_laws(recording, LAWS)) < 0.3 < 0.8 < missed(by_laws(recording, ("offset-drift",)))
+
+
+def test_a_device_without_a_drive_is_predicted_as_a_free_decay() -> None:
+    rate, turn, fall = 5e3, 2 * np.pi * 40.0, 2.0
+    time = np.arange(5000) / rate
+    axis = Axis(Mechanics(1.0, 2 * fall, turn**2 + fall**2), readout=Position(1.0, 1e-3), name="x")
+    decay = 0.3 * np.exp(-fall * time) * np.cos(turn * time + 0.4)
+    recording = Recording.from_arrays({"sense_x": (decay, "V", rate, 0.0)}, Device("beam", {"x": axis}))
+    assert predict(recording, Device("beam", {"x": axis}))["sense_x"].rmse < 1e-3

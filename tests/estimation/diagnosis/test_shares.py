@@ -1,0 +1,107 @@
+"""Shares, remainders, open-loop comparison, rails, and nominal values that a recording does not determine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.diagnosis.clipping import rail
+from estimation.diagnosis.data import prepare_run
+from estimation.diagnosis.fit import Comparison, fit_model
+from estimation.diagnosis.identifiability import determined_only
+from estimation.diagnosis.initial import flat_whiteners
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.shares import OpenLoop, is_worse, open_loop, remainder_of, share_of
+from scanner.device import Axis, Device, Mechanics, Position
+from scanner.errors import BadInput
+from scanner.recording import Recording
+from tests.support.bench import DEVICE, bench_recording
+
+
+def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
+    assert share_of(without=5.0, complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.95)
+    assert remainder_of(complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.05)
+    assert share_of(without=1.0, complete=1.2, nominal=5.0, noise=1.0) == 0.0
+
+
+def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> None:
+    nominal = {"sense_x": OpenLoop(1.0, 10.0, 0.1)}
+    assert not is_worse(nominal, {"sense_x": OpenLoop(1.2, 10.0, 0.1)})
+    assert is_worse(nominal, {"sense_x": OpenLoop(1.4, 10.0, 0.1)})
+
+
+def test_a_rail_is_recognised_from_samples_at_one_value() -> None:
+    rng = np.random.default_rng(3)
+    wave = np.sin(np.linspace(0.0, 60.0, 4000)) + 0.01 * rng.normal(size=4000)
+    assert rail(np.clip(wave, None, 0.8)) is None  # the lower half swings further
+    assert rail(np.clip(wave + 0.5, None, 1.2)) == pytest.approx(1.2)
+    assert rail(wave) is None
+    assert rail(np.round(wave * 64) / 64) is None  # a converter's steps are no rail
+
+
+def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
+    run = prepare_run(bench_recording(seed=2), DEVICE)
+    model = Model([run], DEVICE)
+    comparison = Comparison([run], flat_whiteners(model))
+    fit = fit_model(comparison, model, np.zeros(len(model.parameters)), max_iterations=6)
+    at = [i for i, f in enumerate(model.parameters) if f.kind == "nominal"]
+    names = [model.parameters[i].name for i in at]
+    variance, directions = np.linalg.eigh(fit.covariance[np.ix_(at, at)])
+    valley = directions[:, -1]
+    assert variance[-1] > 0.9
+    assert abs(valley[names.index("readout.gain")]) > 0.3
+    moved = fit.x.copy()
+    moved[at] += 2.0 * valley
+    settled = determined_only(replace(fit, x=moved))
+    assert determined_only(fit)[at] == pytest.approx(settled[at], abs=1e-3)
+    assert valley @ settled[at] == pytest.approx(0.0, abs=1e-9)
+    changed = comparison.residual(model, determined_only(fit)) - fit.residual
+    assert np.sum(changed[comparison.rows] ** 2) < 1.0
+
+
+@pytest.mark.slow
+def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> None:
+    """A pendulum let go at 45 degrees: whatever its law is called, the device that has it predicts its swing."""
+    from benchmarks.measured import ROWS
+    from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+    from estimation.diagnosis.fit import Fit
+    from estimation.diagnosis.improvement import improve
+    from estimation.diagnosis.initial import estimate_whiteners, fit_initial_state, fit_progressively, window_schedule
+    from estimation.diagnosis.model import Candidate
+    from estimation.diagnosis.selection import SelectionResult, SelectionStep
+
+    (recording,), _, device = ROWS["pendulum-45"](measured_data)
+    run = prepare_run(recording, device)
+
+    def fitted(model: Model) -> Fit:
+        comparison, stops = Comparison([run], flat_whiteners(model)), window_schedule(model)
+        first = fit_progressively(comparison, model, fit_initial_state(comparison, model, stops[0]).x, stops)[-1]
+        return fit_model(comparison, model, first.x, max_iterations=20)
+
+    nominal = fitted(Model([run], device))
+    free = Model([run], device, [Candidate(DISCREPANCY_TERMS["free-mechanics"], "x", "sense")])
+    comparison = Comparison([run], estimate_whiteners(free, fitted(free).x))
+    found = fit_model(comparison, free, fitted(free).x, max_iterations=20)
+    nominal = fit_model(comparison, nominal.model, nominal.x)
+    improved = improve(
+        SelectionResult(comparison, nominal, found, (SelectionStep(free.candidates[0], nominal, found, ()),))
+    )
+    assert "measured-law" in improved.device.axis("x").terms
+    assert Device.from_toml(improved.device.to_toml()) == improved.device
+    before, after = (open_loop([run], one)["sense_x"].error for one in (device, improved.device))
+    assert after < 0.3 * before
+
+
+@pytest.mark.parametrize(
+    ("rate", "samples", "what"),
+    [(100.0, 5000, "sampled at 100 Hz, too slowly for a resonance at 1000 Hz"), (2e4, 100, "fewer than 8 turns")],
+)
+def test_a_recording_that_cannot_serve_is_refused(rate: float, samples: int, what: str) -> None:
+    axis = Axis(Mechanics(1.0, 2.0, (2 * np.pi * 1e3) ** 2), readout=Position(1.0, 1e-3), name="x")
+    decay = np.cos(2 * np.pi * 1e3 * np.arange(samples) / rate) + 1e-3 * np.random.default_rng(1).normal(size=samples)
+    recording = Recording.from_arrays({"sense_x": (decay, "V", rate, 0.0)}, Device("beam", {"x": axis}))
+    with pytest.raises(BadInput, match=what):
+        prepare_run(recording, Device("beam", {"x": axis}))

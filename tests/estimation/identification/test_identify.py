@@ -1,0 +1,258 @@
+"""Identification: intervals have their nominal coverage, and the command writes its files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.papers.sine import driven, linear_axis
+from benchmarks.papers.threshold import sensing_axis
+from estimation.identification.calibrate import classify_recording, identify
+from estimation.identification.fits import DrivenRecord, fit_capacitance_profile, fit_mechanics, fit_ringdown
+from phantoms.forward import InitialState, Plan, settled_state, simulate, simulate_trajectory
+from phantoms.waveforms import Constant, Sine
+from recon.cli import main
+from scanner.device import Axis, Device
+from scanner.devices import load
+from scanner.drift import Drift
+from scanner.errors import BadInput
+from scanner.forward_model import sense_signal
+from scanner.recording import Recording
+
+DRIVEN = load("chen2020-driven")
+AXIS = DRIVEN.axis("x")
+RATE, PSD = 5e6, 2e-4
+
+
+@pytest.fixture(scope="module")
+def moving() -> list[DrivenRecord]:
+    """Noiseless driven motion at three frequencies."""
+    records = []
+    for f in (31400.0, 31480.0, 31560.0):
+        plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.004, RATE, substeps=4)
+        angle = simulate_trajectory(AXIS, plan, settled_state(AXIS, replace(plan, settle=0.04)), 0.0, 0.004).angle
+        records.append(DrivenRecord(angle[:-1:4], plan.drives["x"](np.arange(20000) / RATE), f / 2, RATE))
+    return records
+
+
+@pytest.fixture(scope="module")
+def decay() -> tuple[np.ndarray, np.ndarray]:
+    """Noiseless decay of the chen2019 device under its bias: angle and sense."""
+    axis = sensing_axis()
+    plan = Plan({"x": Constant(10.0)}, 0.08, 500e3, substeps=4)
+    path = simulate_trajectory(axis, plan, InitialState(0.15, 0.0), 0.0, 0.08)
+    return path.angle[:-1:4], sense_signal(axis.require_readout(), [path])[:-1:4]
+
+
+def coverage(draws: list[dict], truth: dict[str, float]) -> dict[str, float]:
+    return {key: np.mean([d[key].ci95[0] < value < d[key].ci95[1] for d in draws]) for key, value in truth.items()}
+
+
+def test_driven_motion_determines_inertia_damping_and_stiffness(moving):
+    """A ringdown determines only ratios of J, k and b. Driven motion determines all three."""
+    m = AXIS.require_mechanics()
+    draws = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        noisy = [replace(r, angle=r.angle + PSD * rng.standard_normal(r.angle.size)) for r in moving]
+        draws.append(fit_mechanics(AXIS, noisy))
+    truth = {"J": m.J, "b": m.b, "k": m.k}
+    for key, value in truth.items():
+        assert np.mean([d[key].value for d in draws]) == pytest.approx(value, rel=2e-3)
+    assert min(coverage(draws, truth).values()) >= 0.8
+
+
+def test_a_linear_drive_determines_inertia_damping_and_stiffness():
+    true = linear_axis(1000.0, 50.0)
+    records = []
+    for f in (960.0, 1030.0):
+        angle, drive = driven(true, f, 0.05, 0.1, Drift())
+        noisy = angle + PSD * np.random.default_rng(int(f)).standard_normal(angle.size)
+        records.append(DrivenRecord(noisy, drive(np.arange(angle.size) / 1e6), f, 1e6))
+    found, m = fit_mechanics(true, records), true.require_mechanics()
+    for key in ("J", "b", "k"):
+        assert found[key].value == pytest.approx(getattr(m, key), abs=4 * found[key].sd)
+        assert found[key].sd < 1e-3 * getattr(m, key)
+
+
+def test_one_drive_frequency_is_not_enough(moving):
+    with pytest.raises(BadInput, match="two or more drive frequencies"):
+        fit_mechanics(AXIS, moving[:1])
+
+
+@pytest.mark.slow
+def test_a_ringdown_determines_frequency_and_damping(decay):
+    axis = sensing_axis()
+    m = axis.require_mechanics()
+    off = replace(axis, mechanics=replace(m, k=m.k * 1.004, b=m.b * 0.9))
+    draws = []
+    for seed in range(25):
+        angle = decay[0] + PSD * np.random.default_rng(seed).standard_normal(decay[0].size)
+        draws.append(fit_ringdown(angle, 500e3, off, 10.0)[0])
+    truth = {"k_over_J": m.k / m.J, "b_over_J": m.b / m.J, "J": m.J}
+    assert min(coverage(draws, truth).values()) >= 0.8
+    assert np.mean([d["b_over_J"].value for d in draws]) == pytest.approx(m.b / m.J, rel=1e-3)
+    assert draws[0]["J"].sd > 20 * draws[0]["k_over_J"].sd / draws[0]["k_over_J"].value * m.J
+
+
+def test_the_capacitance_profile_and_the_channel_delay_are_fitted(decay):
+    axis = sensing_axis()
+    comb = axis.require_capacitance()
+    off = replace(axis, capacitance=replace(comb, C0=1.1 * comb.C0, theta0=0.9 * comb.theta0, theta_th=0.0))
+    draws = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        angle = decay[0][57:] + PSD * rng.standard_normal(decay[0].size - 57)  # the angle channel is 0.114 ms early
+        sense = decay[1][:-57] + 0.0435 * rng.standard_normal(decay[1].size - 57)
+        draws.append(fit_capacitance_profile(off, angle, sense, 500e3, axis.resonance).values)
+    truth = {"theta0": comb.theta0, "theta_th": comb.theta_th, "C0": comb.C0, "delay": 57 / 500e3}
+    for key, value in truth.items():
+        assert np.mean([d[key].value for d in draws]) == pytest.approx(value, rel=0.01)
+    assert min(coverage(draws, truth).values()) >= 0.8
+
+
+def with_comb_errors(axis: Axis, rng: np.random.Generator) -> Axis:
+    """The axis with errors of 2 % (standard deviation) in the comb, as in a data sheet."""
+    comb, tolerance = axis.require_capacitance(), {"C0": 0.02, "theta0": 0.02}
+    off = 1.0 + 0.02 * rng.standard_normal(2)
+    off_comb = replace(comb, C0=off[0] * comb.C0, theta0=off[1] * comb.theta0)
+    return replace(axis, capacitance=off_comb, tolerance={**axis.tolerance, **tolerance})
+
+
+def test_intervals_have_their_coverage_when_the_comb_is_uncertain(moving):
+    m = AXIS.require_mechanics()
+    draws, tolerances = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        recordings = [
+            Recording.from_arrays(
+                {
+                    "angle_x": (r.angle + PSD * rng.standard_normal(r.angle.size), "rad", RATE, 0.0),
+                    "drive_x": (r.voltage, "V", RATE, 0.0),
+                }
+            )
+            for r in moving
+        ]
+        found = identify(recordings, replace(DRIVEN, axes={"x": with_comb_errors(AXIS, rng)}))
+        draws.append(dict(found.values["x"]))
+        tolerances.append([found.device.tolerance("x", key) for key in "Jbk"])
+    held = coverage(draws, {"J": m.J, "b": m.b, "k": m.k})
+    assert min(held.values()) >= 0.85
+    assert np.mean([d["J"].sd for d in draws]) < 0.06 * m.J  # 2 % of C0, twice 2 % of theta0
+    # The device keeps what does not depend on the torque's scale: the resonance, k / J.
+    assert np.max(tolerances) < 0.01
+
+
+def test_a_free_decay_under_bias_determines_inertia_up_to_the_comb_uncertainty(decay):
+    axis = sensing_axis()
+    J = axis.require_mechanics().J
+    draws = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        angle = decay[0][:20000] + 1e-6 * rng.standard_normal(20000)
+        channels = {"angle_x": (angle, "rad", 500e3, 0.0), "bias_x": (np.full(20000, 10.0), "V", 500e3, 0.0)}
+        found = identify([Recording.from_arrays(channels)], Device("decaying", {"x": with_comb_errors(axis, rng)}))
+        draws.append(dict(found.values["x"]))
+    assert coverage(draws, {"J": J})["J"] >= 0.75
+    assert np.mean([d["J"].sd for d in draws]) > 0.02 * J
+
+
+def test_a_free_decay_without_bias_keeps_the_nominal_inertia_and_its_tolerance(decay):
+    axis = replace(sensing_axis(), tolerance={"J": 0.03})
+    channels = {"angle_x": (decay[0][:20000], "rad", 500e3, 0.0)}
+    found = identify([Recording.from_arrays(channels)], Device("decaying", {"x": axis}))
+    J, k = (found.values["x"][key] for key in "Jk")
+    assert J.sd == pytest.approx(0.03 * J.value)
+    assert k.sd == pytest.approx(0.03 * k.value, rel=0.01)
+    assert any("J is the nominal one" in note for note in found.notes)
+
+
+def test_only_mechanics_are_identified_on_a_shared_electrode(moving):
+    quiet = np.random.default_rng(0).standard_normal(moving[0].angle.size)
+    recordings = [
+        Recording.from_arrays(
+            {
+                "angle_x": (r.angle, "rad", RATE, 0.0),
+                "drive_x": (r.voltage, "V", RATE, 0.0),
+                "sense": (quiet, "V", RATE, 0.0),
+            }
+        )
+        for r in moving
+    ]
+    found = identify(recordings, DRIVEN)
+    assert {"J", "b", "k"} <= set(found.values["x"])
+    assert any(note.startswith("sense: of an electrode that both axes share") for note in found.notes)
+
+
+def calibration(folder) -> list:
+    """Files of one rest and two driven recordings, simulated with a device that differs from the stated one."""
+    m, readout = AXIS.require_mechanics(), AXIS.require_readout()
+    true = replace(
+        DRIVEN,
+        axes={
+            "x": replace(
+                AXIS,
+                mechanics=replace(m, J=m.J * 1.06, b=m.b * 1.1, k=m.k * 1.06),
+                readout=replace(readout, a_cir=-3.7e11, b_cir=6.6),
+            )
+        },
+    )
+    paths = []
+    for f in (31450.0, 31530.0):
+        plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.01, RATE, settle=0.04, angles=True)
+        recording, _ = simulate(true, plan, seed=int(f), nominal=DRIVEN)
+        paths.append(folder / f"{f:.0f}.h5")
+        recording.write(paths[-1])
+    rng = np.random.default_rng(0)
+    quiet = {"sense_x": (0.9 + 0.0139 * rng.standard_normal(50000), "V", RATE, 0.0)}
+    paths.append(folder / "rest.h5")
+    Recording.from_arrays(quiet, DRIVEN).write(paths[-1])
+    return paths
+
+
+def test_the_command_writes_a_device_closer_to_the_truth(tmp_path, capsys):
+    paths = calibration(tmp_path)
+    assert main(["identify", *map(str, paths), "-o", str(tmp_path / "out"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["axes"] == summary["axes"]
+    values = summary["axes"]["x"]["values"]
+    device = Device.load(tmp_path / "out" / "device.toml")
+    axis, m = device.axis("x"), AXIS.require_mechanics()
+    assert pytest.approx(1.06 * m.J, rel=0.01) == axis.mechanics.J
+    assert axis.mechanics.b == pytest.approx(1.1 * m.b, rel=0.01)
+    assert axis.mechanics.resonance == pytest.approx(AXIS.resonance, rel=1e-4)
+    assert axis.readout.a_cir == pytest.approx(-3.7e11, rel=0.01)
+    assert axis.readout.b_cir == pytest.approx(6.6, rel=0.01)
+    assert values["noise_var"]["ci95"][0] < 0.0139**2 < values["noise_var"]["ci95"][1]
+    assert device.tolerance("x", "k") < 0.01
+    assert "95 % interval" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_recording_is_classified_as_rest_free_decay_or_driven(decay):
+    n = 2000
+    still, swinging = np.random.default_rng(1).standard_normal(n), np.sin(np.arange(n) / 50.0)
+    rate = 1e5
+
+    def made(**channels):
+        units = {"drive": "V", "angle": "rad", "sense": "V"}
+        return Recording.from_arrays({f"{k}_x": (v, units[k], rate, 0.0) for k, v in channels.items()})
+
+    assert classify_recording(made(sense=still), "x") == "rest"
+    assert classify_recording(made(angle=swinging, sense=swinging), "x") == "free decay"
+    assert classify_recording(made(angle=swinging, drive=swinging), "x") == "driven"
+    assert classify_recording(made(sense=swinging), "x") is None
+    assert classify_recording(made(sense=still), "y") is None
+
+
+def test_recordings_without_a_reference_angle_are_refused(tmp_path, capsys):
+    path = tmp_path / "no.h5"
+    swinging = np.sin(np.arange(3000) / 50.0)
+    Recording.from_arrays({"sense_x": (swinging, "V", RATE, 0.0)}, DRIVEN).write(path)
+    assert main(["identify", str(path), "-o", str(tmp_path / "out")]) == 2
+    assert "reference angle" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(BadInput, match="no recording"):
+        identify([], DRIVEN)

@@ -1,0 +1,123 @@
+"""Estimators compensate the effects that the device states as terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from estimation.describing_function import torque_harmonics
+from estimation.estimate import estimate
+from phantoms.forward import Plan, simulate
+from phantoms.waveforms import Sine
+from recon.evaluation import evaluate_axis
+from scanner import devices
+from scanner.device import Device, Drive, Position
+from scanner.forward_model import ActiveTerm
+from scanner.recording import Recording
+from scanner.terms import catalogue
+
+DURATION_S = 0.006
+DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
+TERM_PARAMETERS: dict[str, dict[str, float]] = {
+    "readout-lag": {"f_c": 2e5},
+    "comb-offset": {"theta_c": 0.01},
+    "square-law": {"w": 3e10},
+    "channel-delay": {"delay": 1e-6},
+    "gain-drift": {"g": 0.2, "T": DURATION_S},
+    "feedthrough": {"g": 0.005, "h": 0.005, "omega_d": 2 * np.pi * 27680.0},
+    "drive-lag": {"f_c": 1.5e5},
+    "quadratic-stiffness": {"k2": 6e-7},
+}
+
+
+def stated(device: Device, effect: str, axis: str = "x") -> Device:
+    terms = {effect: TERM_PARAMETERS[effect]}
+    return replace(device, axes=dict(device.axes) | {axis: replace(device.axis(axis), terms=terms)})
+
+
+@cache
+def recorded(effect: str) -> tuple[Recording, Mapping]:
+    """The imaging device, both axes on one electrode, with an effect on x."""
+    return simulate(stated(devices.load("imaging"), effect), Plan(DRIVES, DURATION_S), seed=1)
+
+
+def flips(recording: Recording, truth: Mapping) -> dict[str, bool]:
+    """Axis -> whether its sign has to be flipped; an even capacitance does not determine the sign."""
+    plain = estimate(recording, devices.load("imaging"), "tracker")
+    return {
+        axis: evaluate_axis(motion, truth[f"angle_{axis}"][0], 5e6, 0.0).mirrored for axis, motion in plain.axes.items()
+    }
+
+
+def errors(device: Device, effect: str, method: str) -> tuple[float, float]:
+    """Largest of both axes' errors: phase [deg] and angle, root mean square [rad]."""
+    recording, truth = recorded(effect)
+    motion = estimate(recording, device, method, flips(recording, truth))
+    found = [evaluate_axis(motion.axes[axis], truth[f"angle_{axis}"][0], 5e6, 0.0) for axis in "xy"]
+    return max(np.degrees(each.phase_rmse) for each in found), max(each.angle_rmse for each in found)
+
+
+@pytest.mark.parametrize("effect", sorted(TERM_PARAMETERS.keys() - {"drive-lag"}))
+def test_the_tracker_compensates_a_stated_term(effect: str) -> None:
+    device = devices.load("imaging")
+    before, after = (errors(each, effect, "tracker") for each in (device, stated(device, effect)))
+    assert after[0] < 0.02
+    assert after[0] < 0.5 * before[0] or after[1] < 0.25 * before[1]
+
+
+def test_the_tracker_absorbs_a_drive_lag_as_a_stiffness_change() -> None:
+    device = devices.load("imaging")  # it matters without a sense signal
+    for known_device in (device, stated(device, "drive-lag")):
+        assert errors(known_device, "drive-lag", "tracker")[0] < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ekf", "constant"])
+def test_other_estimators_compensate_a_stated_term(method: str) -> None:
+    device = devices.load("imaging")
+    before, after = (errors(each, "readout-lag", method)[0] for each in (device, stated(device, "readout-lag")))
+    assert after < 0.2 < 2.0 < before
+
+
+def test_either_axis_may_state_a_term_of_a_shared_electrode() -> None:
+    device = devices.load("imaging")
+    assert errors(stated(device, "readout-lag", "y"), "readout-lag", "tracker")[0] < 0.02
+
+
+def test_the_nonlinearity_and_lag_of_a_position_sensor_are_inverted() -> None:
+    axis = devices.load("chen2020-driven").axis("x")
+    readout = Position(gain=10.0, noise_sd=1e-3)
+    axis = replace(axis, drive=Drive("linear", 1e-9), readout=readout, capacitance=None)
+    nonlinear = Device(
+        "linear", {"x": replace(axis, terms={"sensor-cubic": {"c3": -0.05}, "readout-lag": {"f_c": 1e5}})}
+    )
+    recording, simulated_truth = simulate(nonlinear, Plan({"x": Sine(15500.0, 20.0)}, 0.004, 1e6, settle=0.02), seed=2)
+    truth: Mapping[str, Any] = simulated_truth
+    rms = [
+        evaluate_axis(estimate(recording, device, "sensor").axes["x"], truth["angle_x"][0], 1e6, 0.0).angle_rmse
+        for device in (Device("linear", {"x": axis}), nonlinear)
+    ]
+    assert rms[1] < 1e-3 < 5 * rms[1] < rms[0]  # inverting a lag amplifies noise
+
+
+def test_torque_harmonics_equal_the_describing_function() -> None:
+    axis = devices.load("chen2020-driven").axis("x")
+    cubic = torque_harmonics(ActiveTerm(catalogue()["cubic-stiffness"], (2.0,)), axis, 0.1, 1e5, 0.0)
+    assert cubic[1] == pytest.approx(1j * 0.75 * 2.0 * 0.1**3)  # -k3 a^3 (3 sin u - sin 3u) / 4
+    assert cubic[3] == pytest.approx(-1j * 0.25 * 2.0 * 0.1**3)
+    drag = torque_harmonics(ActiveTerm(catalogue()["quadratic-drag"], (1e-14,)), axis, 0.1, 1e5, 0.0)
+    assert -drag[1].real == pytest.approx(8 / (3 * np.pi) * 1e-14 * (0.1 * 1e5) ** 2, rel=1e-3)
+    k_v, tau = 1e-6, 2e-5
+    solid = torque_harmonics(ActiveTerm(catalogue()["viscoelastic"], (k_v, tau)), axis, 0.1, 1e5, 0.0)
+    assert solid[1] == pytest.approx(1j * 0.1 * k_v * (1 - 1 / (1 + 1j * 1e5 * tau)), rel=1e-3)
+
+
+def test_a_term_that_the_tracker_approximates_is_noted() -> None:
+    recording, _ = recorded("quadratic-stiffness")
+    motion = estimate(recording, stated(devices.load("imaging"), "quadratic-stiffness"), "tracker")
+    assert "quadratic-stiffness of x" in motion.notes[0]

@@ -1,0 +1,127 @@
+"""The public names: they exist, are imported at first use, take recordings and files, and print in a few lines."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lissajous
+from tests.support.simulated import imaging
+
+ROOT = Path(__file__).parent.parent.parent
+REQUIRED_NAMES = {
+    "Recording", "Device", "Motion", "Picture", "simulate", "estimate", "reconstruct", "diagnose", "identify",
+    "predict", "convert", "design", "blur_study", "BadInput", "__version__",
+}  # fmt: skip
+
+
+def test_every_public_name_exists_and_is_listed() -> None:
+    assert set(lissajous.__all__) >= REQUIRED_NAMES
+    assert dir(lissajous) == sorted(lissajous.__all__)
+    for name in lissajous.__all__:
+        assert getattr(lissajous, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'reconstrct'"):
+        lissajous.reconstrct  # noqa: B018
+
+
+def test_type_checkers_find_the_same_names() -> None:
+    tree = ast.parse((ROOT / "lissajous" / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    names = {
+        alias.asname or alias.name for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    names |= {
+        node.target.id for node in block.body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+    }
+    assert names == set(lissajous.__all__)
+
+
+def test_importing_the_package_imports_nothing_else() -> None:
+    code = "import sys, lissajous; print({'numpy', 'scanner', 'recon'} & {m.split('.')[0] for m in sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_no_package_imports_the_public_one() -> None:
+    for package in ("scanner", "phantoms", "estimation", "recon"):
+        for path in (ROOT / package).rglob("*.py"):
+            text = path.read_text(encoding="utf-8")
+            assert "import lissajous" not in text, path
+            assert "from lissajous" not in text, path
+
+
+def test_a_simulation_is_written_and_reconstructed_from_its_file(tmp_path: Path) -> None:
+    simulation = lissajous.simulate(duration=0.006, target="siemens_star", seed=3)
+    simulation.write(tmp_path / "scan.h5")
+    assert simulation.recording.duration == pytest.approx(0.006)
+    from_file = lissajous.reconstruct(tmp_path / "scan.h5", pixels=(100, 100))
+    from_memory = lissajous.reconstruct(simulation.recording, pixels=(100, 100), truth=simulation.truth)
+    assert from_file.picture.image.shape == (100, 100)
+    np.testing.assert_array_equal(from_file.picture.coverage, from_memory.picture.coverage)
+    for axis in "xy":
+        assert from_file.evaluation[axis].phase_rmse == from_memory.evaluation[axis].phase_rmse < np.radians(0.1)
+    for result in (*simulation[:1], simulation, from_file, from_file.motion, from_file.picture):
+        assert len(repr(result).splitlines()) < 16
+        assert max(map(len, repr(result).splitlines())) < 200
+
+
+def test_a_device_is_given_by_name_by_file_or_as_an_object(tmp_path: Path) -> None:
+    named = lissajous.load_device("imaging")
+    (tmp_path / "device.toml").write_text(named.to_toml(), encoding="utf-8")
+    assert lissajous.load_device(tmp_path / "device.toml") == lissajous.load_device(named) == named
+    assert "imaging" in repr(named)
+    recording, _ = imaging()
+    without = lissajous.Recording.from_arrays(
+        {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
+    )
+    phases = [lissajous.estimate(without, device).axes["x"].phase for device in (named, tmp_path / "device.toml")]
+    np.testing.assert_array_equal(*phases)
+    with pytest.raises(lissajous.BadInput, match="states no device"):
+        lissajous.estimate(without)
+
+
+def test_predict_and_diagnose_take_one_recording_or_several(tmp_path: Path) -> None:
+    recording, _ = imaging()
+    recording.write(tmp_path / "scan.h5")
+    predicted = lissajous.predict(tmp_path / "scan.h5")
+    assert set(predicted) == {"sense"}
+    assert "rmse" in repr(predicted)
+    with pytest.raises(lissajous.BadInput, match="states no device"):
+        lissajous.identify(lissajous.Recording.from_arrays({"sense": (np.arange(9.0), "V", 1e6)}))
+
+
+def test_convert_reads_and_writes_an_instruments_file(tmp_path: Path) -> None:
+    np.savez(tmp_path / "capture.npz", a=np.arange(100.0))
+    mapping = {"channels": {"sense_x": {"variable": "a", "unit": "mV", "sample_rate": 1e3}}}
+    lazy = lissajous.convert(tmp_path / "capture.npz", mapping)
+    written = lissajous.convert(tmp_path / "capture.npz", mapping, tmp_path / "recording.h5")
+    for recording in (lazy, written):
+        np.testing.assert_allclose(recording["sense_x"].read(), 1e-3 * np.arange(100.0))
+
+
+def test_design_lists_pairs_best_first() -> None:
+    found = lissajous.design("imaging", pixels=(200, 200), frame_rate=60.0, fill=0.85)
+    assert found.candidates[0].figure.frame_rate >= 60.0
+    assert "pictures a second" in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("channel", "message"),
+    [
+        (np.zeros(3), "is not a tuple of 3 or 4 items; give"),
+        ((np.zeros((3, 2)), "V", 1e3), "has shape (3, 2); store it as (n,)"),
+        (([[1.0], [2.0, 3.0]], "V", 1e3), "rows differ in length"),
+        ((np.ones(3), "furlong", 1e3), "unit 'furlong' is unknown"),
+        ((np.ones(3), "V", "fast"), "sample_rate is 'fast', not a finite number"),
+    ],
+)
+def test_from_arrays_states_what_it_expects(channel: object, message: str) -> None:
+    with pytest.raises(lissajous.BadInput) as raised:
+        lissajous.Recording.from_arrays({"sense_x": channel})  # type: ignore[dict-item]
+    assert "sense_x" in str(raised.value)
+    assert message in str(raised.value)

@@ -1,0 +1,125 @@
+"""The phase error of the readout, estimated from the picture, and the coverage of its intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from phantoms.experiment import Experiment, simulate_experiment
+from recon.evaluation import truth_from_simulation
+from recon.imaging.readout_phase import correlate_matern32, estimate_readout_phase
+from recon.pipeline import Options, reconstruct
+from scanner.recording import Recording
+from tests.support.simulated import imaging, with_sense
+
+TIME_S = np.linspace(0.0, 0.04, 60)
+POSTERIOR_TIME_S = np.linspace(0.0, 0.04, 41)
+
+
+def measured(truth: np.ndarray, sd: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Measurements of a phase error that is known at ``POSTERIOR_TIME_S``, with their standard deviations [rad]."""
+    return np.interp(TIME_S, POSTERIOR_TIME_S, truth) + rng.normal(0.0, sd, TIME_S.size), np.full(TIME_S.size, sd)
+
+
+@pytest.mark.parametrize("kind", ["as stated", "constant", "drifting"])
+def test_intervals_have_their_nominal_coverage(kind: str) -> None:
+    rng = np.random.default_rng(5)
+    covered, variances, errors = [], [], []
+    for _ in range(40):
+        truth = np.zeros(POSTERIOR_TIME_S.size)
+        if kind != "as stated":
+            truth += np.radians(10.0 ** rng.uniform(-1.5, 0.7))
+        if kind == "drifting":
+            covariance = np.radians(0.1) ** 2 * correlate_matern32(POSTERIOR_TIME_S[:, None] - POSTERIOR_TIME_S, 5e-3)
+            truth += rng.multivariate_normal(np.zeros(POSTERIOR_TIME_S.size), covariance)
+        posterior = estimate_readout_phase(TIME_S, *measured(truth, np.radians(0.03), rng), POSTERIOR_TIME_S)
+        assert posterior is not None
+        error = posterior.mean - truth
+        covered.append(np.abs(error) < 1.96 * np.sqrt(posterior.variance))
+        variances.append(posterior.variance)
+        errors.append(error)
+    assert np.mean(covered) > 0.9
+    rms, stated = np.sqrt(np.mean(np.square(errors))), np.sqrt(np.mean(variances))
+    assert rms < 1.2 * stated
+    if kind == "drifting":
+        assert 0.9 < np.mean(covered) < 0.99  # the intervals are not too wide
+    if kind == "as stated":
+        assert stated < np.radians(0.03) / np.sqrt(10.0)  # a constant alone would have 0.03°/sqrt(60)
+
+
+def test_a_large_constant_is_found_to_the_precision_of_the_mean() -> None:
+    rng = np.random.default_rng(2)
+    truth = np.full(POSTERIOR_TIME_S.size, np.radians(5.0))
+    posterior = estimate_readout_phase(TIME_S, *measured(truth, np.radians(0.03), rng), POSTERIOR_TIME_S)
+    assert posterior is not None
+    assert posterior.sd == pytest.approx(np.radians(0.03) / np.sqrt(TIME_S.size), rel=0.5)
+    assert abs(posterior.value - truth[0]) < 3.0 * posterior.sd
+
+
+def test_without_measurements_there_is_no_estimate() -> None:
+    nothing = np.full(TIME_S.size, np.nan), np.full(TIME_S.size, np.inf)
+    assert estimate_readout_phase(TIME_S, *nothing, POSTERIOR_TIME_S) is None
+
+
+def test_the_estimate_returns_to_the_constant_away_from_the_measurements() -> None:
+    rng = np.random.default_rng(3)
+    value, sd = measured(np.full(POSTERIOR_TIME_S.size, np.radians(1.0)), np.radians(0.03), rng)
+    late = POSTERIOR_TIME_S + 10.0
+    posterior = estimate_readout_phase(TIME_S, value, sd, late)
+    assert posterior is not None
+    np.testing.assert_allclose(posterior.mean, np.radians(1.0), atol=np.radians(0.03))
+    inside = estimate_readout_phase(TIME_S, value, sd, POSTERIOR_TIME_S)
+    assert inside is not None
+    assert posterior.variance.mean() >= inside.variance.mean()
+
+
+def delayed(sense: np.ndarray) -> np.ndarray:
+    """The signal, delayed by half a microsecond."""
+    frequency = np.fft.rfftfreq(2 * sense.size, 0.2e-6)
+    mirrored = np.fft.rfft(np.concatenate([sense, sense[::-1]]))
+    return np.fft.irfft(mirrored * np.exp(-2j * np.pi * frequency * 0.5e-6))[: sense.size]
+
+
+def test_an_unstated_delay_is_estimated_corrected_and_reported() -> None:
+    recording, simulated = imaging()
+    truth = truth_from_simulation(simulated)
+    result = reconstruct(with_sense(recording, delayed), Options(), truth, quiet=True)
+    for axis, rate in (("x", 13840.0), ("y", 3270.0)):
+        late = 2.0 * np.pi * rate * 0.5e-6
+        assert result.readout_phase[axis].value == pytest.approx(late, abs=4.0 * result.readout_phase[axis].sd)
+        assert np.degrees(result.evaluation[axis].phase_rmse) < 0.03
+    assert any("a delay of 0.5 µs" in note and "lissajous diagnose" in note for note in result.notes)
+    alone = reconstruct(with_sense(recording, delayed), Options(sense_only=True), truth, quiet=True)
+    assert np.degrees(alone.evaluation["x"].phase_rmse) > 2.0
+    assert not alone.readout_phase
+
+
+def test_a_correctly_stated_readout_keeps_its_precision() -> None:
+    recording, simulated = imaging()
+    truth = truth_from_simulation(simulated)
+    result, alone = (reconstruct(recording, Options(sense_only=only), truth, quiet=True) for only in (False, True))
+    for axis in "xy":
+        assert result.evaluation[axis].phase_rmse < 1.1 * alone.evaluation[axis].phase_rmse + np.radians(0.002)
+    assert not any("late" in note or "early" in note for note in result.notes)
+
+
+def test_a_specimen_without_detail_gives_a_wide_interval_and_a_note() -> None:
+    recording, simulated = imaging()
+    channels = {k: (c.read(), c.unit, c.sample_rate, c.start) for k, c in recording.channels.items()}
+    light = np.random.default_rng(0).poisson(200.0, recording["intensity"].size).astype(float)
+    channels["intensity"] = (light, *channels["intensity"][1:])
+    featureless = Recording.from_arrays(channels, recording.device)
+    result = reconstruct(featureless, Options(), truth_from_simulation(simulated), quiet=True)
+    for axis in "xy":
+        assert axis not in result.readout_phase
+        sd = result.motion.axes[axis].phase_sd
+        assert np.all(sd > 2.0 * np.pi * 3000.0 * 0.3e-6)
+    assert sum("determines no phase" in note for note in result.notes) == 2
+
+
+@pytest.mark.parametrize(("target", "pixels"), [("siemens_star", 100), ("immunohistochemistry", 100)])
+def test_a_short_scan_with_detail_below_a_pixel_keeps_the_phase_of_the_sense_signal(target: str, pixels: int) -> None:
+    recording, simulated = simulate_experiment(Experiment(target=target, duration=0.006), 3)
+    result = reconstruct(recording, Options(pixels=(pixels, pixels)), truth_from_simulation(simulated), quiet=True)
+    for axis in "xy":
+        assert np.degrees(result.evaluation[axis].phase_rmse) < 0.05

@@ -1,0 +1,79 @@
+"""A law without a name in a device file: it moves the mirror as a named law does, and is straight beyond its range."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scanner.device import Device
+from scanner.errors import DeviceInvalid
+from scanner.forward_model import DriveInput, simulate_axis, stated_terms
+from scanner.terms import catalogue
+from scanner.terms.measured_law import added, beyond, measured_law
+
+TABLE: dict[str, Any] = {
+    "stage": "mechanics", "variables": ["angle", "rate"], "centre": [0.0, 0.0],
+    "lower": [-1.0, -10.0], "upper": [1.0, 10.0],
+    "powers": [[3, 0], [2, 1]], "coefficients": [-19.0, 0.05], "coefficients_sd": [0.1, 0.01],
+}  # fmt: skip
+NAMED = {"cubic-stiffness": {"k3": -19.0}, "cubic-damping": {"b3": 0.05}}
+BARE = """
+name = "pendulum"
+[x.mechanics]
+J = 1.0
+b = 0.5
+k = 114.0
+[x.readout]
+kind = "position"
+gain = 1.0
+noise_sd = 0.001
+"""
+
+
+def device(terms: dict[str, Any]) -> Device:
+    bare = Device.from_toml(BARE)
+    return replace(bare, axes={"x": replace(bare.axis("x"), terms=terms)})
+
+
+def angle(of: Device, start: float) -> np.ndarray:
+    axis = of.axis("x")
+    return simulate_axis(axis, stated_terms(axis), DriveInput(np.zeros((600, 3)), 5e-3), (start, 0.0)).angle
+
+
+def test_a_device_file_keeps_a_measured_law() -> None:
+    made = device({"measured-law": TABLE})
+    assert Device.from_toml(made.to_toml()) == made
+    assert "measured-law" not in catalogue()
+
+
+def test_a_measured_law_moves_the_mirror_as_the_named_laws_do() -> None:
+    assert angle(device({"measured-law": TABLE}), 0.8) == pytest.approx(angle(device(NAMED), 0.8), abs=1e-12)
+
+
+def test_beyond_its_range_a_measured_law_continues_with_the_slope_at_the_edge() -> None:
+    table = TABLE | {
+        "stage": "readout", "variables": ["signal"], "centre": [0.5], "lower": [0.0], "upper": [2.0],
+        "powers": [[2]], "coefficients": [0.1],
+    }  # fmt: skip
+    values = np.array([0.0, 0.5, 2.0, 3.0, -1.0])
+    _, packed = measured_law(table)
+    assert added(values, packed) == pytest.approx([0.025, 0.0, 0.225, 0.225 + 0.3, 0.025 + 0.1])
+    assert beyond(table, [values]) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        ({"stage": "timing"}, "stage 'timing'"),
+        ({"powers": [[3, 0]]}, "wrong length"),
+        ({"coefficients": None}, "lacks"),
+    ],
+)
+def test_a_measured_law_that_cannot_be_used_is_refused(changed: dict[str, Any], what: str) -> None:
+    table = {key: value for key, value in (TABLE | changed).items() if value is not None}
+    with pytest.raises(DeviceInvalid, match=what) as refused:
+        stated_terms(device({"measured-law": table}).axis("x"))
+    assert "x.terms.measured-law" in str(refused.value)
