@@ -38,9 +38,9 @@ def load_device(device: DeviceSource) -> Device:
     Raises:
         BadInput: no device has that name and no file that path, or the file is not a valid device.
     """
-    from phantoms.experiment import device_named
+    from scanner.devices import find
 
-    return device if isinstance(device, Device) else device_named(str(device))
+    return find(device)
 
 
 class Simulation(NamedTuple):

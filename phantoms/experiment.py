@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from phantoms.forward import Plan, Scene, simulate
 from phantoms.optics import Detector, blur_by_spot
@@ -13,7 +12,6 @@ from phantoms.waveforms import Sine, Waveform
 from scanner import devices
 from scanner.device import Device
 from scanner.drift import Drift, exponential
-from scanner.errors import BadInput
 from scanner.recording import Recording
 
 
@@ -80,16 +78,3 @@ def simulate_experiment(
     )
     recording, truth = simulate(experiment.device, plan, Scene(light, experiment.detector), seed, nominal=nominal)
     return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}
-
-
-def device_named(name: str) -> Device:
-    """Return the device of that name that comes with the program, or else the one in that TOML file.
-
-    Raises:
-        BadInput: there is neither.
-    """
-    if name in devices.names():
-        return devices.load(name)
-    if not Path(name).exists():
-        raise BadInput(f"no device is named {name!r} and no file is", hint=f"there are {', '.join(devices.names())}")
-    return Device.load(name)

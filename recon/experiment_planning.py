@@ -20,6 +20,7 @@ from phantoms import waveforms
 from phantoms.waveforms import Constant, Multisine, Sine, Sweep, Waveform
 from recon.io.convert import open_any
 from recon.io.output import check_folder, replacing_folder
+from scanner import devices
 from scanner.device import Device
 from scanner.device_toml import checked_number
 from scanner.errors import BadInput
@@ -203,7 +204,7 @@ def predict_detectability(runs: Sequence[Run], device: Device) -> list[Detectabi
 def plan_files(
     paths: Sequence[Path],
     output: Path,
-    device: Path | None = None,
+    device: str | Path | None = None,
     mapping: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -218,14 +219,13 @@ def plan_files(
     from tqdm import tqdm
 
     from estimation.diagnosis.data import prepare_run
-    from phantoms.experiment import device_named
     from recon.report.diagnosis import plan_report
 
     check_folder(output)
     planned = {path: read_excitation(path) for path in paths if path.suffix == ".toml"}
     with ExitStack() as stack, tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
         recorded = {path: stack.enter_context(open_any(path, mapping)) for path in paths if path.suffix != ".toml"}
-        nominal = device_named(str(device)) if device is not None else None
+        nominal = devices.find(device) if device is not None else None
         nominal = nominal or next((each.device for each in recorded.values() if each.device is not None), None)
         if nominal is None:
             raise BadInput("states no device", file=paths[0], hint="give one with --device")

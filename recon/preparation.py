@@ -113,11 +113,7 @@ def select_device(recording: Recording, device: DeviceSource | None) -> Device:
     Raises:
         BadInput: the file is not a valid device, or none is given and the recording has none.
     """
-    if isinstance(device, str) and device in devices.names():
-        device = devices.load(device)
-    elif device is not None and not isinstance(device, Device):
-        device = Device.load(device)
-    return require_device(recording, device)
+    return require_device(recording, None if device is None else devices.find(device))
 
 
 def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:

@@ -44,10 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    from phantoms.experiment import device_named
+    from scanner.devices import find
 
     return design_scan(
-        device_named(args.device),
+        find(args.device),
         args.output,
         half_angles=args.half_angles,
         pixels=args.pixels,

@@ -24,9 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument(
         "--device",
-        type=Path,
-        metavar="FILE",
-        help="device TOML in place of the recording's own; with --plan, or a name",
+        metavar="NAME|FILE",
+        help="a named device or TOML file in place of the recording's own",
     )
 
 
@@ -40,7 +39,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 def diagnose_files(
     paths: Sequence[Path],
     output: Path,
-    device: Path | None = None,
+    device: str | Path | None = None,
     mapping: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -64,13 +63,13 @@ def diagnose_files(
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder
     from recon.report.diagnosis import diagnosis_report
-    from scanner.device import Device
+    from scanner import devices
 
     check_folder(output)
     began = time.perf_counter()
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
-        nominal = Device.load(device) if device is not None else None
+        nominal = devices.find(device) if device is not None else None
         with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
             diagnosis = diagnose_with_optics(recordings, nominal, bar.set_description_str)
             bar.set_description_str("report")

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the device")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
     parser.add_argument(
-        "--device", type=Path, metavar="FILE", help="nominal device TOML in place of the recordings' own"
+        "--device", metavar="NAME|FILE", help="nominal device, by name or TOML file, in place of the recordings' own"
     )
 
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def identify_files(
-    paths: Sequence[Path], output: Path, device: Path | None = None, mapping: Path | None = None
+    paths: Sequence[Path], output: Path, device: str | Path | None = None, mapping: Path | None = None
 ) -> dict[str, Any]:
     """Identify a device; write device.toml, summary.json and report.html into ``output``; return the summary.
 
@@ -51,13 +51,13 @@ def identify_files(
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder, write_json
     from recon.report.identification import identification_report
-    from scanner.device import Device
+    from scanner import devices
     from scanner.errors import BadInput
 
     check_folder(output)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
-        nominal = Device.load(device) if device else next((r.device for r in recordings if r.device), None)
+        nominal = devices.find(device) if device else next((r.device for r in recordings if r.device), None)
         if nominal is None:
             hint = "give one with --device, or record it under /device"
             raise BadInput("states no device", file=paths[0], channel="/device", hint=hint)

@@ -11,7 +11,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, help="the recording (.h5), or an instrument's file with --mapping")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the prediction")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
+    parser.add_argument(
+        "--device", metavar="NAME|FILE", help="a named device or TOML file in place of the recording's own"
+    )
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
@@ -21,7 +23,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 def predict_file(
     path: Path,
     output: Path,
-    device: Path | None = None,
+    device: str | Path | None = None,
     mapping: Path | None = None,
 ) -> dict[str, Any]:
     """Predict one recording and write predicted.h5 and summary.json into ``output``; return the summary.
@@ -40,13 +42,13 @@ def predict_file(
     from estimation.diagnosis.predict import beyond_measured_laws, predict
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder, write_json
-    from scanner.device import Device
+    from scanner import devices
     from scanner.errors import BadInput
     from scanner.recording import Recording
 
     check_folder(output)
     with open_any(path, mapping) as recording:
-        used = Device.load(device) if device is not None else recording.device
+        used = devices.find(device) if device is not None else recording.device
         if used is None:
             hint = "give one with --device, or record it under /device"
             raise BadInput("states no device", file=path, channel="/device", hint=hint)

@@ -48,7 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="follow: end when nothing came for so long (5)",
     )
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument("--device", type=Path, metavar="FILE", help="device TOML in place of the recording's own")
+    parser.add_argument(
+        "--device", metavar="NAME|FILE", help="a named device or TOML file in place of the recording's own"
+    )
     parser.add_argument("--estimator", metavar="NAME", help="tracker, ukf, ekf, ...; else by what was recorded")
     parser.add_argument(
         "--pixels", type=parse_size, default=(400, 400), metavar="WxH", help="size of the picture (400x400)"

@@ -45,15 +45,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    from phantoms.experiment import Experiment, device_named, simulate_experiment
+    from phantoms.experiment import Experiment, simulate_experiment
     from phantoms.optics import Detector
     from phantoms.waveforms import Sine
+    from scanner import devices
     from scanner.files import check_place
 
     check_place(args.output)
 
     experiment = Experiment(
-        device=device_named(args.device),
+        device=devices.find(args.device),
         target=args.target,
         drives={"x": Sine(*args.drive_x), "y": Sine(*args.drive_y)},
         duration=args.duration,

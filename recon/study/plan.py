@@ -13,9 +13,8 @@ from typing import Any, TypeVar
 
 from estimation.estimators import estimators
 from estimation.estimators import registered as registered_estimators
-from phantoms.experiment import device_named
 from phantoms.targets import TARGETS, TISSUES
-from scanner.device import Device
+from scanner import devices
 from scanner.device_toml import FINITE, NOT_NEGATIVE, POSITIVE, WHOLE, check_values, checked_number
 from scanner.errors import BadInput
 from scanner.files import read_toml
@@ -252,7 +251,7 @@ def _read_design(table: object, folder: Path) -> StudyDesign:
         if not isinstance(getattr(design, name), str):
             raise BadInput(f"is {getattr(design, name)!r} and must be text", channel=f"designs.{name}")
     beside = folder / design.device
-    device = Device.load(beside) if beside.is_file() else device_named(design.device)
+    device = devices.find(beside if beside.is_file() else design.device)
     device.require_scan()
     for name in ("x", "y"):
         device.axis(name)

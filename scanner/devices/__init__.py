@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from pathlib import Path
 
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -24,3 +25,19 @@ def load(name: str) -> Device:
     if name not in names():
         raise BadInput(f"no device is named {name!r}", hint=f"there are {', '.join(names())}")
     return Device.from_toml((files(__name__) / f"{name}.toml").read_text(encoding="utf-8"), source=f"device {name}")
+
+
+def find(source: Device | str | Path) -> Device:
+    """Return a device as it is, the device of that name that comes with the program, or else the one in that TOML file.
+
+    Raises:
+        BadInput: there is neither, or the file is not a valid device.
+    """
+    if isinstance(source, Device):
+        return source
+    if str(source) in names():
+        return load(str(source))
+    if not Path(source).exists():
+        hint = f"`lissajous new-device` writes one; named devices: {', '.join(names())}"
+        raise BadInput(f"no device is named {str(source)!r} and no file is", hint=hint)
+    return Device.load(source)

@@ -1,0 +1,28 @@
+"""Commands take a device by its name or as a file."""
+
+from pathlib import Path
+
+import pytest
+
+from recon.cli import main
+from recon.preparation import select_device
+from scanner import devices
+from tests.support.simulated import imaging
+
+
+def test_a_device_is_found_by_name_by_file_and_as_it_is(tmp_path: Path) -> None:
+    device = devices.load("imaging")
+    (tmp_path / "own.toml").write_text(device.to_toml(), encoding="utf-8")
+    assert devices.find("imaging") == devices.find(tmp_path / "own.toml") == devices.find(device)
+    assert select_device(imaging()[0], "chen2020").name == "chen2020"
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "predict", "identify", "diagnose"])
+def test_a_device_that_is_neither_is_refused(command: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    imaging()[0].slice(0.0, 0.001).write(tmp_path / "scan.h5")
+    arguments = [command, str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out"), "--device", "imagin"]
+    assert main(arguments) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "no device is named 'imagin' and no file is" in line
+    assert "imaging" in line
+    assert not (tmp_path / "out").exists()
