@@ -139,7 +139,7 @@ def report(name: str, case: Case) -> dict[str, Any]:
     """What the diagnosis said of one row, and how the device predicts."""
     diagnosed, predicted, device = case
     began = time.perf_counter()
-    found = diagnose(diagnosed, device, say=lambda text: print(f"   ... {text}", file=sys.stderr, flush=True))
+    found = diagnose(diagnosed, device, progress=lambda text: print(f"   ... {text}", file=sys.stderr, flush=True))
     seconds = time.perf_counter() - began
     errors = {}
     for each in predicted:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-from estimation.diagnosis.diagnose import Diagnosis, diagnose
+from estimation.diagnosis.diagnose import Diagnosis, diagnose, nominal_device
+from estimation.diagnosis.selection import Progress
 from scanner.device import Device
 from scanner.recording import Recording
-
-Progress = Callable[[str], None]
-"""Called with one line of text at the start of every step."""
 
 
 def diagnose_with_optics(
@@ -29,10 +27,10 @@ def diagnose_with_optics(
     Raises:
         BadInput: no device, or a recording that cannot be compared with it.
     """
-    nominal = device or recordings[0].device
+    nominal = nominal_device(recordings, device)
     with_intensity = [recording for recording in recordings if "intensity" in recording]
-    if nominal is None or not with_intensity or any(axis.mechanics for axis in nominal.axes.values()):
-        diagnosis = diagnose(recordings, device, progress)
+    if not with_intensity or any(axis.mechanics for axis in nominal.axes.values()):
+        diagnosis = diagnose(recordings, nominal, progress)
     else:
         diagnosis = Diagnosis("consistent", (), None, nominal, None)
     for recording in with_intensity:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Comparison, Fit, fit_model
+from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import flat_whiteners
 from estimation.diagnosis.model import Candidate, Model
 from recon.io.readers import read
@@ -78,7 +78,7 @@ def by_laws(recording: Recording, laws: Sequence[str]) -> Fit:
     assert device is not None
     run = prepare_run(recording, device)
     model = Model([run], device, [Candidate(catalogue()[effect], "x", "sense") for effect in laws], ())
-    return fit_model(Comparison([run], flat_whiteners(model)), model, np.zeros(len(model.parameters)), max_iterations=8)
+    return fit_model(Likelihood([run], flat_whiteners(model)), model, np.zeros(len(model.parameters)), max_iterations=8)
 
 
 def held_out(size: int) -> NDArray[np.bool_]:
@@ -117,7 +117,7 @@ def main(data: Path, output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
     steps = {}
     for name, recording in recordings(data / "spiral_20hz.mat").items():
-        found = diagnose([recording], say=lambda text: print(f"  ... {text}", flush=True))
+        found = diagnose([recording], progress=lambda text: print(f"  ... {text}", flush=True))
         (output / f"device_{name}.toml").write_text(found.device.to_toml(), encoding="utf-8")
         print(f"Axis {name}")
         print(findings_text(found))

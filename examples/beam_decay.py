@@ -83,12 +83,12 @@ def main(data: Path, output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
     convert_file(next(data.glob("*.lvm")), MAPPING, output / "beam_decay.h5")
     with Recording.open(output / "beam_decay.h5") as whole:
-        found = diagnose([whole.slice(FROM, TO)], say=lambda text: print(f"  ... {text}", flush=True))
+        found = diagnose([whole.slice(FROM, TO)], progress=lambda text: print(f"  ... {text}", flush=True))
     (output / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
     print(f"Found in the decay from {FROM} s to {TO} s")
     print(findings_text(found))
     assert found.search is not None
-    channel = found.search.comparison.runs[0].outputs[0]
+    channel = found.search.likelihood.runs[0].outputs[0]
     rate = 1 / channel.step
     unseen = held_out(channel.data.size, rate)
     _, frequency, decay = slow_motion(channel.data - channel.data.mean(), rate)

@@ -13,7 +13,7 @@ def nested_fits(found: Diagnosis) -> dict[str, Fit]:
     rounds = sorted(found.search.steps, key=lambda each: each.after.neg2_log_evidence - each.before.neg2_log_evidence)
     fits = [found.search.final]
     for each in reversed(rounds):
-        fits.append(refit_without(found.search.comparison, fits[-1], each.candidate))
+        fits.append(refit_without(found.search.likelihood, fits[-1], each.candidate))
     names = ["linear", *(each.candidate.term.effect for each in rounds)]
     return dict(zip(names, reversed(fits), strict=True))
 

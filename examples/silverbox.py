@@ -71,7 +71,7 @@ def main(data: Path, output: Path) -> None:
     convert_file(data / "multisine.npz", MAPPING, output / "silverbox.h5")
     with Recording.open(output / "silverbox.h5") as whole:
         parts = multisines(whole)
-        found = diagnose([parts[FITTED]], say=lambda text: print(f"  ... {text}", flush=True))
+        found = diagnose([parts[FITTED]], progress=lambda text: print(f"  ... {text}", flush=True))
         (output / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
         print(f"Found in multisine {FITTED + 1} of {len(parts)}")
         print(findings_text(found))

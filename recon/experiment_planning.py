@@ -187,7 +187,7 @@ def predict_detectability(runs: Sequence[Run], device: Device) -> list[Detectabi
     Raises:
         BadInput: a readout states no noise.
     """
-    from estimation.diagnosis.fit import Comparison
+    from estimation.diagnosis.fit import Likelihood
     from estimation.diagnosis.identifiability import detectability, linearise_simulated, stated_whitener
     from estimation.diagnosis.initial import fit_initial_state, window_schedule
     from estimation.diagnosis.model import Model
@@ -195,10 +195,10 @@ def predict_detectability(runs: Sequence[Run], device: Device) -> list[Detectabi
 
     whiteners = [[stated_whitener(output) for output in run.outputs] for run in runs]
     model = Model(runs, device)
-    begun = fit_initial_state(Comparison(runs, whiteners), model, window_schedule(model)[0])
+    begun = fit_initial_state(Likelihood(runs, whiteners), model, window_schedule(model)[0])
     x = np.array([v if f.kind == "start" else 0.0 for f, v in zip(model.parameters, begun.x, strict=True)])
-    comparison, fit = linearise_simulated(model, x, whiteners)
-    return detectability(comparison, fit, catalogue().values())
+    likelihood, fit = linearise_simulated(model, x, whiteners)
+    return detectability(likelihood, fit, catalogue().values())
 
 
 def plan_files(

@@ -24,7 +24,7 @@ MIN_REMAINDER_SHARE = 1e-3
 
 def share(found: SelectionResult, each: SelectionStep) -> float:
     """Share of the misfit of its channel that a finding alone explains."""
-    name, noise = _channel(found, each), noise_of(found.comparison)
+    name, noise = _channel(found, each), noise_of(found.likelihood)
     without, complete, nominal = (left_by(fit)[name] for fit in (each.before, found.final, found.nominal))
     return share_of(without, complete, nominal, noise[name])
 
@@ -36,13 +36,13 @@ def remainder(found: SelectionResult) -> dict[str, Any] | None:
     """
     if found.final.validation_chi2 < MAX_HELD_OUT_CHI2:
         return None
-    noise, complete, nominal = noise_of(found.comparison), left_by(found.final), left_by(found.nominal)
+    noise, complete, nominal = noise_of(found.likelihood), left_by(found.final), left_by(found.nominal)
     left, name = max((remainder_of(complete[key], nominal[key], noise[key]), key) for key in complete)
     if left < MIN_REMAINDER_SHARE:
         return None
     present = {each.key for each in found.final.model.candidates}
     free = all_candidates(found.final.model.device, found.final.model, DISCREPANCY_TERMS.values())
-    beside = score_candidates(found.comparison, found.final, [each for each in free if each.key not in present])
+    beside = score_candidates(found.likelihood, found.final, [each for each in free if each.key not in present])
     most = max(beside, key=lambda each: each.predicted_gain, default=None)
     stage = "readout" if most is None else most.candidate.term.stage
     return {"share": left, "stage": stage, "channel": name}
@@ -53,9 +53,9 @@ def unexplained(found: SelectionResult) -> str | None:
     parts, level = [], found.final.validation_chi2
     if level > MAX_HELD_OUT_CHI2:
         parts.append(f"held-out reduced chi-square is still {level:.2f}")
-    noise = noise_of(found.comparison)
+    noise = noise_of(found.likelihood)
     for name, value in left_by(found.final).items():
-        data = [output.data for run in found.comparison.runs for output in run.outputs if output.name == name]
+        data = [output.data for run in found.likelihood.runs for output in run.outputs if output.name == name]
         deviation = float(np.sqrt(np.mean([each.var() for each in data])))
         rest = float(np.sqrt(max(0.0, value - noise[name])))
         if level > MAX_HELD_OUT_CHI2 and rest > MAX_UNEXPLAINED_SHARE * deviation:
@@ -65,6 +65,6 @@ def unexplained(found: SelectionResult) -> str | None:
 
 def _channel(found: SelectionResult, each: SelectionStep) -> str:
     """The channel in which a finding shows: the one it acts on, else the first that its axis is sensed in."""
-    outputs = [output for run in found.comparison.runs for output in run.outputs if each.candidate.axis in output.axes]
+    outputs = [output for run in found.likelihood.runs for output in run.outputs if each.candidate.axis in output.axes]
     acted = [output.name for output in outputs if output.kind == each.candidate.channel.partition(":")[0]]
     return (acted or [output.name for output in outputs])[0]

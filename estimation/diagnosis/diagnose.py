@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -14,14 +14,14 @@ from estimation.diagnosis.decomposition import remainder, share, unexplained
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
-from estimation.diagnosis.fit import Comparison, Fit
+from estimation.diagnosis.fit import Fit, Likelihood
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_only
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.localisation import describe_localisation
 from estimation.diagnosis.model import Candidate
 from estimation.diagnosis.profile_likelihood import profile_interval
 from estimation.diagnosis.progressive_fit import UNIQUE_NAME_THRESHOLD
-from estimation.diagnosis.selection import SelectionResult, SelectionStep, select_terms
+from estimation.diagnosis.selection import Progress, SelectionResult, SelectionStep, select_terms
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -124,23 +124,34 @@ class Diagnosis:
 
 
 def diagnose(
-    recordings: Sequence[Recording], device: Device | None = None, say: Callable[[str], None] = lambda text: None
+    recordings: Sequence[Recording], device: Device | None = None, progress: Progress = lambda text: None
 ) -> Diagnosis:
-    """Hold recordings of one device against it.
+    """Diagnose which effects on drive, mechanics, readout and timing the nominal device omits.
 
     Args:
-        device: nominal; by default that of the first recording.
-        say: told what is being done.
+        recordings: of one device; all are fitted together.
+        device: the nominal one; None takes that of the first recording.
+        progress: called with one line of text at every step.
 
     Raises:
         BadInput: no device, or a recording that cannot be compared with it.
     """
-    device = device or recordings[0].device
-    if device is None:
+    nominal = nominal_device(recordings, device)
+    runs = [prepare_run(recording, nominal) for recording in recordings]
+    return build_diagnosis(select_terms(runs, nominal, catalogue(), progress))
+
+
+def nominal_device(recordings: Sequence[Recording], device: Device | None) -> Device:
+    """The stated device, or else that of the first recording.
+
+    Raises:
+        BadInput: neither is given.
+    """
+    nominal = device or recordings[0].device
+    if nominal is None:
         hint = "give one with --device, or record it under /device"
         raise BadInput("states no device", file=recordings[0].path, hint=hint)
-    runs = [prepare_run(recording, device) for recording in recordings]
-    return build_diagnosis(select_terms(runs, device, catalogue(), say))
+    return nominal
 
 
 def build_diagnosis(found: SelectionResult) -> Diagnosis:
@@ -192,8 +203,8 @@ def _finding(found: SelectionResult, each: SelectionStep) -> Finding:
         stage=candidate.term.stage,
         effect=effect,
         equation=candidate.term.equation,
-        parameters=() if unknown else parameter_estimates(found.comparison, found.final, candidate),
-        where=describe_localisation(found.comparison, candidate, each.before, each.after),
+        parameters=() if unknown else parameter_estimates(found.likelihood, found.final, candidate),
+        where=describe_localisation(found.likelihood, candidate, each.before, each.after),
         probability=options[effect] / total,
         rivals=rivals,
         heldout={"metric": METRIC, "before": each.before.validation_chi2, "after": found.final.validation_chi2},
@@ -216,7 +227,7 @@ def _distances(found: SelectionResult, each: SelectionStep) -> dict[str, float]:
         if lead.candidate.term.effect not in DISCREPANCY_TERMS and lead.candidate.key not in taken
     ]
     rivals = [lead.candidate for lead in leads]
-    first_order = distances_to_rivals(found.comparison, found.final, each.candidate, rivals)
+    first_order = distances_to_rivals(found.likelihood, found.final, each.candidate, rivals)
     return {
         lead.candidate.key: min(distance, float(np.sqrt(max(lead.misfit_gap, 0.0))))
         for lead, distance in zip(leads, first_order, strict=True)
@@ -239,7 +250,7 @@ def _advice(found: SelectionResult, each: SelectionStep, distance: Mapping[str, 
     nearest = min(close, key=lambda key: distance.get(key, np.inf), default=None)
     if nearest is not None and distance.get(nearest, np.inf) < DISCRIMINATION_SIGMA:
         said.append(
-            discrimination_advice(found.comparison, found.final, candidate, close.pop(nearest), distance[nearest])
+            discrimination_advice(found.likelihood, found.final, candidate, close.pop(nearest), distance[nearest])
         )
     for other in close.values():
         text = candidate.term.confounders.get(other.term.effect) or other.term.confounders.get(effect)
@@ -251,20 +262,20 @@ def _name(candidate: Candidate) -> str:
     return "unknown" if candidate.term.effect in DISCREPANCY_TERMS else candidate.term.effect
 
 
-def parameter_estimates(comparison: Comparison, fit: Fit, candidate: Candidate) -> tuple[ParameterEstimate, ...]:
+def parameter_estimates(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> tuple[ParameterEstimate, ...]:
     """Physical values of a candidate's parameters with their 95 % intervals, by profile likelihood.
 
     The values are those of the improved device, whose undetermined nominal values are as stated.
     """
     scales = fit.model.scales(candidate.axis)
     values = fit.model.values(candidate, determined_only(fit))
-    resolution = rail_resolution(comparison.runs, candidate)
+    resolution = rail_resolution(likelihood.runs, candidate)
     found = []
     for parameter, value in zip(candidate.term.parameters, values, strict=True):
         at = fit.model.index("term", candidate.key, parameter.name)
         ends = [value - resolution, value + resolution]
         if at is not None:
-            ends = [parameter.value(end, scales) for end in profile_interval(comparison, fit, at)]
+            ends = [parameter.value(end, scales) for end in profile_interval(likelihood, fit, at)]
         found.append(
             ParameterEstimate(parameter.name, float(value), (float(min(ends)), float(max(ends))), parameter.unit)
         )

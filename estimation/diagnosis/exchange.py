@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.fit import Comparison, Fit, fit_models
+from estimation.diagnosis.fit import Fit, Likelihood, fit_models
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.progressive_fit import ABORT_MARGIN, satisfies_sign_constraints
 from estimation.diagnosis.screening import (
@@ -75,12 +75,12 @@ class ExchangeResult:
 
 
 def fit_exchanges(
-    comparison: Comparison, fit: Fit, removed: Sequence[Candidate], pool: Sequence[Candidate], pairs: bool = False
+    likelihood: Likelihood, fit: Fit, removed: Sequence[Candidate], pool: Sequence[Candidate], pairs: bool = False
 ) -> list[Fit]:
     """Fits with one term of ``pool``, or with ``pairs`` also two, in the place of ``removed``; the best first."""
     present = {candidate.key for candidate in fit.model.candidates}
     new = [candidate for candidate in pool if candidate.key not in present]
-    scores = [s for s in score_candidates(comparison, fit, new, removed=removed) if np.any(s.columns)]
+    scores = [s for s in score_candidates(likelihood, fit, new, removed=removed) if np.any(s.columns)]
     if not scores:
         return []
     ends = np.cumsum([0, *(score.columns.shape[1] for score in scores)])
@@ -101,7 +101,7 @@ def fit_exchanges(
             if rank < MAX_EXCHANGE_FITS or confounds:
                 starts.append(_exchange_start(fit, removed, [scores[i] for i in group], estimate))
     fits = fit_models(
-        comparison,
+        likelihood,
         starts,
         max_iterations=PAIR_ITERATIONS if pairs else EXCHANGE_ITERATIONS,
         abort_above=fit.neg2_log_evidence + ABORT_MARGIN,
@@ -155,14 +155,14 @@ def rivals_of(best: Fit, others: Sequence[Fit]) -> RivalFits:
     )
 
 
-def exchange_to_convergence(comparison: Comparison, fit: Fit, pool: Sequence[Candidate], newest: int) -> ExchangeResult:
+def exchange_to_convergence(likelihood: Likelihood, fit: Fit, pool: Sequence[Candidate], newest: int) -> ExchangeResult:
     """Exchange each of the ``newest`` last terms for a better one until no exchange lowers -2 log evidence."""
     rivals: dict[str, RivalFits] = {}
     for _ in range(MAX_EXCHANGES):
         rivals = {}
         better = None
         for candidate in fit.model.candidates[len(fit.model.candidates) - newest :]:
-            others = fit_exchanges(comparison, fit, (candidate,), pool)
+            others = fit_exchanges(likelihood, fit, (candidate,), pool)
             if others and others[0].neg2_log_evidence < fit.neg2_log_evidence - MIN_EXCHANGE_GAIN:
                 better = others[0]
                 break

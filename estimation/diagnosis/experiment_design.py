@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.diagnosis.data import Run
-from estimation.diagnosis.fit import Comparison, Fit
+from estimation.diagnosis.fit import Fit, Likelihood
 from estimation.diagnosis.identifiability import (
     DISCRIMINATION_SIGMA,
     candidate_sensitivities,
@@ -27,30 +27,30 @@ it."""
 
 
 def distances_to_rivals(
-    comparison: Comparison, fit: Fit, candidate: Candidate, rivals: Sequence[Candidate]
+    likelihood: Likelihood, fit: Fit, candidate: Candidate, rivals: Sequence[Candidate]
 ) -> list[float]:
     """Norm of the fitted effect of a candidate that remains after each rival is fitted in its place [sigma].
 
     For a rival without any effect it is the norm of the whole effect.
     """
     own = np.array([f.kind in ("term", "hidden") and f.owner == candidate.key for f in fit.model.parameters])
-    signal, rest = _effect_signal(comparison, fit, candidate)[fit.rows], fit.jacobian[np.ix_(fit.rows, ~own)]
+    signal, rest = _effect_signal(likelihood, fit, candidate)[fit.rows], fit.jacobian[np.ix_(fit.rows, ~own)]
     found = []
-    for blocks in candidate_sensitivities(comparison, fit, rivals):
+    for blocks in candidate_sensitivities(likelihood, fit, rivals):
         shown = [block[fit.rows] for block in blocks]
         size, apart = unexplained_norms(rest, fit.model.precision[~own], signal[:, None], shown)
         found.append(float(min([size[0], *apart[0]])))
     return found
 
 
-def _effect_signal(comparison: Comparison, fit: Fit, candidate: Candidate) -> Array:
+def _effect_signal(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Array:
     """Effect of a candidate on the whitened residual, shape (N,); to first order if it has an amplitude."""
     moving = amplitude_indices(fit.model, candidate)
     if moving:
         return np.asarray(fit.jacobian[:, moving] @ fit.x[moving])
     kept = [each for each in fit.model.candidates if each is not candidate]
     less = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
-    return fit.residual - comparison.residual(less, less.map_parameters_from(fit.model, fit.x))
+    return fit.residual - likelihood.residual(less, less.map_parameters_from(fit.model, fit.x))
 
 
 @dataclass(frozen=True)
@@ -64,32 +64,32 @@ class CandidateExperiment:
 
 
 def rank_experiments(
-    comparison: Comparison, fit: Fit, candidate: Candidate, rival: Candidate
+    likelihood: Likelihood, fit: Fit, candidate: Candidate, rival: Candidate
 ) -> list[tuple[str, float]]:
     """Further measurements, each with the distance [sigma] to ``rival`` that it would give; the best first."""
     found = []
-    for each in _candidate_experiments(comparison, fit, candidate.axis):
+    for each in _candidate_experiments(likelihood, fit, candidate.axis):
         together = linearise_simulated(each.model, each.x, each.whiteners)
         found.append((each.what, distances_to_rivals(*together, candidate, [rival])[0]))
     return sorted(found, key=lambda pair: -pair[1])
 
 
 def discrimination_advice(
-    comparison: Comparison, fit: Fit, candidate: Candidate, rival: Candidate, distance: float
+    likelihood: Likelihood, fit: Fit, candidate: Candidate, rival: Candidate, distance: float
 ) -> str:
     """Distance to a confounder in words, and the measurements that would distinguish the two."""
     name = rival.term.effect
     said = f"{name} lies {distance:.1f} σ away, {DISCRIMINATION_SIGMA} are needed"
     computed = [
-        f"{what}: {d:.1f} σ" for what, d in rank_experiments(comparison, fit, candidate, rival) if d > 1.2 * distance
+        f"{what}: {d:.1f} σ" for what, d in rank_experiments(likelihood, fit, candidate, rival) if d > 1.2 * distance
     ]
     known = candidate.term.confounders.get(name) or rival.term.confounders.get(candidate.term.effect)
     return "; ".join([said, *computed, *([known] if known else [])])
 
 
-def _candidate_experiments(comparison: Comparison, fit: Fit, axis: str) -> Iterator[CandidateExperiment]:
+def _candidate_experiments(likelihood: Likelihood, fit: Fit, axis: str) -> Iterator[CandidateExperiment]:
     """Measurements that could be added to the runs of ``fit``."""
-    runs, whiteners = fit.model.runs, comparison.whiteners
+    runs, whiteners = fit.model.runs, likelihood.whiteners
     r = next(i for i, run in enumerate(runs) if axis in run.inputs)
     if not any(output.name == f"angle_{axis}" for run in runs for output in run.outputs):
         seeing = _with_angle(runs[r], axis)

@@ -92,8 +92,8 @@ class Fit:
         return float(np.mean(self.residual[self.validation_rows] ** 2))
 
 
-class Comparison:
-    """Whitened residuals of a model against recordings, with masks of the fitted and the held-out samples.
+class Likelihood:
+    """Gaussian likelihood of the recordings: whitened residuals of a model, and masks of fitted and held-out samples.
 
     Attributes:
         runs: the recordings.
@@ -192,7 +192,7 @@ class Comparison:
 
 
 def fit_model(
-    comparison: Comparison,
+    likelihood: Likelihood,
     model: Model,
     x: Array,
     stop: float = 1.0,
@@ -214,10 +214,10 @@ def fit_model(
         fixed: index of a parameter that keeps its value.
     """
     steps = np.full(x.size, INITIAL_STEP) if steps is None else steps
-    rows = comparison.fitted(stop)
+    rows = likelihood.fitted(stop)
     result = fit_levenberg_marquardt(
-        lambda trial: comparison.residual(model, trial, stop),
-        lambda trial, residual: comparison.jacobian(model, trial, residual, steps, stop),
+        lambda trial: likelihood.residual(model, trial, stop),
+        lambda trial, residual: likelihood.jacobian(model, trial, residual, steps, stop),
         x,
         model.precision,
         rows=rows,
@@ -226,11 +226,11 @@ def fit_model(
         tolerance=tolerance,
         abort_above=abort_above,
     )
-    return _finalise_fit(comparison, model, result.x, result.residual, result.jacobian, rows)
+    return _finalise_fit(likelihood, model, result.x, result.residual, result.jacobian, rows)
 
 
 def fit_models(
-    comparison: Comparison,
+    likelihood: Likelihood,
     starts: Iterable[tuple[Model, Array]],
     stop: float = 1.0,
     max_iterations: int = 12,
@@ -240,22 +240,22 @@ def fit_models(
     """:func:`fit_model` for each model and start, ``MAX_PARALLEL_FITS`` at a time, in the order of ``starts``."""
 
     def fit(start: tuple[Model, Array]) -> Fit:
-        return fit_model(comparison, *start, stop, max_iterations, tolerance=tolerance, abort_above=abort_above)
+        return fit_model(likelihood, *start, stop, max_iterations, tolerance=tolerance, abort_above=abort_above)
 
     return list(FIT_POOL.map(fit, starts))
 
 
-def linearise_at(comparison: Comparison, model: Model, x: Array, stop: float = 1.0) -> Fit:
+def linearise_at(likelihood: Likelihood, model: Model, x: Array, stop: float = 1.0) -> Fit:
     """Residual and Jacobian of a model at ``x``, as a fit without iterations."""
-    residual, steps = comparison.residual(model, x, stop), np.full(x.size, INITIAL_STEP)
+    residual, steps = likelihood.residual(model, x, stop), np.full(x.size, INITIAL_STEP)
     for _ in range(2):  # the first Jacobian adapts the steps
-        jacobian = comparison.jacobian(model, x, residual, steps, stop)
-    return _finalise_fit(comparison, model, x, residual, jacobian, comparison.fitted(stop))
+        jacobian = likelihood.jacobian(model, x, residual, steps, stop)
+    return _finalise_fit(likelihood, model, x, residual, jacobian, likelihood.fitted(stop))
 
 
-def _finalise_fit(comparison: Comparison, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:
+def _finalise_fit(likelihood: Likelihood, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:
     """A fit with its Laplace evidence."""
     chi2, penalty = float(residual[rows] @ residual[rows]), float(model.precision @ (x * x))
     information = jacobian[rows].T @ jacobian[rows]
     evidence = laplace_neg2_log_evidence(chi2 + penalty, information, model.precision**-0.5)
-    return Fit(model, x, chi2, penalty, residual, jacobian, rows, comparison.validation_rows, evidence)
+    return Fit(model, x, chi2, penalty, residual, jacobian, rows, likelihood.validation_rows, evidence)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.diagnosis.data import Output
-from estimation.diagnosis.fit import Comparison, Fit, linearise_at
+from estimation.diagnosis.fit import Fit, Likelihood, linearise_at
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener
 from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
@@ -72,7 +72,7 @@ class Detectability:
     distance: float
 
 
-def detectability(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> list[Detectability]:
+def detectability(likelihood: Likelihood, fit: Fit, terms: Iterable[Term]) -> list[Detectability]:
     """Detectability of every effect that ``fit`` does not contain, the largest first.
 
     An effect with a time constant or frequency has the median size over the grid of that parameter; for a confounder
@@ -80,11 +80,11 @@ def detectability(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> li
     """
     taken = {each.key for each in fit.model.candidates}
     candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in taken]
-    blocks = candidate_sensitivities(comparison, fit, candidates)
+    blocks = candidate_sensitivities(likelihood, fit, candidates)
     found = [(candidate, block) for candidate, own in zip(candidates, blocks, strict=True) for block in own]
     if not found:
         return []
-    sizes, apart = discrimination_distances(fit, [block for _, block in found], comparison.rows)
+    sizes, apart = discrimination_distances(fit, [block for _, block in found], likelihood.rows)
     keys = np.array([candidate.key for candidate, _ in found])
     effects = np.array([candidate.term.effect for candidate, _ in found])
     shown = []
@@ -99,13 +99,13 @@ def detectability(comparison: Comparison, fit: Fit, terms: Iterable[Term]) -> li
     return sorted(shown, key=lambda each: -each.sigma)
 
 
-def candidate_sensitivities(comparison: Comparison, fit: Fit, candidates: Sequence[Candidate]) -> list[list[Array]]:
+def candidate_sensitivities(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> list[list[Array]]:
     """Sensitivities to every candidate around ``fit``, shape (N, q), for each point of linearisation with any effect.
 
     The effect of the unknown initial hidden state is projected out, because it is no evidence for the term.
     """
-    rows, shown = comparison.rows, []
-    for screened in score_candidate_starts(comparison, fit, candidates):
+    rows, shown = likelihood.rows, []
+    for screened in score_candidate_starts(likelihood, fit, candidates):
         blocks = []
         for each in screened:
             own, hidden = np.split(each.columns, [max(1, len(amplitude_indices(each.model, each.candidate)))], axis=1)
@@ -154,15 +154,15 @@ def unexplained_norms(nominal: Array, precision: Array, signals: Array, blocks: 
     return np.sqrt(size), np.sqrt(np.maximum(apart, 0.0))
 
 
-def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Comparison, Fit]:
-    """Comparison of a model with its own signals at ``x`` as recordings, and the perfect fit to them."""
+def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Likelihood, Fit]:
+    """Likelihood of the signals of a model at ``x`` as recordings, and the exact fit of the model to them."""
     runs = [
         replace(run, outputs=tuple(replace(o, data=signal) for o, signal in zip(run.outputs, signals, strict=True)))
         for run, signals in zip(model.runs, model.outputs(x), strict=True)
     ]
     made = Model(runs, model.device, model.candidates, model.mains)
-    comparison = Comparison(runs, whiteners)
-    return comparison, linearise_at(comparison, made, x)
+    likelihood = Likelihood(runs, whiteners)
+    return likelihood, linearise_at(likelihood, made, x)
 
 
 def stated_whitener(output: Output) -> Whitener:

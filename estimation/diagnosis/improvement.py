@@ -24,7 +24,7 @@ class Improvement:
 
     Attributes:
         search: without the findings that were rejected.
-        device: never predicts worse than the nominal one, beyond the uncertainty of that comparison.
+        device: never predicts worse than the nominal one, beyond the uncertainty of that likelihood.
         nominal, improved: how the two devices predict every channel.
     """
 
@@ -44,11 +44,11 @@ class Improvement:
 def improve(found: SelectionResult) -> Improvement:
     """Return the device with the findings that do not make its open-loop prediction worse.
 
-    A named law that makes it worse than the nominal device's, beyond the uncertainty of that comparison, is rejected,
+    A named law that makes it worse than the nominal device's, beyond the uncertainty of that likelihood, is rejected,
     the weakest first. A law without a name is a finding all the same. Where the device with it predicts no better, the
     device stays nominal.
     """
-    runs, stated = found.comparison.runs, found.final.model.device
+    runs, stated = found.likelihood.runs, found.final.model.device
     nominal = open_loop(runs, stated)
     while True:
         unnamed = any(each.candidate.term.effect in DISCREPANCY_TERMS for each in found.steps)
@@ -79,17 +79,17 @@ def static_law(found: SelectionResult) -> Fit:
     fewer = Candidate(replace(free.term, parameters=parameters), free.axis, free.channel)
     others = fit.model.candidates[:-1]
     model = Model(fit.model.runs, fit.model.device, [*others, fewer] if static else others, fit.model.mains)
-    return fit_model(found.comparison, model, model.map_parameters_from(fit.model, fit.x))
+    return fit_model(found.likelihood, model, model.map_parameters_from(fit.model, fit.x))
 
 
 def without_weakest(found: SelectionResult) -> SelectionResult:
     """A search's result without the finding that explains least."""
     weakest = min(found.steps, key=lambda each: each.before.chi2 + each.before.penalty)
     rest = [each for each in found.steps if each is not weakest]
-    final = refit_without(found.comparison, found.final, weakest.candidate) if rest else found.nominal
+    final = refit_without(found.likelihood, found.final, weakest.candidate) if rest else found.nominal
 
     def refitted(each: SelectionStep) -> SelectionStep:
-        before = refit_without(found.comparison, final, each.candidate) if len(rest) > 1 else found.nominal
+        before = refit_without(found.likelihood, final, each.candidate) if len(rest) > 1 else found.nominal
         return replace(each, before=before, after=final)
 
     return replace(found, final=final, steps=tuple(map(refitted, rest)))

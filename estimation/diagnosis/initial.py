@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimation.diagnosis.data import Output
-from estimation.diagnosis.fit import Comparison, Fit, fit_model, fit_models
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.diagnosis.model import Model
 from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener, near_lines, noise_psd
 from scanner.arrays import Array
@@ -69,7 +69,7 @@ def _lines_overlap(output: Output, lines: Array, width: float, motion: float) ->
 
 
 def fit_initial_state(
-    comparison: Comparison, model: Model, stop: float, grid: tuple[int, int] = (9, 12), finalists: int = 3
+    likelihood: Likelihood, model: Model, stop: float, grid: tuple[int, int] = (9, 12), finalists: int = 3
 ) -> Fit:
     """Fit the initial angle and rate over the first window, from a grid of amplitudes and phases for each run.
 
@@ -95,7 +95,7 @@ def fit_initial_state(
         for r, run in enumerate(model.runs):
             for axis in run.inputs:
                 one[_start_indices(model, axis, r)] = next(place)[i]
-    fits = fit_models(comparison, [(model, one) for one in starts_x], stop, max_iterations=10)
+    fits = fit_models(likelihood, [(model, one) for one in starts_x], stop, max_iterations=10)
     return min(fits, key=lambda fit: fit.chi2 + fit.penalty)
 
 
@@ -112,7 +112,7 @@ def _misfit(model: Model, r: int, x: Array, stop: float) -> float:
 
 
 def fit_progressively(
-    comparison: Comparison, model: Model, x: Array, stops: Sequence[float], max_iterations: int = 6
+    likelihood: Likelihood, model: Model, x: Array, stops: Sequence[float], max_iterations: int = 6
 ) -> list[Fit]:
     """Fits over windows of increasing length, each started from the one before."""
     steps = np.full(x.size, 1e-4)
@@ -120,7 +120,7 @@ def fit_progressively(
     for stop in stops:
         last = stop == stops[-1]
         fit = fit_model(
-            comparison, model, x, stop, 2 * max_iterations if last else max_iterations, steps, 0.05 if last else 1.0
+            likelihood, model, x, stop, 2 * max_iterations if last else max_iterations, steps, 0.05 if last else 1.0
         )
         fits.append(fit)
         x = fit.x

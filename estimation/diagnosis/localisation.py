@@ -4,35 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.diagnosis.fit import Comparison, Fit
+from estimation.diagnosis.fit import Fit, Likelihood
 from estimation.diagnosis.model import Candidate
 from scanner.arrays import Array
 
 
-def chi2_reduction_by_channel(comparison: Comparison, before: Fit, after: Fit) -> dict[str, float]:
+def chi2_reduction_by_channel(likelihood: Likelihood, before: Fit, after: Fit) -> dict[str, float]:
     """Fall of chi-square from ``before`` to ``after`` in each channel, over fitted and held-out samples."""
-    keep = comparison.rows | comparison.validation_rows
+    keep = likelihood.rows | likelihood.validation_rows
     fall = np.where(keep, before.residual**2 - after.residual**2, 0.0)
-    names = [output.name for run in comparison.runs for output in run.outputs]
+    names = [output.name for run in likelihood.runs for output in run.outputs]
     total: dict[str, float] = {}
     for i, name in enumerate(names):
-        total[name] = total.get(name, 0.0) + float(fall[comparison.channel == i].sum())
+        total[name] = total.get(name, 0.0) + float(fall[likelihood.channel == i].sum())
     return total
 
 
-def chi2_reduction_by_time(comparison: Comparison, before: Fit, after: Fit, bins: int = 40) -> Array:
+def chi2_reduction_by_time(likelihood: Likelihood, before: Fit, after: Fit, bins: int = 40) -> Array:
     """Fall of the mean squared whitened residual in intervals of equal duration, shape (bins,)."""
-    keep = comparison.rows | comparison.validation_rows
-    slot = np.minimum((comparison.time * bins).astype(int), bins - 1)[keep]
+    keep = likelihood.rows | likelihood.validation_rows
+    slot = np.minimum((likelihood.time * bins).astype(int), bins - 1)[keep]
     fall = (before.residual**2 - after.residual**2)[keep]
     return np.bincount(slot, fall, bins) / np.maximum(np.bincount(slot, minlength=bins), 1)
 
 
-def chi2_reduction_by_harmonic(comparison: Comparison, before: Fit, after: Fit, count: int = 8) -> dict[int, float]:
+def chi2_reduction_by_harmonic(likelihood: Likelihood, before: Fit, after: Fit, count: int = 8) -> dict[int, float]:
     """Share of the fall of chi-square around each multiple of the motion's frequency, over all channels."""
     reduction: dict[int, float] = {}
     first = 0
-    for run, whiteners in zip(comparison.runs, comparison.whiteners, strict=True):
+    for run, whiteners in zip(likelihood.runs, likelihood.whiteners, strict=True):
         for output, whiten in zip(run.outputs, whiteners, strict=True):
             part = slice(first, first + whiten.samples)
             first += whiten.samples
@@ -46,19 +46,19 @@ def chi2_reduction_by_harmonic(comparison: Comparison, before: Fit, after: Fit, 
     return {n: max(v, 0.0) / total for n, v in reduction.items()}
 
 
-def describe_localisation(comparison: Comparison, candidate: Candidate, before: Fit, after: Fit) -> str:
+def describe_localisation(likelihood: Likelihood, candidate: Candidate, before: Fit, after: Fit) -> str:
     """One line: stage, channels, time and harmonics of the misfit that a term explains."""
     place = f"{candidate.term.stage} of axis {candidate.axis}"
-    channels = chi2_reduction_by_channel(comparison, before, after)
+    channels = chi2_reduction_by_channel(likelihood, before, after)
     total = sum(max(v, 0.0) for v in channels.values())
     if total < 20.0:
         pulls = before.penalty - after.penalty
         return f"{place}: not in the residual; chi-square of the nominal values' deviations falls by {pulls:.0f}"
     shares = ", ".join(f"{name} {max(v, 0.0) / total:.0%}" for name, v in sorted(channels.items(), key=lambda i: -i[1]))
-    by_time = np.maximum(chi2_reduction_by_time(comparison, before, after), 0.0)
+    by_time = np.maximum(chi2_reduction_by_time(likelihood, before, after), 0.0)
     centre = float(by_time @ (np.arange(by_time.size) + 0.5) / by_time.size / max(by_time.sum(), 1e-300))
     when = "throughout" if 0.35 < centre < 0.65 else "mostly early" if centre < 0.5 else "mostly late"
-    harmonics = chi2_reduction_by_harmonic(comparison, before, after)
+    harmonics = chi2_reduction_by_harmonic(likelihood, before, after)
     top = sorted(harmonics.items(), key=lambda item: -item[1])[:3]
     around = ", ".join(f"{n}f {share:.0%}" for n, share in top if share > 0.05)
     return f"{place}: {shares} of the misfit, {when} (centre at {centre:.0%}), around {around}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.diagnosis.fit import Comparison, Fit
+from estimation.diagnosis.fit import Fit, Likelihood
 from scanner.arrays import Array
 from scanner.forward_model import AxisTrajectory
 
@@ -37,7 +37,7 @@ def draw_parameters(fit: Fit, count: int = POSTERIOR_DRAWS) -> Array:
 
 
 def phase_portrait(
-    comparison: Comparison, final: Fit, residuals: Sequence[Array], run_index: int, channel_index: int
+    likelihood: Likelihood, final: Fit, residuals: Sequence[Array], run_index: int, channel_index: int
 ) -> list[Array]:
     """Root mean square of each residual over the angle and rate of the mirror, in units of the noise.
 
@@ -45,17 +45,17 @@ def phase_portrait(
         For each residual shape (PORTRAIT_CELLS, PORTRAIT_CELLS): rows are rates and columns angles, from minus to plus
         the largest of the run; NaN for states that the mirror never had.
     """
-    outputs_before = sum(len(run.outputs) for run in comparison.runs[:run_index])
-    output = comparison.runs[run_index].outputs[channel_index]
-    of_channel = comparison.channel == outputs_before + channel_index
+    outputs_before = sum(len(run.outputs) for run in likelihood.runs[:run_index])
+    output = likelihood.runs[run_index].outputs[channel_index]
+    of_channel = likelihood.channel == outputs_before + channel_index
     trajectory = axis_trajectories(final, final.x, run_index)[output.axes[0]]
-    at = comparison.time[of_channel] * output.data.size * output.stride + output.first
+    at = likelihood.time[of_channel] * output.data.size * output.stride + output.first
     grid = np.arange(trajectory.angle.size)
     row, column = (
         np.clip((np.interp(at, grid, v) / np.abs(v).max() + 1.0) / 2.0 * PORTRAIT_CELLS, 0, PORTRAIT_CELLS - 1)
         for v in (trajectory.rate, trajectory.angle)
     )
-    compared = (comparison.rows | comparison.validation_rows)[of_channel]
+    compared = (likelihood.rows | likelihood.validation_rows)[of_channel]
     cell = (row.astype(np.intp) * PORTRAIT_CELLS + column.astype(np.intp))[compared]
     count = np.bincount(cell, minlength=PORTRAIT_CELLS**2)
     portraits = []

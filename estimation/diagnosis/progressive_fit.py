@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.fit import MAX_PARALLEL_FITS, Comparison, Fit, fit_model, fit_models, linearise_at
+from estimation.diagnosis.fit import MAX_PARALLEL_FITS, Fit, Likelihood, fit_model, fit_models, linearise_at
 from estimation.diagnosis.initial import estimate_whiteners
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.screening import (
@@ -106,25 +106,25 @@ def satisfies_sign_constraints(fit: Fit) -> bool:
     )
 
 
-def evidence_gain(comparison: Comparison, before: Fit, after: Fit) -> float:
+def evidence_gain(likelihood: Likelihood, before: Fit, after: Fit) -> float:
     """Fall of -2 log evidence from ``before`` to ``after``, 0 below the detection threshold.
 
     The part that slow noise, rising more steeply than extrapolated, would also explain does not count.
     """
-    excused = comparison.low_frequency_excess_allowance(before) - comparison.low_frequency_excess_allowance(after)
+    excused = likelihood.low_frequency_excess_allowance(before) - likelihood.low_frequency_excess_allowance(after)
     lead = before.neg2_log_evidence - after.neg2_log_evidence - excused
     # the remainder is as uncertain as the steepness of slow noise
     return lead if lead >= DETECTION_THRESHOLD * (COLOURED_NOISE_SAFETY_FACTOR if excused > lead else 1.0) else 0.0
 
 
-def is_significant(comparison: Comparison, before: Fit, after: Fit) -> bool:
+def is_significant(likelihood: Likelihood, before: Fit, after: Fit) -> bool:
     """Whether a term lowers -2 log evidence beyond the threshold and also improves the held-out samples.
 
     Where a term hardly acts on the held-out samples (it returns a nominal value to its prior, or it is a clip level
     that is reached at the start only), they need not improve, within the scatter of the change. Beside a clip level
     they must: slow noise is clipped with the signal and resembles an offset in the clipped periods.
     """
-    lead = evidence_gain(comparison, before, after)
+    lead = evidence_gain(likelihood, before, after)
     if not lead:
         return False
     gained = float(
@@ -149,14 +149,14 @@ def is_significant(comparison: Comparison, before: Fit, after: Fit) -> bool:
     return gained > share
 
 
-def fit_screened_candidates(comparison: Comparison, base: Fit, candidates: Sequence[Candidate]) -> list[Fit]:
+def fit_screened_candidates(likelihood: Likelihood, base: Fit, candidates: Sequence[Candidate]) -> list[Fit]:
     """Fits of the candidates with a predicted gain around ``base``; the best first.
 
     Discrepancy terms, which cost most, are fitted only if they gain beside the best named term.
     """
-    promising = sorted(score_candidates(comparison, base, candidates), key=lambda s: -s.predicted_gain)
+    promising = sorted(score_candidates(likelihood, base, candidates), key=lambda s: -s.predicted_gain)
     named, free = _split_discrepancy([each for each in promising if each.predicted_gain > MIN_PREDICTED_GAIN])
-    return _fit_named_first(named, free, lambda part, bar: _fit_shortlist(comparison, base, part))
+    return _fit_named_first(named, free, lambda part, bar: _fit_shortlist(likelihood, base, part))
 
 
 def _split_discrepancy(screened: Sequence[ScoreTest]) -> tuple[list[ScoreTest], list[ScoreTest]]:
@@ -182,23 +182,23 @@ def _fit_named_first(
 
 def _explains(fit: Fit, free: Sequence[Candidate]) -> bool:
     """Whether no discrepancy term has a predicted gain beside a fit, under the noise in the residual of the fit."""
-    comparison = Comparison(fit.model.runs, estimate_whiteners(fit.model, fit.x))
-    again = fit_model(comparison, fit.model, fit.x, max_iterations=3)
+    likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
+    again = fit_model(likelihood, fit.model, fit.x, max_iterations=3)
     if again.chi2 > CHI2_LINEARISABLE * int(again.rows.sum()):
         return False
-    return all(each.predicted_gain < DETECTION_THRESHOLD for each in score_candidates(comparison, again, free))
+    return all(each.predicted_gain < DETECTION_THRESHOLD for each in score_candidates(likelihood, again, free))
 
 
-def _fit_shortlist(comparison: Comparison, base: Fit, promising: Sequence[ScoreTest]) -> list[Fit]:
+def _fit_shortlist(likelihood: Likelihood, base: Fit, promising: Sequence[ScoreTest]) -> list[Fit]:
     """Fits, with possible signs, of the candidates with the largest predicted gains.
 
     Where the misfit is large, predictions may be wrong by a factor of ten either way. Then all candidates are fitted
     for a few iterations, and the worse half is dropped.
     """
-    running = [(each.model, damped_newton_start(comparison, base, each)) for each in promising]
+    running = [(each.model, damped_newton_start(likelihood, base, each)) for each in promising]
     if promising and promising[0].predicted_gain > NONLINEAR_GAIN:
         for turns in (2, 3):
-            fits = sorted(fit_models(comparison, running, max_iterations=turns), key=lambda fit: fit.neg2_log_evidence)
+            fits = sorted(fit_models(likelihood, running, max_iterations=turns), key=lambda fit: fit.neg2_log_evidence)
             running = [(fit.model, fit.x) for fit in fits[: max(BEAM_WIDTH, len(fits) // 2)]]
         hopeless = (
             min((fit.neg2_log_evidence for fit in fits if satisfies_sign_constraints(fit)), default=np.inf)
@@ -207,11 +207,11 @@ def _fit_shortlist(comparison: Comparison, base: Fit, promising: Sequence[ScoreT
     else:
         clear = [each for each in promising if each.predicted_gain > 0.5 * promising[0].predicted_gain]
         running, hopeless = running[: max(BEAM_WIDTH, len(clear))], np.inf
-    return [fit for fit in fit_models(comparison, running, abort_above=hopeless) if satisfies_sign_constraints(fit)]
+    return [fit for fit in fit_models(likelihood, running, abort_above=hopeless) if satisfies_sign_constraints(fit)]
 
 
 def fit_candidates_progressively(
-    comparison: Comparison,
+    likelihood: Likelihood,
     nominal: Model,
     early: Sequence[Fit],
     stops: Sequence[float],
@@ -226,10 +226,10 @@ def fit_candidates_progressively(
     Args:
         early: fits of the nominal model over the windows ``stops``.
     """
-    followed, reached, base, brink = _divergence_window(comparison, nominal, early, stops)
+    followed, reached, base, brink = _divergence_window(likelihood, nominal, early, stops)
     growing = [each for each in candidates if each.term.initial_seeds]
     others = [each for each in candidates if not each.term.initial_seeds]
-    field = sorted(score_candidates(comparison, base, others, brink), key=lambda each: -each.predicted_gain)
+    field = sorted(score_candidates(likelihood, base, others, brink), key=lambda each: -each.predicted_gain)
     choosy = base.rows.sum() > MIN_SAMPLES_FOR_SHORTLIST
     named, _ = _split_discrepancy(field)
     named = [
@@ -237,7 +237,7 @@ def fit_candidates_progressively(
         for i, each in enumerate(named)
         if not choosy or i < MAX_INITIAL_CANDIDATES or each.predicted_gain > 0.5 * field[0].predicted_gain
     ]
-    named += _seed_self_excited(comparison, nominal, followed, growing, brink)
+    named += _seed_self_excited(likelihood, nominal, followed, growing, brink)
     _, free = _split_discrepancy(field[:MAX_INITIAL_CANDIDATES])
     later = [stop for stop in stops if stop > brink]
     tracks = list(_refine_windows([reached, brink, *later])) if reached else [brink, *_refine_windows([brink, *later])]
@@ -246,15 +246,15 @@ def fit_candidates_progressively(
         running = [
             (
                 each.model,
-                _init_from_last_good(each, followed) if reached else damped_newton_start(comparison, base, each, brink),
+                _init_from_last_good(each, followed) if reached else damped_newton_start(likelihood, base, each, brink),
             )
             for each in part
         ]
         if not any(each.candidate.term.effect in DISCREPANCY_TERMS for each in part):
-            return _fit_over_windows(comparison, running, tracks, reached, MAX_WINDOW_SPLITS)
+            return _fit_over_windows(likelihood, running, tracks, reached, MAX_WINDOW_SPLITS)
         fits: list[Fit] = []
         for one in running:  # one by one: each may need its own intermediate windows
-            fits += _fit_over_windows(comparison, [one], tracks, reached, MAX_WINDOW_SPLITS_SINGLE, rival)
+            fits += _fit_over_windows(likelihood, [one], tracks, reached, MAX_WINDOW_SPLITS_SINGLE, rival)
             rival = min([*fits, *([rival] if rival else [])], key=lambda fit: fit.neg2_log_evidence, default=None)
         return fits
 
@@ -262,14 +262,14 @@ def fit_candidates_progressively(
 
 
 def _seed_self_excited(
-    comparison: Comparison, nominal: Model, followed: Fit, growing: Sequence[Candidate], brink: float
+    likelihood: Likelihood, nominal: Model, followed: Fit, growing: Sequence[Candidate], brink: float
 ) -> Iterator[ScoreTest]:
     """Score tests of self-excited modes, which are not linear around zero: the best start for every size of coupling.
 
     They use the nominal values of the last fitted window; values fitted over a longer one would imitate the mode.
     """
-    straying = linearise_at(comparison, nominal, nominal.map_parameters_from(followed.model, followed.x), brink)
-    for starts in score_candidate_starts(comparison, straying, growing, brink):
+    straying = linearise_at(likelihood, nominal, nominal.map_parameters_from(followed.model, followed.x), brink)
+    for starts in score_candidate_starts(likelihood, straying, growing, brink):
         size = starts[0].model.index("term", starts[0].candidate.key, starts[0].candidate.term.free_parameters[0].name)
         for each in {start.x[size]: start for start in sorted(starts, key=lambda start: start.predicted_gain)}.values():
             if each.predicted_gain > MIN_PREDICTED_GAIN:
@@ -291,24 +291,24 @@ class DivergenceWindow(NamedTuple):
 
 
 def _divergence_window(
-    comparison: Comparison, model: Model, early: Sequence[Fit], stops: Sequence[float]
+    likelihood: Likelihood, model: Model, early: Sequence[Fit], stops: Sequence[float]
 ) -> DivergenceWindow:
     """The two windows between which ``model`` fails, found among ``stops`` and refined by bisection."""
     first = _first_divergent(early)
     followed, reached, stop = early[max(first - 1, 0)], stops[first - 1] if first else 0.0, stops[first]
-    failing = fit_model(comparison, model, model.map_parameters_from(early[first].model, early[first].x), stop, 8)
+    failing = fit_model(likelihood, model, model.map_parameters_from(early[first].model, early[first].x), stop, 8)
     for later in stops[first + 1 :]:
         if _reduced_chi2(failing) > CHI2_ADEQUATE:
             break
         # under the estimated noise the model may fit a window that it failed to fit under the first guess
         followed, reached, stop = failing, stop, later
-        failing = fit_model(comparison, model, failing.x, stop, 8)
+        failing = fit_model(likelihood, model, failing.x, stop, 8)
     while (
         _reduced_chi2(failing) > SPLIT_RATIO * max(_reduced_chi2(followed), 1.0)
         and stop > MIN_WINDOW_RATIO**2 * reached > 0.0
     ):
         middle = float(np.sqrt(reached * stop))
-        fit = fit_model(comparison, model, model.map_parameters_from(followed.model, followed.x), middle, 8)
+        fit = fit_model(likelihood, model, model.map_parameters_from(followed.model, followed.x), middle, 8)
         if _reduced_chi2(fit) < 2.0 * _reduced_chi2(followed):
             followed, reached = fit, middle
         else:
@@ -317,7 +317,7 @@ def _divergence_window(
 
 
 def _fit_over_windows(
-    comparison: Comparison,
+    likelihood: Likelihood,
     running: list[tuple[Model, Array]],
     stops: Sequence[float],
     reached: float,
@@ -346,7 +346,7 @@ def _fit_over_windows(
                 (fit.neg2_log_evidence for fit in fits if satisfies_sign_constraints(fit)), default=bar - ABORT_MARGIN
             )
             some = running[first : first + MAX_PARALLEL_FITS]
-            fits += fit_models(comparison, some, stop, turns, tolerance, abort_above=best + ABORT_MARGIN)
+            fits += fit_models(likelihood, some, stop, turns, tolerance, abort_above=best + ABORT_MARGIN)
         fits.sort(key=lambda fit: (not satisfies_sign_constraints(fit), fit.neg2_log_evidence))
         now = _reduced_chi2(fits[0])
         lost = level < CHI2_LINEARISABLE and now > DIVERGENCE_RATIO * max(level, 1.0)
@@ -360,7 +360,7 @@ def _fit_over_windows(
             lost_at[stop] = now
             splits -= 1
             continue
-        if fits[0].chi2 > bar or (stop >= stops[:WINDOWS_PER_STEP][-1] and _dominated(comparison, fits[0], rival)):
+        if fits[0].chi2 > bar or (stop >= stops[:WINDOWS_PER_STEP][-1] and _dominated(likelihood, fits[0], rival)):
             return []
         reached, level = ahead.pop(), now
         if len(fits) <= BEAM_WIDTH or fits[BEAM_WIDTH].neg2_log_evidence > fits[0].neg2_log_evidence + PRUNE_MARGIN:
@@ -384,11 +384,11 @@ def _deduplicate(fits: Sequence[Fit]) -> Iterator[Fit]:
             yield fit
 
 
-def _dominated(comparison: Comparison, fit: Fit, rival: Fit | None) -> bool:
+def _dominated(likelihood: Likelihood, fit: Fit, rival: Fit | None) -> bool:
     """Whether a fit over a window is worse than ``rival`` even if only noise remained outside the window."""
     if rival is None:
         return False
-    unseen = comparison.rows & ~fit.rows
+    unseen = likelihood.rows & ~fit.rows
     rest = min(float(np.sum(rival.residual[unseen] ** 2)), MIN_NOISE_CHI2 * int(unseen.sum()))
     return fit.chi2 + rest > rival.neg2_log_evidence + ABORT_MARGIN
 

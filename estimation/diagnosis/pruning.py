@@ -11,12 +11,12 @@ from math import comb, log
 
 import numpy as np
 
-from estimation.diagnosis.fit import Comparison, Fit, fit_model
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.model import Candidate, Model
 from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
 
 
-def prune_by_evidence(comparison: Comparison, fit: Fit) -> Fit | None:
+def prune_by_evidence(likelihood: Likelihood, fit: Fit) -> Fit | None:
     """Refit with the required amplitudes of the last term, a discrepancy term; None if none is required.
 
     The -2 log evidence of the result includes the choice of the amplitudes: every subset of the same size is equally
@@ -34,7 +34,7 @@ def prune_by_evidence(comparison: Comparison, fit: Fit) -> Fit | None:
     )
     pruned = Candidate(replace(candidate.term, parameters=parameters), candidate.axis, candidate.channel)
     model = Model(fit.model.runs, fit.model.device, [*fit.model.candidates[:-1], pruned], fit.model.mains)
-    refit = fit_model(comparison, model, model.map_parameters_from(fit.model, fit.x))
+    refit = fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
     choice = 2.0 * log(comb(len(indices), len(required)))
     return replace(refit, neg2_log_evidence=refit.neg2_log_evidence + choice)
 

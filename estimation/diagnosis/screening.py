@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.diagnosis.fit import TRAJECTORY_POOL, Comparison, Fit
+from estimation.diagnosis.fit import TRAJECTORY_POOL, Fit, Likelihood
 from estimation.diagnosis.model import Candidate, Model
 from scanner.arrays import Array
 from scanner.device import Device
@@ -90,7 +90,7 @@ def is_amplitude(candidate: Candidate, parameter: Parameter) -> bool:
 
 
 def score_candidates(
-    comparison: Comparison,
+    likelihood: Likelihood,
     base: Fit,
     candidates: Iterable[Candidate],
     stop: float = 1.0,
@@ -103,25 +103,25 @@ def score_candidates(
     """
     return [
         max(found, key=lambda each: each.predicted_gain)
-        for found in score_candidate_starts(comparison, base, candidates, stop, removed)
+        for found in score_candidate_starts(likelihood, base, candidates, stop, removed)
     ]
 
 
 def score_candidate_starts(
-    comparison: Comparison,
+    likelihood: Likelihood,
     base: Fit,
     candidates: Iterable[Candidate],
     stop: float = 1.0,
     removed: Sequence[Candidate] = (),
 ) -> list[list[ScoreTest]]:
     """As :func:`score_candidates`, from every start of every candidate."""
-    rows = base.rows & (comparison.time < stop)
+    rows = base.rows & (likelihood.time < stop)
     known = ProfiledLinearModel(base, rows, removed)
-    return list(TRAJECTORY_POOL.map(lambda each: _score_starts(comparison, base, each, known, rows, stop), candidates))
+    return list(TRAJECTORY_POOL.map(lambda each: _score_starts(likelihood, base, each, known, rows, stop), candidates))
 
 
 def _score_starts(
-    comparison: Comparison,
+    likelihood: Likelihood,
     base: Fit,
     candidate: Candidate,
     known: ProfiledLinearModel,
@@ -142,10 +142,10 @@ def _score_starts(
     for first in range(0, len(points), LANES):
         some = points[first : first + LANES]
         if moving:
-            found = _sensitivities(comparison, base, model, some, moving, hidden, rows, stop)
+            found = _sensitivities(likelihood, base, model, some, moving, hidden, rows, stop)
         else:  # not linear around zero (a clip level, a mode that grows): the change by a finite size
             model.prefetch_trajectories(some, stop)
-            found = [(comparison.residual(model, x, stop) - base.residual)[:, None] for x in some]
+            found = [(likelihood.residual(model, x, stop) - base.residual)[:, None] for x in some]
         for x, columns in zip(some, found, strict=True):
             normal, gradient, response = known.normal_equations(columns[rows])
             gain, estimate = linear_gain(normal, gradient)
@@ -182,20 +182,20 @@ def hidden_state_indices(model: Model, candidate: Candidate) -> list[int]:
     return [i for i, f in enumerate(model.parameters) if f.kind == "hidden" and f.owner == candidate.key]
 
 
-def damped_newton_start(comparison: Comparison, base: Fit, each: ScoreTest, stop: float = 1.0) -> Array:
+def damped_newton_start(likelihood: Likelihood, base: Fit, each: ScoreTest, stop: float = 1.0) -> Array:
     """Start of a fit: the first-order step, halved until chi-square grows by less than ``MAX_CHI2_GROWTH``."""
-    rows = base.rows & (comparison.time < stop)
+    rows = base.rows & (likelihood.time < stop)
     level = MAX_CHI2_GROWTH * float(base.residual[rows] @ base.residual[rows])
     share = 1.0
     while share > 0.1:
-        residual = comparison.residual(each.model, each.x + share * each.step, stop)[rows]
+        residual = likelihood.residual(each.model, each.x + share * each.step, stop)[rows]
         if residual @ residual < level:
             break
         share *= 0.5
     return np.asarray(each.x + share * each.step)
 
 
-def _sensitivities(comparison: Comparison, base: Fit, model: Model, points: Sequence[Array], moving: Sequence[int],
+def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequence[Array], moving: Sequence[int],
                    hidden: Sequence[int], rows: NDArray[np.bool_], stop: float) -> list[Array]:  # fmt: skip
     """At every one of ``points`` the derivatives of the whitened residual by the amplitudes ``moving`` and by the first
     of them times each of the ``hidden`` states, shape (N, q + h)."""
@@ -210,7 +210,7 @@ def _sensitivities(comparison: Comparison, base: Fit, model: Model, points: Sequ
             x[list(numbers)] = list(numbers.values())
         model.prefetch_trajectories(list(changed.values()), stop)
         for (p, j), x in changed.items():
-            yield p, j, comparison.residual(model, x, stop) - base.residual
+            yield p, j, likelihood.residual(model, x, stop) - base.residual
 
     left = list(np.ndindex(deltas.shape))
     for turn in range(2):

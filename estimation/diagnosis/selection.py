@@ -11,7 +11,7 @@ from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.data import Run
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.exchange import RivalFit, RivalFits, exchange_to_convergence, fit_exchanges, rivals_of
-from estimation.diagnosis.fit import Comparison, Fit, fit_model, fit_models
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.diagnosis.initial import (
     estimate_whiteners,
     fit_initial_state,
@@ -39,6 +39,7 @@ from scanner.device import Device
 from scanner.terms import Term
 
 Progress = Callable[[str], None]
+"""Called with one line of text at every step."""
 
 MAX_EFFECTS = 3
 """Effects that are selected in one diagnosis. It bounds the cost: each effect needs a search among all candidates."""
@@ -88,20 +89,20 @@ class SelectionResult:
     """What was found.
 
     Attributes:
-        comparison: under the last noise.
+        likelihood: under the last noise.
         nominal: the nominal device under the last noise.
         final: the device with all that was found.
         steps: effect by effect.
     """
 
-    comparison: Comparison
+    likelihood: Likelihood
     nominal: Fit
     final: Fit
     steps: tuple[SelectionStep, ...] = field(default_factory=tuple)
 
 
 def select_terms(
-    runs: Sequence[Run], device: Device, terms: Mapping[str, Term], say: Progress = lambda text: None
+    runs: Sequence[Run], device: Device, terms: Mapping[str, Term], progress: Progress = lambda text: None
 ) -> SelectionResult:
     """Select the terms that ``device`` omits from ``runs``.
 
@@ -110,47 +111,49 @@ def select_terms(
 
     Args:
         terms: candidates by effect.
-        say: called with a line of progress.
+        progress: called with one line of text at every step.
     """
     clipped = clipped_readouts(runs, terms.get("saturation"))
     model = Model(runs, device, clipped)
-    say("nominal device")
+    progress("nominal device")
     stops = window_schedule(model)
-    comparison = Comparison(runs, flat_whiteners(model))
-    early = fit_progressively(comparison, model, fit_initial_state(comparison, model, stops[0]).x, stops)
-    comparison = Comparison(runs, _min_entropy_whiteners(_fit_hum_variants(comparison, early[-1])))
-    nominal = fit_model(comparison, model, early[-1].x)
+    likelihood = Likelihood(runs, flat_whiteners(model))
+    early = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)
+    likelihood = Likelihood(runs, _min_entropy_whiteners(_fit_hum_variants(likelihood, early[-1])))
+    nominal = fit_model(likelihood, model, early[-1].x)
     named = [each for each in terms.values() if each.effect not in {certain.term.effect for certain in clipped}]
-    states = [SelectionState(comparison, nominal, select_mains_hum(comparison, nominal), {})]
-    states += _forward_steps(states[0], [*named, *DISCREPANCY_TERMS.values()], early, stops, say)
+    states = [SelectionState(likelihood, nominal, select_mains_hum(likelihood, nominal), {})]
+    states += _forward_steps(states[0], [*named, *DISCREPANCY_TERMS.values()], early, stops, progress)
     found = states[-1]
     if (
         _ends_with_discrepancy(found.best)
         and found.nominal.validation_chi2 > CHI2_LARGE
         and found.best.validation_chi2 > CHI2_ADEQUATE
     ):
-        several = _accept_while_halving(states[-2], _forward_steps(states[-2], named, early, stops, say, found.tried))
+        several = _accept_while_halving(
+            states[-2], _forward_steps(states[-2], named, early, stops, progress, found.tried)
+        )
         enough = several.best.validation_chi2 - 1.0 < MAX_REMAINING_MISFIT_RATIO * (
             several.nominal.validation_chi2 - 1.0
         )
         if (
             enough
-            and fit_model(found.comparison, several.best.model, several.best.x).neg2_log_evidence
+            and fit_model(found.likelihood, several.best.model, several.best.x).neg2_log_evidence
             < found.best.neg2_log_evidence
         ):
             found = several
     if _ends_with_discrepancy(found.best):
         # with the required amplitudes only, its law is simpler and better determined
-        fewer = prune_by_evidence(found.comparison, found.best)
+        fewer = prune_by_evidence(found.likelihood, found.best)
         if fewer is not None and fewer.neg2_log_evidence < found.best.neg2_log_evidence:
             found = replace(found, best=fewer)
     elif len(found.best.model.candidates) > len(clipped):
         found = _replace_terms_by_discrepancy(found)
     steps = tuple(
-        _selection_step(found.comparison, found.nominal, found.best, each, found.rivals.get(each.key, ()))
+        _selection_step(found.likelihood, found.nominal, found.best, each, found.rivals.get(each.key, ()))
         for each in found.best.model.candidates
     )
-    return SelectionResult(found.comparison, found.nominal, found.best, steps)
+    return SelectionResult(found.likelihood, found.nominal, found.best, steps)
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,7 @@ class SelectionState:
         tried: fits of the named terms among which the last was chosen, under the noise before it.
     """
 
-    comparison: Comparison
+    likelihood: Likelihood
     nominal: Fit
     best: Fit
     rivals: Mapping[str, RivalFits]
@@ -175,7 +178,7 @@ def _forward_steps(
     terms: Sequence[Term],
     early: Sequence[Fit],
     stops: Sequence[float],
-    say: Progress,
+    progress: Progress,
     tried: Sequence[Fit] = (),
 ) -> Iterator[SelectionState]:
     """States of the selection after each added term.
@@ -183,65 +186,65 @@ def _forward_steps(
     Args:
         tried: fits of the candidates of the first step, if they exist already.
     """
-    comparison, nominal, best, rivals = state.comparison, state.nominal, state.best, dict(state.rivals)
+    likelihood, nominal, best, rivals = state.likelihood, state.nominal, state.best, dict(state.rivals)
     for _ in range(MAX_EFFECTS - len(best.model.candidates)):
         taken = {each.key for each in best.model.candidates}
         if taken:
             # The noise was estimated before these terms were fitted, so it may contain part of their effect.
-            comparison = Comparison(best.model.runs, estimate_whiteners(best.model, best.x))
-            best = fit_model(comparison, best.model, best.x)
-        best = with_interference_line(comparison, best)
+            likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
+            best = fit_model(likelihood, best.model, best.x)
+        best = with_interference_line(likelihood, best)
         adequate = bool(rivals) and best.validation_chi2 < CHI2_ADEQUATE
         pool = [each for each in terms if not (adequate and each.effect in DISCREPANCY_TERMS)]
         candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
-        say(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
+        progress(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
         if tried:
             fits, tried = list(tried), ()
         elif best.chi2 < (CHI2_DIVERGED if taken else CHI2_LINEARISABLE) * best.rows.sum():
-            fits = fit_screened_candidates(comparison, best, candidates)
+            fits = fit_screened_candidates(likelihood, best, candidates)
         else:
             if taken:
-                say(f"refitting windows with {', '.join(sorted(taken))}")
+                progress(f"refitting windows with {', '.join(sorted(taken))}")
                 early = fit_progressively(
-                    comparison, best.model, best.model.map_parameters_from(early[0].model, early[0].x), stops
+                    likelihood, best.model, best.model.map_parameters_from(early[0].model, early[0].x), stops
                 )
-            fits = fit_candidates_progressively(comparison, best.model, early, stops, candidates)
+            fits = fit_candidates_progressively(likelihood, best.model, early, stops, candidates)
         if not fits or best.neg2_log_evidence - fits[0].neg2_log_evidence < DETECTION_THRESHOLD:
             return
-        say(f"refit with {fits[0].model.candidates[-1].key}")
-        comparison = Comparison(best.model.runs, estimate_whiteners(fits[0].model, fits[0].x))
+        progress(f"refit with {fits[0].model.candidates[-1].key}")
+        likelihood = Likelihood(best.model.runs, estimate_whiteners(fits[0].model, fits[0].x))
         by_name = [fit for fit in fits if not _ends_with_discrepancy(fit)]
         reach = max(REFIT_MARGIN, REFIT_MARGIN_RELATIVE * (best.neg2_log_evidence - fits[0].neg2_log_evidence))
         close = [fit for fit in fits if fit.neg2_log_evidence < fits[0].neg2_log_evidence + reach][:6]
-        close = fit_models(comparison, [(fit.model, fit.x) for fit in close])
+        close = fit_models(likelihood, [(fit.model, fit.x) for fit in close])
         close = sorted((fit for fit in close if satisfies_sign_constraints(fit)), key=lambda fit: fit.neg2_log_evidence)
-        before = fit_model(comparison, best.model, best.x, max_iterations=4)
-        nominal = before if not rivals else fit_model(comparison, nominal.model, nominal.x, max_iterations=4)
-        found = next((fit for fit in close if is_significant(comparison, before, fit)), None)
+        before = fit_model(likelihood, best.model, best.x, max_iterations=4)
+        nominal = before if not rivals else fit_model(likelihood, nominal.model, nominal.x, max_iterations=4)
+        found = next((fit for fit in close if is_significant(likelihood, before, fit)), None)
         if found is None and before.validation_chi2 > CHI2_INADEQUATE and not taken:
             found = next(
                 (fit for fit in close if _ends_with_discrepancy(fit)), None
             )  # an effect is missing, of which only the stage is known
         if found is None:
-            yield SelectionState(comparison, nominal, before, rivals, by_name)
+            yield SelectionState(likelihood, nominal, before, rivals, by_name)
             return
         named = [each for each in candidates if each.term.effect not in DISCREPANCY_TERMS]
         leads = _rivals_of_newest(found, before, close)
         if _ends_with_discrepancy(found):
-            say("replacing the discrepancy term by named terms")
-            comparison, before, found = _replace_discrepancy_by_terms(comparison, before, found, named)
+            progress("replacing the discrepancy term by named terms")
+            likelihood, before, found = _replace_discrepancy_by_terms(likelihood, before, found, named)
             close = []  # they were fitted under another noise if terms were exchanged
         if not _ends_with_discrepancy(found) and found.chi2 < CHI2_DIVERGED * found.rows.sum():
             # The first term may imitate several effects: where much misfit remains, it may be exchanged too.
             kept = len(best.model.candidates) if found.validation_chi2 <= CHI2_LINEARISABLE else 0
             newest = min(len(found.model.candidates) - kept, len(uncertain(found.model)))
-            final = exchange_to_convergence(comparison, found, named, newest)
+            final = exchange_to_convergence(likelihood, found, named, newest)
             earlier = _rivals_of_newest(final.fit, before, close)
             leads = {key: _merge_rivals(own, earlier.get(key, ())) for key, own in final.rivals.items()}
             found = final.fit
         rivals |= leads
-        best = drop_redundant(comparison, found)
-        yield SelectionState(comparison, nominal, best, rivals, by_name)
+        best = drop_redundant(likelihood, found)
+        yield SelectionState(likelihood, nominal, best, rivals, by_name)
         if _ends_with_discrepancy(best):
             return
 
@@ -258,28 +261,28 @@ def _accept_while_halving(start: SelectionState, further: Iterator[SelectionStat
 
 
 def _replace_discrepancy_by_terms(
-    comparison: Comparison, before: Fit, free: Fit, named: Sequence[Candidate]
-) -> tuple[Comparison, Fit, Fit]:
+    likelihood: Likelihood, before: Fit, free: Fit, named: Sequence[Candidate]
+) -> tuple[Likelihood, Fit, Fit]:
     """Replace a discrepancy term by named terms if they have the better evidence, under newly estimated noise.
 
     Returns:
-        comparison, the fit before, the fit with the terms or, where none will do, with the free correction.
+        likelihood, the fit before, the fit with the terms or, where none is adequate, with the discrepancy term.
     """
-    others = fit_exchanges(comparison, free, free.model.candidates[-1:], named, pairs=True)
+    others = fit_exchanges(likelihood, free, free.model.candidates[-1:], named, pairs=True)
     others = [
         fit
         for fit in others
-        if fit.neg2_log_evidence < free.neg2_log_evidence and is_significant(comparison, before, fit)
+        if fit.neg2_log_evidence < free.neg2_log_evidence and is_significant(likelihood, before, fit)
     ]
     if not others:
-        return comparison, before, free
+        return likelihood, before, free
     found = others[0]
     fewer = [fit for fit in others if len(fit.model.candidates) < len(found.model.candidates)]
     # the second of two terms must be significant like any second effect
-    if fewer and not is_significant(comparison, fewer[0], found):
+    if fewer and not is_significant(likelihood, fewer[0], found):
         found = fewer[0]
-    comparison = Comparison(comparison.runs, estimate_whiteners(found.model, found.x))
-    return comparison, fit_model(comparison, before.model, before.x), fit_model(comparison, found.model, found.x)
+    likelihood = Likelihood(likelihood.runs, estimate_whiteners(found.model, found.x))
+    return likelihood, fit_model(likelihood, before.model, before.x), fit_model(likelihood, found.model, found.x)
 
 
 def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
@@ -289,24 +292,24 @@ def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
     be fitted only around a model that has the phase right. With a single term per stage, the most important term is
     replaced if the fit is inadequate. The replaced terms are reported as rivals. Otherwise the state is unchanged.
     """
-    comparison, fit = state.comparison, state.best
+    likelihood, fit = state.likelihood, state.best
     terms = uncertain(fit.model)
     removed = max(([each for each in terms if each.term.stage == one.term.stage] for one in terms), key=len)
     if len(removed) == 1:
         if fit.validation_chi2 < CHI2_INADEQUATE:
             return state
-        removed = [max(terms, key=lambda each: refit_without(comparison, fit, each).neg2_log_evidence)]
+        removed = [max(terms, key=lambda each: refit_without(likelihood, fit, each).neg2_log_evidence)]
     free = all_candidates(fit.model.device, fit.model, DISCREPANCY_TERMS.values())
-    others = [each for each in fit_exchanges(comparison, fit, removed, free) if each.chi2 < fit.chi2]
+    others = [each for each in fit_exchanges(likelihood, fit, removed, free) if each.chi2 < fit.chi2]
     fewer = [
         each
-        for each in (prune_by_evidence(comparison, other) for other in others[:MAX_DISCREPANCY_FITS])
+        for each in (prune_by_evidence(likelihood, other) for other in others[:MAX_DISCREPANCY_FITS])
         if each is not None
     ]
     best = min(fewer, key=lambda each: each.neg2_log_evidence, default=fit)
     if best.neg2_log_evidence > fit.neg2_log_evidence - UNIQUE_NAME_THRESHOLD:
         return state
-    found = drop_redundant(comparison, best)
+    found = drop_redundant(likelihood, best)
     worse = fit.chi2 + fit.penalty - best.chi2 - best.penalty
     leads = tuple(RivalFit(fit.neg2_log_evidence - best.neg2_log_evidence, each, worse) for each in removed)
     return replace(state, best=found, rivals={**state.rivals, found.model.candidates[-1].key: leads})
@@ -339,18 +342,18 @@ def _ends_with_discrepancy(fit: Fit) -> bool:
     return bool(fit.model.candidates) and fit.model.candidates[-1].term.effect in DISCREPANCY_TERMS
 
 
-def drop_redundant(comparison: Comparison, fit: Fit) -> Fit:
+def drop_redundant(likelihood: Likelihood, fit: Fit) -> Fit:
     """Refit without the terms that the others make redundant.
 
     A confounder may be selected first and become redundant once the true effect is added. Hum is selected anew with and
     without every term: in a short recording a drift and one mains frequency resemble the other mains frequency.
     """
-    fit = select_mains_hum(comparison, fit)
+    fit = select_mains_hum(likelihood, fit)
     several = len(fit.model.candidates) > 1
     for each in uncertain(fit.model) if several else ():
-        less = select_mains_hum(comparison, refit_without(comparison, fit, each))
-        if not evidence_gain(comparison, less, fit):
-            return drop_redundant(comparison, less)
+        less = select_mains_hum(likelihood, refit_without(likelihood, fit, each))
+        if not evidence_gain(likelihood, less, fit):
+            return drop_redundant(likelihood, less)
     return fit
 
 
@@ -359,15 +362,15 @@ def uncertain(model: Model) -> list[Candidate]:
     return [each for each in model.candidates if each.term.free_parameters]
 
 
-def refit_without(comparison: Comparison, fit: Fit, candidate: Candidate) -> Fit:
+def refit_without(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Fit:
     """The fit refitted with one of its terms taken out."""
     kept = [each for each in fit.model.candidates if each is not candidate]
     model = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
-    return fit_model(comparison, model, model.map_parameters_from(fit.model, fit.x))
+    return fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
 
 
 def _selection_step(
-    comparison: Comparison,
+    likelihood: Likelihood,
     nominal: Fit,
     best: Fit,
     candidate: Candidate,
@@ -375,20 +378,20 @@ def _selection_step(
 ) -> SelectionStep:
     """The selection step of one term of the final fit."""
     alone = len(best.model.candidates) == 1 and bool(candidate.term.free_parameters)
-    return SelectionStep(candidate, nominal if alone else refit_without(comparison, best, candidate), best, rivals)
+    return SelectionStep(candidate, nominal if alone else refit_without(likelihood, best, candidate), best, rivals)
 
 
-def select_mains_hum(comparison: Comparison, fit: Fit) -> Fit:
+def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none."""
-    return min(_fit_hum_variants(comparison, fit), key=lambda each: each.neg2_log_evidence)
+    return min(_fit_hum_variants(likelihood, fit), key=lambda each: each.neg2_log_evidence)
 
 
-def _fit_hum_variants(comparison: Comparison, fit: Fit) -> list[Fit]:
+def _fit_hum_variants(likelihood: Likelihood, fit: Fit) -> list[Fit]:
     """The fit without hum, and with hum of each mains frequency alone."""
     heard = ((), *((each,) for each in MAINS_HZ))
     models = [Model(fit.model.runs, fit.model.device, fit.model.candidates, mains) for mains in heard]
     return fit_models(
-        comparison, [(model, model.map_parameters_from(fit.model, fit.x)) for model in models], max_iterations=3
+        likelihood, [(model, model.map_parameters_from(fit.model, fit.x)) for model in models], max_iterations=3
     )
 
 
@@ -401,7 +404,7 @@ def _min_entropy_whiteners(fits: Iterable[Fit]) -> list[list[Whitener]]:
     return min(found, key=lambda noise: sum(float(np.log(each.psd).sum()) for row in noise for each in row))
 
 
-def with_interference_line(comparison: Comparison, fit: Fit) -> Fit:
+def with_interference_line(likelihood: Likelihood, fit: Fit) -> Fit:
     """The same fit, with the strongest interfering line in the natural scales of its runs."""
     line = strongest_foreign_line(fit)
     if line is None:

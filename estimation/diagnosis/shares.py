@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from estimation.diagnosis.data import Run
-from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Comparison, Fit, fit_model
+from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import fit_initial_state, flat_whiteners, window_schedule
 from estimation.diagnosis.model import Model
 from scanner.arrays import Array, Mask
@@ -52,9 +52,9 @@ def remainder_of(complete: float, nominal: float, noise: float) -> float:
     return float(np.clip((complete - noise) / max(nominal - noise, 1e-300), 0.0, 1.0))
 
 
-def noise_variance(comparison: Comparison, run: int, output: int) -> float:
+def noise_variance(likelihood: Likelihood, run: int, output: int) -> float:
     """Variance of a channel's noise as the whitening has it, in the band that is compared."""
-    psd, size = comparison.whiteners[run][output].psd, comparison.runs[run].outputs[output].data.size
+    psd, size = likelihood.whiteners[run][output].psd, likelihood.runs[run].outputs[output].data.size
     return float(np.sum(psd)) * 2.0 / size**2
 
 
@@ -68,12 +68,12 @@ def left_by(fit: Fit) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in total.items()}
 
 
-def noise_of(comparison: Comparison) -> dict[str, float]:
+def noise_of(likelihood: Likelihood) -> dict[str, float]:
     """Variance of every channel's noise, over all runs that have it."""
     total: dict[str, list[float]] = {}
-    for r, run in enumerate(comparison.runs):
+    for r, run in enumerate(likelihood.runs):
         for i, output in enumerate(run.outputs):
-            total.setdefault(output.name, []).append(noise_variance(comparison, r, i))
+            total.setdefault(output.name, []).append(noise_variance(likelihood, r, i))
     return {name: float(np.mean(values)) for name, values in total.items()}
 
 
@@ -105,9 +105,9 @@ def with_start(runs: Sequence[Run], device: Device) -> tuple[Model, Array]:
             for f, p in zip(model.parameters, model.precision, strict=True)
         ]
     )
-    comparison = Comparison(runs, flat_whiteners(model))
+    likelihood = Likelihood(runs, flat_whiteners(model))
     first = window_schedule(model)[0]
-    x = fit_model(comparison, model, fit_initial_state(comparison, model, first).x, first, 12, tolerance=1e-3).x
+    x = fit_model(likelihood, model, fit_initial_state(likelihood, model, first).x, first, 12, tolerance=1e-3).x
     return model, np.array(
         [value if f.kind in ("start", "hidden") else 0.0 for f, value in zip(model.parameters, x, strict=True)]
     )

@@ -109,14 +109,14 @@ def _motion_sections(diagnosis: Diagnosis, search: SelectionResult, errors: Mapp
         )
         head = ["effect", "difference", "judgement"]
         sections.append(Section("Effects compared", text, Table(head, evidence_rows(search.steps))))
-    effects = detectability(search.comparison, search.final, catalogue().values())
+    effects = detectability(search.likelihood, search.final, catalogue().values())
     return [*sections, _detectability(effects), _nominal_values(diagnosis)]
 
 
 def _phase_errors(search: SelectionResult) -> dict[str, PhaseError]:
     """Phase errors of open-loop predictions by recording and axis."""
     errors = {}
-    for r, run in enumerate(search.comparison.runs):
+    for r, run in enumerate(search.likelihood.runs):
         for axis in run.inputs:
             error = phase_error(search.nominal, search.final, axis, r)
             if error is not None:
@@ -128,10 +128,10 @@ def _waveforms(search: SelectionResult) -> Section:
     figures = [
         waveform_figure(
             waveform(search.nominal, search.final, r, channel),
-            f"{run.name}, {output.name}" if len(search.comparison.runs) > 1 else output.name,
+            f"{run.name}, {output.name}" if len(search.likelihood.runs) > 1 else output.name,
             UNITS.get(output.kind, ""),
         )
-        for r, run in enumerate(search.comparison.runs)
+        for r, run in enumerate(search.likelihood.runs)
         for channel, output in enumerate(run.outputs)
     ]
     return Section("Measured and simulated waveforms", figures=figures, least="26rem")
@@ -158,7 +158,7 @@ def _blur_section(errors: Mapping[str, PhaseError]) -> Section:
 def _residuals(search: SelectionResult) -> Section:
     figures = []
     first = 0
-    for run, whiteners in zip(search.comparison.runs, search.comparison.whiteners, strict=True):
+    for run, whiteners in zip(search.likelihood.runs, search.likelihood.whiteners, strict=True):
         for output, whitener in zip(run.outputs, whiteners, strict=True):
             part = slice(first, first + whitener.samples)
             first += whitener.samples
@@ -174,9 +174,9 @@ def _residuals(search: SelectionResult) -> Section:
 def _portraits(search: SelectionResult) -> Section:
     pair = (search.nominal.residual, search.final.residual)
     figures = []
-    for r, run in enumerate(search.comparison.runs):
+    for r, run in enumerate(search.likelihood.runs):
         for channel, output in enumerate(run.outputs):
-            before, after = phase_portrait(search.comparison, search.final, pair, r, channel)
+            before, after = phase_portrait(search.likelihood, search.final, pair, r, channel)
             caption = f"{run.name}, {output.name}: residual over angle and rate of axis {output.axes[0]}"
             figures.append(portrait_figure(before, after, caption))
     return Section("Residuals over the state of the mirror", figures=figures, least="24rem")

@@ -84,7 +84,7 @@ def test_a_plan_predicts_the_detectability_in_the_recording(tmp_path: Path) -> N
     assert diagnosis.search is not None
     sigma_in_recording = {
         effect.candidate.key: effect.sigma
-        for effect in detectability(diagnosis.search.comparison, diagnosis.search.final, catalogue().values())
+        for effect in detectability(diagnosis.search.likelihood, diagnosis.search.final, catalogue().values())
     }
     planned = predicted_detectability(sweep)
     for key in ("x.cubic-stiffness", "x.quadratic-drag", "x.gain-drift", "x.damping-drift", "x.readout-lag"):

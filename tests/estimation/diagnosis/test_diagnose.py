@@ -14,7 +14,7 @@ from estimation.diagnosis.data import decimate, is_steady, prepare_run, resample
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.exchange import fit_exchanges
-from estimation.diagnosis.fit import Comparison, fit_model
+from estimation.diagnosis.fit import Likelihood, fit_model
 from estimation.diagnosis.initial import (
     estimate_whiteners,
     fit_initial_state,
@@ -95,9 +95,9 @@ def test_the_nominal_fit_recovers_resonance_and_quality() -> None:
     made = bench_recording(seed=9)
     run = prepare_run(made, DEVICE)
     model = Model([run], DEVICE)
-    comparison = Comparison([run], flat_whiteners(model))
+    likelihood = Likelihood([run], flat_whiteners(model))
     stops = window_schedule(model)
-    fit = fit_progressively(comparison, model, fit_initial_state(comparison, model, stops[0]).x, stops)[-1]
+    fit = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)[-1]
     axis = model.nominal("x", fit.x)
     assert axis.resonance / RESONANCE_HZ == pytest.approx(np.sqrt(1.004), abs=2e-4)
     assert axis.quality == pytest.approx(40 / 1.05 * np.sqrt(1.004), rel=0.01)
@@ -212,14 +212,14 @@ def test_a_free_term_is_replaced_by_two_named_terms() -> None:
     size = np.abs(bench_signals(0.0, 0.0)[1]).max()
     run = prepare_run(bench_recording(k3=0.06 * STIFFNESS / size**2, gain_drift=0.15, seed=4), DEVICE)
     nominal = Model([run], DEVICE)
-    comparison = Comparison([run], flat_whiteners(nominal))
+    likelihood = Likelihood([run], flat_whiteners(nominal))
     stops = window_schedule(nominal)
-    early = fit_progressively(comparison, nominal, fit_initial_state(comparison, nominal, stops[0]).x, stops)[-1]
+    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
     free = Candidate(DISCREPANCY_TERMS["free-mechanics"], "x", "sense")
     model = Model([run], DEVICE, [free], nominal.mains)
-    free_fit = fit_model(comparison, model, model.map_parameters_from(early.model, early.x), max_iterations=20)
+    free_fit = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x), max_iterations=20)
     pool = [c for c in all_candidates(DEVICE, nominal, catalogue().values()) if not c.channel.startswith("angle")]
-    best = fit_exchanges(comparison, free_fit, [free], pool, pairs=True)[0]
+    best = fit_exchanges(likelihood, free_fit, [free], pool, pairs=True)[0]
     assert {candidate.term.effect for candidate in best.model.candidates} == {"cubic-stiffness", "gain-drift"}
     assert best.neg2_log_evidence < free_fit.neg2_log_evidence - 100.0
 
@@ -240,9 +240,9 @@ def test_a_foreign_tone_among_the_lines_of_a_multisine_is_detected() -> None:
     for tone, detected in ((0.0, False), (5e-3, True)):
         data = moved + rng.normal(0, 2e-3, moved.size) + tone * wave
         disturbed = Model([replace(run, outputs=(replace(run.outputs[0], data=data),))], DEVICE)
-        comparison = Comparison(disturbed.runs, flat_whiteners(disturbed))
+        likelihood = Likelihood(disturbed.runs, flat_whiteners(disturbed))
         line = strongest_foreign_line(
-            fit_model(comparison, disturbed, np.zeros(len(disturbed.parameters)), max_iterations=1)
+            fit_model(likelihood, disturbed, np.zeros(len(disturbed.parameters)), max_iterations=1)
         )
         assert (line is not None and abs(line - 336.0) < 3.0) == detected
 

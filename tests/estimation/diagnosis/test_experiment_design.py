@@ -7,7 +7,7 @@ import pytest
 
 from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals, rank_experiments
-from estimation.diagnosis.fit import Comparison, Fit, fit_model
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.profile_likelihood import Z_95, profile_interval
@@ -23,64 +23,64 @@ def cubic_spring(share: float) -> float:
 
 
 @pytest.fixture(scope="module")
-def fitted() -> tuple[Comparison, Fit]:
+def fitted() -> tuple[Likelihood, Fit]:
     """A weak cubic spring, fitted with its own term."""
     run = prepare_run(bench_recording(k3=cubic_spring(0.012), seed=6), DEVICE)
     nominal, model = Model([run], DEVICE), Model([run], DEVICE, [CUBIC])
-    comparison = Comparison([run], flat_whiteners(nominal))
+    likelihood = Likelihood([run], flat_whiteners(nominal))
     stops = window_schedule(nominal)
-    start = fit_progressively(comparison, nominal, fit_initial_state(comparison, nominal, stops[0]).x, stops)[-1]
-    return comparison, fit_model(comparison, model, model.map_parameters_from(nominal, start.x))
+    start = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
+    return likelihood, fit_model(likelihood, model, model.map_parameters_from(nominal, start.x))
 
 
-def test_the_squared_distance_predicts_the_evidence_gain_over_a_confounder(fitted: tuple[Comparison, Fit]) -> None:
-    comparison, fit = fitted
-    (distance,) = distances_to_rivals(comparison, fit, CUBIC, [QUINTIC])
+def test_the_squared_distance_predicts_the_evidence_gain_over_a_confounder(fitted: tuple[Likelihood, Fit]) -> None:
+    likelihood, fit = fitted
+    (distance,) = distances_to_rivals(likelihood, fit, CUBIC, [QUINTIC])
     rival = Model(fit.model.runs, DEVICE, [QUINTIC])
-    instead = fit_model(comparison, rival, rival.map_parameters_from(fit.model, fit.x))
+    instead = fit_model(likelihood, rival, rival.map_parameters_from(fit.model, fit.x))
     lead = instead.chi2 + instead.penalty - fit.chi2 - fit.penalty
     assert abs(lead - distance**2) < 2 * Z_95 * distance + 1.0  # noise scatters the gain by twice the distance
     assert distance < 4.5
 
 
-def test_the_advice_names_measurements_that_separate_confounders(fitted: tuple[Comparison, Fit]) -> None:
-    comparison, fit = fitted
-    (distance,) = distances_to_rivals(comparison, fit, CUBIC, [QUINTIC])
-    distances = dict(rank_experiments(comparison, fit, CUBIC, QUINTIC))
+def test_the_advice_names_measurements_that_separate_confounders(fitted: tuple[Likelihood, Fit]) -> None:
+    likelihood, fit = fitted
+    (distance,) = distances_to_rivals(likelihood, fit, CUBIC, [QUINTIC])
+    distances = dict(rank_experiments(likelihood, fit, CUBIC, QUINTIC))
     assert (
         distances["with its angle recorded, noise 0.001 of the swing"]
         > 4.5
         > distances["beside a recording at half the drive"]
     )
     assert min(distances.values()) > distance
-    text = discrimination_advice(comparison, fit, CUBIC, QUINTIC, distance)
+    text = discrimination_advice(likelihood, fit, CUBIC, QUINTIC, distance)
     assert text.startswith(f"quintic-stiffness lies {distance:.1f} σ away, 4.5 are needed; with its angle recorded")
     assert "second, larger amplitude" in text
 
 
-def test_the_profile_rises_by_the_95_percent_threshold_at_the_interval_ends(fitted: tuple[Comparison, Fit]) -> None:
+def test_the_profile_rises_by_the_95_percent_threshold_at_the_interval_ends(fitted: tuple[Likelihood, Fit]) -> None:
     """Compared with a refit with the value fixed at each end of the interval."""
-    comparison, fit = fitted
+    likelihood, fit = fitted
     i = fit.model.index("term", CUBIC.key, "k3")
     assert i is not None
-    for end in profile_interval(comparison, fit, i):
+    for end in profile_interval(likelihood, fit, i):
         x, free = fit.x.copy(), np.arange(fit.x.size) != i
         x += fit.covariance[:, i] / fit.covariance[i, i] * (end - fit.x[i])
         for _ in range(2):
-            residual = comparison.residual(fit.model, x)[fit.rows]
+            residual = likelihood.residual(fit.model, x)[fit.rows]
             part, precision = fit.jacobian[np.ix_(fit.rows, free)], fit.model.precision[free]
             push = part.T @ residual + precision * x[free]
             x[free] -= np.linalg.solve(part.T @ part + np.diag(precision), push)
-        residual = comparison.residual(fit.model, x)[fit.rows]
+        residual = likelihood.residual(fit.model, x)[fit.rows]
         rise = residual @ residual + fit.model.precision @ x**2 - fit.chi2 - fit.penalty
         assert rise == pytest.approx(Z_95**2, rel=0.1)
-    low, high = profile_interval(comparison, fit, i)
+    low, high = profile_interval(likelihood, fit, i)
     scale = CUBIC.term.parameters[0].value(1.0, fit.model.scales("x"))
     assert low * scale < cubic_spring(0.012) < high * scale
 
 
 class Posterior:
-    """A comparison of two samples with a model of two numbers, and that model; both samples are fitted."""
+    """The likelihood of a model of two parameters for two samples, both fitted, and that model."""
 
     validation_rows, precision = np.zeros(2, bool), np.full(2, 1e-12)
 

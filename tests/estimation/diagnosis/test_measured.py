@@ -60,7 +60,7 @@ def test_the_beam_has_a_cubic_spring_and_quadratic_drag(measured_data: Path, dia
     weights = [finding.heldout["before"] for finding in diagnosis.findings]  # misfit without the effect
     assert weights == sorted(weights, reverse=True)
     assert weights[-1] > 10.0 * diagnosis.findings[0].heldout["after"]
-    data = diagnosis.search.comparison.runs[0].outputs[0].data
+    data = diagnosis.search.likelihood.runs[0].outputs[0].data
     frequency, modelled = (slow_motion(s - s.mean(), 1000.0)[1] for s in (data, simulated(diagnosis.search.final)))
     held_out_samples = held_out(data.size, 1000.0)
     assert (

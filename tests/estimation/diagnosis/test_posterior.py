@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimation.diagnosis.effect_curve import effect_curve
-from estimation.diagnosis.fit import Comparison, Fit
+from estimation.diagnosis.fit import Fit, Likelihood
 from estimation.diagnosis.identifiability import linearise_simulated, stated_whitener
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.posterior import (
@@ -27,7 +27,7 @@ from tests.support.bench import DEVICE
 RUN = prepare_planned_run(Excitation("down", {"x": Constant(0.0)}, {"x": 4e-3}, 0.06, 40e3), DEVICE)
 
 
-def fitted(effect: str | None, channel: str = "sense") -> tuple[Comparison, Fit]:
+def fitted(effect: str | None, channel: str = "sense") -> tuple[Likelihood, Fit]:
     """A ringdown of a device with one effect of natural size, and its perfect fit."""
     candidates = [Candidate(catalogue()[effect], "x", channel)] if effect else []
     model = Model([RUN], DEVICE, candidates)
@@ -80,11 +80,11 @@ def test_an_effect_with_internal_state_has_no_curve() -> None:
 
 
 def test_the_portrait_shows_a_residual_at_the_state_of_the_mirror() -> None:
-    comparison, fit = fitted(None)
+    likelihood, fit = fitted(None)
     trajectory = axis_trajectories(fit, fit.x, 0)["x"]
-    at = comparison.time * RUN.outputs[0].data.size * RUN.outputs[0].stride
+    at = likelihood.time * RUN.outputs[0].data.size * RUN.outputs[0].stride
     angle = np.interp(at, np.arange(trajectory.angle.size), trajectory.angle)
-    right, flat = phase_portrait(comparison, fit, [np.where(angle > 0.0, 3.0, 1.0), np.full(angle.size, 2.0)], 0, 0)
+    right, flat = phase_portrait(likelihood, fit, [np.where(angle > 0.0, 3.0, 1.0), np.full(angle.size, 2.0)], 0, 0)
     assert np.nanmin(right[:, PORTRAIT_CELLS // 2 + 1 :]) == 3.0
     assert np.nanmax(right[:, : PORTRAIT_CELLS // 2 - 1]) == 1.0
     assert np.isnan(flat[0, 0])  # the motion never reaches the corner

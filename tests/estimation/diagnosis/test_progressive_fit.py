@@ -10,7 +10,7 @@ from numpy.polynomial.chebyshev import chebval
 
 from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.discrepancy import cosine_series
-from estimation.diagnosis.fit import Comparison, fit_model, fit_models
+from estimation.diagnosis.fit import Likelihood, fit_model, fit_models
 from estimation.diagnosis.initial import fit_initial_state, flat_whiteners, window_schedule
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.progressive_fit import (
@@ -53,14 +53,14 @@ def test_candidates_that_fit_a_window_equally_well_are_kept() -> None:
 
 
 def test_a_fit_with_a_larger_misfit_than_the_complete_rival_is_dropped() -> None:
-    comparison = SimpleNamespace(rows=np.ones(20_000, bool))
+    likelihood = SimpleNamespace(rows=np.ones(20_000, bool))
     rival = SimpleNamespace(neg2_log_evidence=20_300.0, residual=np.ones(20_000))
     fitted_rows = np.arange(20_000) < 8000
     least = 8000.0 + ABORT_MARGIN + 300.0 + (1.0 - MIN_NOISE_CHI2) * 12_000
     for chi2, beaten in ((least - 1.0, False), (least + 1.0, True)):
         fit = SimpleNamespace(rows=fitted_rows, chi2=chi2)
-        assert _dominated(comparison, fit, rival) is beaten  # type: ignore[arg-type]
-    assert not _dominated(comparison, fit, None)  # type: ignore[arg-type]
+        assert _dominated(likelihood, fit, rival) is beaten  # type: ignore[arg-type]
+    assert not _dominated(likelihood, fit, None)  # type: ignore[arg-type]
 
 
 def test_a_diverged_motion_predicts_no_gain() -> None:
@@ -88,13 +88,13 @@ def test_starts_of_one_candidate_that_converged_to_one_fit_are_merged() -> None:
 def test_parallel_fits_equal_sequential_fits() -> None:
     run = prepare_run(bench_recording(k3=2.0, seed=9), DEVICE)
     nominal = Model([run], DEVICE)
-    comparison, stop = Comparison([run], flat_whiteners(nominal)), window_schedule(nominal)[0]
-    x = fit_initial_state(comparison, nominal, stop).x
+    likelihood, stop = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)[0]
+    x = fit_initial_state(likelihood, nominal, stop).x
     models = [Model([run], DEVICE, [Candidate(catalogue()[name], "x", "sense")]) for name in
               ("cubic-stiffness", "quadratic-drag", "second-mode")]  # fmt: skip
     starts = [(model, model.map_parameters_from(nominal, x)) for model in [*models, models[0]]]
-    for start, fit in zip(starts, fit_models(comparison, starts, stop, max_iterations=3), strict=True):
-        alone = fit_model(comparison, *start, stop, 3)
+    for start, fit in zip(starts, fit_models(likelihood, starts, stop, max_iterations=3), strict=True):
+        alone = fit_model(likelihood, *start, stop, 3)
         np.testing.assert_array_equal(fit.x, alone.x)
         assert fit.neg2_log_evidence == alone.neg2_log_evidence
 

@@ -10,7 +10,7 @@ import pytest
 
 from estimation.diagnosis.clipping import rail
 from estimation.diagnosis.data import prepare_run
-from estimation.diagnosis.fit import Comparison, fit_model
+from estimation.diagnosis.fit import Likelihood, fit_model
 from estimation.diagnosis.identifiability import determined_only
 from estimation.diagnosis.initial import flat_whiteners
 from estimation.diagnosis.model import Model
@@ -45,8 +45,8 @@ def test_a_rail_is_recognised_from_samples_at_one_value() -> None:
 def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
     run = prepare_run(bench_recording(seed=2), DEVICE)
     model = Model([run], DEVICE)
-    comparison = Comparison([run], flat_whiteners(model))
-    fit = fit_model(comparison, model, np.zeros(len(model.parameters)), max_iterations=6)
+    likelihood = Likelihood([run], flat_whiteners(model))
+    fit = fit_model(likelihood, model, np.zeros(len(model.parameters)), max_iterations=6)
     at = [i for i, f in enumerate(model.parameters) if f.kind == "nominal"]
     names = [model.parameters[i].name for i in at]
     variance, directions = np.linalg.eigh(fit.covariance[np.ix_(at, at)])
@@ -58,8 +58,8 @@ def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
     settled = determined_only(replace(fit, x=moved))
     assert determined_only(fit)[at] == pytest.approx(settled[at], abs=1e-3)
     assert valley @ settled[at] == pytest.approx(0.0, abs=1e-9)
-    changed = comparison.residual(model, determined_only(fit)) - fit.residual
-    assert np.sum(changed[comparison.rows] ** 2) < 1.0
+    changed = likelihood.residual(model, determined_only(fit)) - fit.residual
+    assert np.sum(changed[likelihood.rows] ** 2) < 1.0
 
 
 @pytest.mark.slow
@@ -77,17 +77,17 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     run = prepare_run(recording, device)
 
     def fitted(model: Model) -> Fit:
-        comparison, stops = Comparison([run], flat_whiteners(model)), window_schedule(model)
-        first = fit_progressively(comparison, model, fit_initial_state(comparison, model, stops[0]).x, stops)[-1]
-        return fit_model(comparison, model, first.x, max_iterations=20)
+        likelihood, stops = Likelihood([run], flat_whiteners(model)), window_schedule(model)
+        first = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)[-1]
+        return fit_model(likelihood, model, first.x, max_iterations=20)
 
     nominal = fitted(Model([run], device))
     free = Model([run], device, [Candidate(DISCREPANCY_TERMS["free-mechanics"], "x", "sense")])
-    comparison = Comparison([run], estimate_whiteners(free, fitted(free).x))
-    found = fit_model(comparison, free, fitted(free).x, max_iterations=20)
-    nominal = fit_model(comparison, nominal.model, nominal.x)
+    likelihood = Likelihood([run], estimate_whiteners(free, fitted(free).x))
+    found = fit_model(likelihood, free, fitted(free).x, max_iterations=20)
+    nominal = fit_model(likelihood, nominal.model, nominal.x)
     improved = improve(
-        SelectionResult(comparison, nominal, found, (SelectionStep(free.candidates[0], nominal, found, ()),))
+        SelectionResult(likelihood, nominal, found, (SelectionStep(free.candidates[0], nominal, found, ()),))
     )
     assert "measured-law" in improved.device.axis("x").terms
     assert Device.from_toml(improved.device.to_toml()) == improved.device

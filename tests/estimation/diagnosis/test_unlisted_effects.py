@@ -8,7 +8,7 @@ import pytest
 from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.fit import Comparison, Fit, fit_model
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.selection import SelectionState, _replace_terms_by_discrepancy
@@ -72,12 +72,12 @@ def replace_named_terms(run: Recording, *names: str, turns: int = 8) -> tuple[Se
     """The state of a search that replaced named terms by free ones where these explain more, and the named fit."""
     prepared = prepare_run(run, DEVICE)
     nominal = Model([prepared], DEVICE)
-    comparison = Comparison([prepared], flat_whiteners(nominal))
+    likelihood = Likelihood([prepared], flat_whiteners(nominal))
     stops = window_schedule(nominal)
-    early = fit_progressively(comparison, nominal, fit_initial_state(comparison, nominal, stops[0]).x, stops)[-1]
+    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
     model = Model([prepared], DEVICE, [Candidate(catalogue()[name], "x", "sense") for name in names], nominal.mains)
-    named = fit_model(comparison, model, model.map_parameters_from(early.model, early.x), max_iterations=turns)
-    return _replace_terms_by_discrepancy(SelectionState(comparison, early, named, {})), named
+    named = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x), max_iterations=turns)
+    return _replace_terms_by_discrepancy(SelectionState(likelihood, early, named, {})), named
 
 
 @pytest.mark.slow
