@@ -12,9 +12,10 @@ import numpy as np
 import lissajous
 
 # %%
-# 60 pictures a second of 200 × 200 pixels, 85 % of the pixels visited, drives of 30 V + 30 V sin on both axes.
+# 60 pictures a second of 200 × 200 pixels, 85 % of the pixels on the path of the beam, drives of 30 V + 30 V sin on
+# both axes.
 device = lissajous.load_device("imaging")
-found = lissajous.design(device, pixels=(200, 200), frame_rate=60.0, fill=0.85, volts=(30.0, 30.0))
+found = lissajous.design(device, pixels=(200, 200), frame_rate=60.0, fill=0.85, volts=(30.0, 30.0), sample_rate=None)
 for axis, band in found.bands.items():
     low, high = band.motion_frequencies_reaching(0.18, 0.0005)
     print(f"{axis}: the field is covered from {low:.1f} to {high:.1f} Hz of the motion")

@@ -315,7 +315,7 @@ def design(
     fill: float = 0.95,
     half_angles: tuple[float, float] | None = None,
     volts: tuple[float, float] = (30.0, 30.0),
-    sample_rate: float | None = None,
+    sample_rate: float | None = 5e6,
     margin: float = 0.0005,
 ) -> ScanDesign:
     """Find drive frequencies whose Lissajous figure fills the picture at the wanted frame rate.
@@ -325,23 +325,22 @@ def design(
         pixels: width and height of the picture.
         frame_rate: pictures a second, at least [Hz].
         fill: fraction of the pixels that one picture has to visit.
-        half_angles: half the field in x and y [rad]; the device's ``[scan]`` where None.
+        half_angles: half the field in x and y [rad], optical if the device's ``[scan]`` says so; that of the device
+            where None.
         volts: amplitude and offset of both drives [V].
-        sample_rate: samples a second [Hz]; the beam's whole path counts where None.
+        sample_rate: samples a second, which fill pixels [Hz]; the beam's whole path counts where None.
         margin: relative change of either stiffness that field and motion have to survive.
 
     Raises:
         BadInput: the drives do not sustain the field, or no pair of frequencies repeats at the frame rate.
     """
-    from recon.imaging.picture import Grid
-    from recon.scan_design import ScanRequirements
+    from recon.imaging.picture import grid_of_scan
+    from recon.scan_design import ScanRequirements, wanted_field
     from recon.scan_design import design as design_scan
 
     loaded = load_device(device)
-    if half_angles is None:
-        scan = loaded.require_scan()
-        half_angles = scan.half_angle_x, scan.half_angle_y
-    requirements = ScanRequirements(Grid(*pixels, *half_angles), frame_rate, fill, sample_rate, margin)
+    grid = grid_of_scan(*pixels, wanted_field(loaded, half_angles))
+    requirements = ScanRequirements(grid, frame_rate, fill, sample_rate, margin)
     return ScanDesign(*design_scan(loaded, requirements, volts))
 
 

@@ -302,7 +302,7 @@ def simulate(
     if scene is not None:
         field_of_view = device.require_scan()
         x, y = (beam_position(device, name, truth[f"angle_{name}"], time) for name in ("x", "y"))
-        light = sample_scene(scene.light, x, y, field_of_view.half_angle_x, field_of_view.half_angle_y)
+        light = sample_scene(scene.light, x, y, *field_of_view.mechanical_half_angles)
         light = apply_intensity_terms(device, light, time)
         channels["intensity"] = (detect(light, plan.sample_rate, scene.detector, rng), "V")
         stored_truth["scene"] = scene.light.astype(np.float32)

@@ -21,12 +21,15 @@ def describe_outside(picture: Picture, motion: Motion) -> list[str]:
     share = picture.outside / max(picture.outside + int(picture.coverage.sum()), 1)
     if share < MAX_OUTSIDE_FRACTION:
         return []
-    half = {"x": picture.grid.half_angle_x, "y": picture.grid.half_angle_y}
+    grid = picture.grid
+    half = dict(zip(AXES, grid.reported_half_angles, strict=True))
     sizes = ", ".join(
-        f"{name}: amplitude {np.max(motion.axes[name].amplitude):.4g} rad, half angle {half[name]:.4g} rad"
+        f"{name}: amplitude {grid.angle_scale * np.max(motion.axes[name].amplitude):.4g} rad, "
+        f"half angle {half[name]:.4g} rad"
         for name in AXES
     )
-    return [f"{share:.0%} of the samples lie outside the field of view ({sizes}); check [scan] of the device"]
+    what = f"{share:.0%} of the samples lie outside the field of view"
+    return [f"{what} ({sizes}; {grid.angle} angles); check [scan] of the device"]
 
 
 def describe_ambiguous_signs(motion: Motion) -> list[str]:

@@ -21,7 +21,7 @@ from recon.imaging import blur
 from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
 from recon.imaging.image_phase import refine_motion
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
-from recon.imaging.picture import Grid, Picture
+from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
 from recon.notes import describe_ambiguous_signs, describe_clock_jumps, describe_outside
@@ -358,8 +358,7 @@ def _repair_dropped_samples(
 def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:
     """The pixels over the device's field of view, else over the range of the motion, with a note that says so."""
     if device.scan is not None:
-        scan = device.scan
-        return Grid(*options.pixels, scan.half_angle_x, scan.half_angle_y, scan.metres_per_radian), []
+        return grid_of_scan(*options.pixels, device.scan), []
     half = {axis: float(np.max(motion.axes[axis].amplitude)) for axis in AXES}
     note = (
         f"the device states no [scan]: the field is the motion's own, {half['x']:.4g} x {half['y']:.4g} rad half angles"

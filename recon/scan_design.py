@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from recon.imaging.coverage import largest_gap, time_for_fill
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
-from scanner.device import Axis, Device
+from scanner.device import Axis, Device, Scan
 from scanner.errors import BadInput
 from scanner.parametric import sine_drive, steady_state, stiffness_modulation, threshold, tongue_edges
 
@@ -42,6 +42,18 @@ _TONGUE_STEPS = 12
 
 _EDGE_HALVINGS = 8
 """Halvings of a step at the frequency where the motion ceases: to 1/3000 of the tongue's width."""
+
+
+def wanted_field(device: Device, half_angles: tuple[float, float] | None) -> Scan:
+    """Return the device's field of view, with other half angles [rad] if some are given.
+
+    Raises:
+        DeviceInvalid: none is given and the device states none.
+    """
+    if half_angles is None:
+        return device.require_scan()
+    stated = device.scan or Scan(*half_angles)
+    return replace(stated, half_angle_x=half_angles[0], half_angle_y=half_angles[1])
 
 
 @dataclass(frozen=True)

@@ -160,16 +160,43 @@ class Position(Checked):
 
 @dataclass(frozen=True)
 class Scan(Checked):
-    """Field of view that fills the picture, as mechanical half angles [rad].
+    """Field of view that fills the picture, as half angles, and whether these and all reported angles are optical.
 
     Attributes:
-        half_angle_x, half_angle_y: half the field of view [rad].
-        metres_per_radian: displacement of the beam on the sample [m/rad]; where it is stated, pictures are to scale.
+        half_angle_x, half_angle_y: half the field of view, in the kind of angle that ``angle`` states [rad].
+        metres_per_radian: displacement of the beam on the sample by that angle [m/rad]; where it is stated, pictures
+            are to scale.
+        angle: ``"mechanical"`` (of the mirror; the default) or ``"optical"`` (of the beam, twice the mechanical one): of this table
+            and of every reported angle.
     """
+
+    ANGLES: ClassVar[tuple[str, ...]] = ("mechanical", "optical")
 
     half_angle_x: float = field(metadata=POSITIVE)
     half_angle_y: float = field(metadata=POSITIVE)
     metres_per_radian: float | None = field(default=None, metadata=POSITIVE | CAN_BE_OFF)
+    angle: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.angle_kind not in self.ANGLES:
+            hint = f"write one of {', '.join(self.ANGLES)}"
+            raise DeviceInvalid(f"{self.angle!r} is unknown", channel="angle", hint=hint)
+        super().__post_init__()
+
+    @property
+    def angle_kind(self) -> str:
+        """``"mechanical"``, which is the default, or ``"optical"``."""
+        return self.angle or "mechanical"
+
+    @property
+    def angle_scale(self) -> float:
+        """Stated and reported angle by mechanical angle: 1, or 2 for optical angles."""
+        return 2.0 if self.angle == "optical" else 1.0
+
+    @property
+    def mechanical_half_angles(self) -> tuple[float, float]:
+        """Half the field of view in x and y as mechanical angles [rad]."""
+        return self.half_angle_x / self.angle_scale, self.half_angle_y / self.angle_scale
 
 
 Readout = Amdm | Transimpedance | Position
@@ -274,7 +301,11 @@ class Device:
             parts += [f"terms {', '.join(axis.terms)}"] if axis.terms else []
             lines.append(f"{name}: {'; '.join(parts) or 'nothing stated'}")
         lines += [f"shared {self.readout.kind} readout"] if self.readout else []
-        lines += [f"field ±{self.scan.half_angle_x:.4g} x ±{self.scan.half_angle_y:.4g} rad"] if self.scan else []
+        lines += (
+            [f"field ±{self.scan.half_angle_x:.4g} x ±{self.scan.half_angle_y:.4g} rad {self.scan.angle_kind}"]
+            if self.scan
+            else []
+        )
         return lines
 
     @classmethod

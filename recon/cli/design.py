@@ -32,8 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="V,V",
         help="amplitude and offset of both drives (30,30)",
     )
-    parser.add_argument(
-        "--rate", type=parse_positive, metavar="HZ", help="samples a second; without it the beam's whole path counts"
+    counted = parser.add_mutually_exclusive_group()
+    counted.add_argument(
+        "--rate", type=parse_positive, default=5e6, metavar="HZ", help="samples a second, which fill pixels (5e6)"
+    )
+    counted.add_argument(
+        "--beam-path", action="store_true", help="count every pixel on the beam's path, not only those with a sample"
     )
     parser.add_argument(
         "--margin",
@@ -54,7 +58,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         frame_rate=args.frame_rate,
         fill=args.fill,
         volts=args.volts,
-        rate=args.rate,
+        rate=None if args.beam_path else args.rate,
         margin=args.margin,
     )
 
@@ -80,24 +84,23 @@ def design_scan(
     Raises:
         BadInput: as ``recon.scan_design.design``, or neither a field nor the device's field of view is given.
     """
-    from recon.imaging.picture import Grid
+    from recon.imaging.picture import grid_of_scan
     from recon.io.output import check_folder, finite, replacing_folder, write_json
     from recon.report.conclusions import conclude_design
     from recon.report.design import design_report
-    from recon.scan_design import ScanRequirements, design
+    from recon.scan_design import ScanRequirements, design, wanted_field
 
     check_folder(output)
-    if half_angles is None:
-        scan = device.require_scan()
-        half_angles = scan.half_angle_x, scan.half_angle_y
-    requirements = ScanRequirements(Grid(*pixels, *half_angles), frame_rate, fill, rate, margin)
+    grid = grid_of_scan(*pixels, wanted_field(device, half_angles))
+    requirements = ScanRequirements(grid, frame_rate, fill, rate, margin)
     bands, candidates = design(device, requirements, volts)
     notes = _design_notes(candidates[0], requirements)
     summary = finite(
         {
             "device": device.name,
             "wanted": {
-                "half_angle_rad": dict(zip("xy", half_angles, strict=True)),
+                "half_angle_rad": dict(zip("xy", grid.reported_half_angles, strict=True)),
+                "angle": grid.angle,
                 "pixels": list(pixels),
                 "frame_rate": frame_rate,
                 "fill": fill,
@@ -105,8 +108,8 @@ def design_scan(
                 "volts": {"amplitude": volts[0], "offset": volts[1]},
                 "margin": margin,
             },
-            "bands": {name: _band_summary(band, half_angles["xy".index(name)], margin) for name, band in bands.items()},
-            "candidates": [_candidate_summary(candidate, fill) for candidate in candidates],
+            "bands": {name: _band_summary(band, requirements) for name, band in bands.items()},
+            "candidates": [_candidate_summary(candidate, requirements) for candidate in candidates],
             "notes": notes,
             "output": str(output),
         }
@@ -118,26 +121,28 @@ def design_scan(
     return dict(summary)
 
 
-def _band_summary(band: SustainedBand, half_angle: float, margin: float) -> dict[str, Any]:
-    low, high = band.motion_frequencies_reaching(half_angle, margin)
+def _band_summary(band: SustainedBand, requirements: ScanRequirements) -> dict[str, Any]:
+    grid = requirements.grid
+    half_angle = grid.half_angle_x if band.axis == "x" else grid.half_angle_y
+    low, high = band.motion_frequencies_reaching(half_angle, requirements.stiffness_margin)
     return {
         "sustained_hz": [band.drive[0], band.drive[-1]],
         "covering_hz": [band.drive_per_motion * low, band.drive_per_motion * high],
-        "largest_rad": band.amplitude.max(),
+        "largest_rad": grid.angle_scale * band.amplitude.max(),
         "drive_over_motion": band.drive_per_motion,
     }
 
 
-def _candidate_summary(candidate: ScanCandidate, fill: float) -> dict[str, Any]:
-    figure = candidate.figure
+def _candidate_summary(candidate: ScanCandidate, requirements: ScanRequirements) -> dict[str, Any]:
+    figure, scale = candidate.figure, requirements.grid.angle_scale
     return {
         "drive_hz": dict(zip("xy", candidate.drive, strict=True)),
         "motion_hz": {a: n * figure.frame_rate for a, n in zip("xy", figure.windings, strict=True)},
         "windings": dict(zip("xy", figure.windings, strict=True)),
         "frame_rate": figure.frame_rate,
-        "amplitude_rad": dict(zip("xy", figure.amplitude, strict=True)),
+        "amplitude_rad": {a: scale * amplitude for a, amplitude in zip("xy", figure.amplitude, strict=True)},
         "fill": dict(candidate.fill),
-        "fill_reached": candidate.fill_reached(fill),
+        "fill_reached": candidate.fill_reached(requirements.fill),
         "fill_time_s": dict(candidate.time),
         "gap_px": dict(candidate.gap),
         "mesh_px": candidate.mesh_diameter,

@@ -165,7 +165,7 @@ def reconstruct_file(
             write_tiff(folder / "affected.tif", result.affected.astype(np.uint8), grid)
         if options.frames or options.frame_time:
             write_scan_frames(folder / "frames.ome.tif", result, options)
-        write_motion(folder / "motion.h5", result.motion)
+        write_motion(folder / "motion.h5", result.motion, grid)
         write_json(folder / "summary.json", summary)
         save_picture(folder / "image.png", result.picture, result.affected)
         (folder / "report.html").write_text(reconstruction_report(result, summary), encoding="utf-8")

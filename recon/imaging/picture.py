@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.device import Scan
 from scanner.errors import BadInput
 
 MAX_PIXELS = 1 << 29
@@ -23,6 +24,7 @@ class Grid:
         width, height: pixels.
         half_angle_x, half_angle_y: mechanical angle at the edge of the field [rad].
         metres_per_radian: displacement of the beam on the sample by mechanical angle [m/rad]; None if unknown.
+        angle: kind of the angles that files and reports state, ``"mechanical"`` or ``"optical"``.
 
     Raises:
         BadInput: a size or an angle is not positive and finite, or there are ``MAX_PIXELS`` pixels or more.
@@ -33,6 +35,7 @@ class Grid:
     half_angle_x: float
     half_angle_y: float
     metres_per_radian: float | None = None
+    angle: str = "mechanical"
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -45,9 +48,25 @@ class Grid:
             )
 
     @property
+    def angle_scale(self) -> float:
+        """Reported angle by mechanical angle: 1, or 2 for optical angles."""
+        return 2.0 if self.angle == "optical" else 1.0
+
+    @property
+    def reported_half_angles(self) -> tuple[float, float]:
+        """Half the field in x and y as reports state it [rad]."""
+        return self.half_angle_x * self.angle_scale, self.half_angle_y * self.angle_scale
+
+    @property
     def pixel_angle(self) -> tuple[float, float]:
         """Width and height of a pixel, mechanical angle [rad]."""
         return 2 * self.half_angle_x / self.width, 2 * self.half_angle_y / self.height
+
+
+def grid_of_scan(width: int, height: int, scan: Scan) -> Grid:
+    """Return the pixels over a device's field of view; the grid reports the kind of angle that ``scan`` states."""
+    scale = None if scan.metres_per_radian is None else scan.metres_per_radian * scan.angle_scale
+    return Grid(width, height, *scan.mechanical_half_angles, scale, scan.angle_kind)
 
 
 @dataclass(frozen=True)
@@ -68,9 +87,10 @@ class Picture:
 
     def __repr__(self) -> str:
         grid, visited = self.grid, np.count_nonzero(self.coverage) / self.coverage.size
+        half_x, half_y = grid.reported_half_angles
         return (
             f"Picture of {grid.width} x {grid.height} pixels, {visited:.1%} of them visited, "
-            f"{int(self.coverage.sum())} samples, half angles {grid.half_angle_x:.4g} x {grid.half_angle_y:.4g} rad"
+            f"{int(self.coverage.sum())} samples, half angles {half_x:.4g} x {half_y:.4g} rad {grid.angle}"
         )
 
 

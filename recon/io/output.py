@@ -68,10 +68,14 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def write_motion(path: Path, motion: Motion) -> None:
-    """Write motion.h5: a group an axis with time, phase, amplitude, frequency, phase_sd and angle."""
+def write_motion(path: Path, motion: Motion, grid: Grid) -> None:
+    """Write motion.h5: a group an axis with time, phase, amplitude, frequency, phase_sd and angle.
+
+    Amplitudes and angles are mechanical or optical, as ``grid`` states.
+    """
+    scales = {"amplitude": grid.angle_scale}
     with new_hdf5(path) as file:
-        file.attrs["estimator"] = motion.estimator
+        file.attrs.update({"estimator": motion.estimator, "angle": grid.angle})
         for name, axis in motion.axes.items():
             group = file.create_group(name)
             group.attrs.update({"reference": axis.reference, "sign": axis.sign})
@@ -82,17 +86,17 @@ def write_motion(path: Path, motion: Motion) -> None:
                 ("frequency", "Hz"),
                 ("phase_sd", "rad"),
             ):
-                group.create_dataset(key, data=getattr(axis, key)).attrs["unit"] = unit
+                group.create_dataset(key, data=getattr(axis, key) * scales.get(key, 1.0)).attrs["unit"] = unit
             angle = group.create_dataset("angle", (axis.angle.size,), np.float32)
             for first in range(0, axis.angle.size, CHUNK_SAMPLES):
                 stop = min(first + CHUNK_SAMPLES, axis.angle.size)
-                angle[first:stop] = axis.angle.read(first, stop)
+                angle[first:stop] = grid.angle_scale * axis.angle.read(first, stop)
             angle.attrs.update({"unit": "rad", "sample_rate": axis.angle.sample_rate, "start": axis.angle.start})
 
 
 def pixel_size(grid: Grid) -> tuple[float, float, str]:
-    """Width and height of a pixel and their unit: um on the sample if the scale is known, else rad of the mirror."""
-    scale, unit = (1.0, "rad") if grid.metres_per_radian is None else (1e6 * grid.metres_per_radian, "um")
+    """Width and height of a pixel and their unit: um on the sample if the scale is known, else rad as reported."""
+    scale, unit = (grid.angle_scale, "rad") if grid.metres_per_radian is None else (1e6 * grid.metres_per_radian, "um")
     width, height = grid.pixel_angle
     return scale * width, scale * height, unit
 

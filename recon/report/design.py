@@ -44,8 +44,9 @@ def design_report(
         conclusion: what to do, in a sentence.
     """
     grid, best = requirements.grid, candidates[0]
+    half_x, half_y = grid.reported_half_angles
     subject = (
-        f"Wanted: {grid.width} × {grid.height} pixels over {grid.half_angle_x:g} × {grid.half_angle_y:g} rad (half "
+        f"Wanted: {grid.width} × {grid.height} pixels over {half_x:g} × {half_y:g} rad ({grid.angle} half "
         f"angles), {requirements.frame_rate:g} pictures a second, a fill of {requirements.fill:.1%} "
         + (
             "along the beam's path."
@@ -139,9 +140,12 @@ def _bands_figure(bands: Mapping[str, SustainedBand], requirements: ScanRequirem
         half = _half_angle(requirements, band.axis)
         low, high = band.motion_frequencies_reaching(half, requirements.stiffness_margin)
         panel.axvspan(band.drive_per_motion * low, band.drive_per_motion * high, color="#3d8f5f", alpha=0.15, lw=0)
-        panel.plot(band.drive, band.amplitude, color=COLOURS[0], lw=1.4)
-        panel.axhline(half, color="#444", lw=0.8, ls="--")
+        scale = requirements.grid.angle_scale
+        panel.plot(band.drive, scale * band.amplitude, color=COLOURS[0], lw=1.4)
+        panel.axhline(scale * half, color="#444", lw=0.8, ls="--")
         panel.axvline(drive, color=COLOURS[1], lw=1.0)
-        panel.set(xlabel=f"drive of {band.axis} [Hz]", ylabel="amplitude [rad]", ylim=(0.0, None))
+        panel.set(
+            xlabel=f"drive of {band.axis} [Hz]", ylabel=f"amplitude [rad {requirements.grid.angle}]", ylim=(0.0, None)
+        )
         panel.ticklabel_format(useOffset=False)
     return Figure(figure_uri(drawing), "sustained amplitude; dashed: half the field; red: the first pair's drive")

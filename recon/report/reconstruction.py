@@ -82,7 +82,9 @@ def scale_bar(grid: Grid, part: float = 1.0) -> tuple[str, float]:
         The label, and the length as a fraction of the shown width.
     """
     width, _, unit = pixel_size(grid)
-    width, unit = (width * grid.width * part, "µm") if unit == "um" else (1e3 * width * grid.width * part, "mrad")
+    width, unit = (
+        (width * grid.width * part, "µm") if unit == "um" else (1e3 * width * grid.width * part, f"mrad {grid.angle}")
+    )
     power = 10.0 ** math.floor(math.log10(width / 4.0))
     length = max(step * power for step in (1.0, 2.0, 5.0) if step * power <= width / 4.0)
     return f"{length:g} {unit}", length / width
@@ -121,7 +123,7 @@ def axis_table(summary: Mapping[str, Any]) -> Table:
         ["scan within the bound", *(f"{summary[a]['within_bound']:.1%}" for a in AXES)],
         ["phase error measured in the picture", *measured],
         ["drift of the phase over the scan [°]", *(f"{summary[a]['phase_drift_deg']:.3g}" for a in AXES)],
-        ["amplitude [mrad]", *(f"{1e3 * summary[a]['amplitude_rad']:.2f}" for a in AXES)],
+        [f"amplitude [mrad {summary['angle']}]", *(f"{1e3 * summary[a]['amplitude_rad']:.2f}" for a in AXES)],
         ["frequency [Hz]", *(f"{summary[a]['frequency_hz']:.3f}" for a in AXES)],
         ["sign of the angle", *(summary[a]["sign"] for a in AXES)],
     ]

@@ -58,7 +58,7 @@ def readout_phase_summary(result: Reconstruction, axis: str) -> dict[str, Any] |
 def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
     """What the summary says of one axis."""
     own, bound = result.motion.axes[axis], result.phase_bound(axis)
-    error = result.evaluation.get(axis)
+    error, scale = result.evaluation.get(axis), result.picture.grid.angle_scale
     summary: dict[str, Any] = {
         "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(own.phase_sd**2)))),
         "bound_deg": float(np.degrees(bound)),
@@ -66,7 +66,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
         if error is None
         else blur.within_bound(bound, error=error.phase),
         "sign": own.sign,
-        "amplitude_rad": float(np.mean(own.amplitude)),
+        "amplitude_rad": scale * float(np.mean(own.amplitude)),
         "frequency_hz": float(np.mean(own.frequency)),
         "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
         "picture_phase_error_deg": picture_phase_error(result.phase_errors, axis),
@@ -78,7 +78,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
             "phase_rmse_deg": float(np.degrees(error.phase_rmse)),
             "phase_bias_deg": float(np.degrees(np.mean(error.phase))),
             "amplitude_rmse": float(np.sqrt(np.mean(error.amplitude**2))),
-            "angle_rmse_rad": error.angle_rmse,
+            "angle_rmse_rad": scale * error.angle_rmse,
             "mirrored": error.mirrored,
         }
     return summary
@@ -106,6 +106,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "estimator": result.motion.estimator,
         "name": result.name,
         "axes": list(AXES),
+        "angle": result.picture.grid.angle,
         **grouped,
         **axes,
         "fill": fill_factor(result.picture.coverage),

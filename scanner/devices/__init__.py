@@ -38,6 +38,6 @@ def find(source: Device | str | Path) -> Device:
     if str(source) in names():
         return load(str(source))
     if not Path(source).exists():
-        hint = f"`lissajous new-device` writes one; named devices: {', '.join(names())}"
+        hint = f"there are {', '.join(names())}; `lissajous new-device` writes a file to edit"
         raise BadInput(f"no device is named {str(source)!r} and no file is", hint=hint)
     return Device.load(source)

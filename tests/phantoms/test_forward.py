@@ -129,7 +129,7 @@ def test_intensity_is_the_scene_at_the_true_angles() -> None:
 
 def test_device_is_loaded_by_name() -> None:
     assert devices.find("chen2019").axis("x").resonance == pytest.approx(624.6, abs=0.1)
-    with pytest.raises(BadInput, match="named devices: chen2019, chen2020, chen2020-driven, imaging"):
+    with pytest.raises(BadInput, match="there are chen2019, chen2020, chen2020-driven, imaging"):
         devices.find("unheard-of")
     assert own_electrodes().readout is None
     assert {"sense_x", "sense_y"} <= set(separate_electrodes()[0].channels)
