@@ -166,8 +166,8 @@ class Scan(Checked):
         half_angle_x, half_angle_y: half the field of view, in the kind of angle that ``angle`` states [rad].
         metres_per_radian: displacement of the beam on the sample by that angle [m/rad]; where it is stated, pictures
             are to scale.
-        angle: ``"mechanical"`` (of the mirror; the default) or ``"optical"`` (of the beam, twice the mechanical one): of this table
-            and of every reported angle.
+        angle: ``"mechanical"`` (of the mirror; the default) or ``"optical"`` (of the beam, twice the mechanical
+            one): of this table and of every reported angle.
     """
 
     ANGLES: ClassVar[tuple[str, ...]] = ("mechanical", "optical")
