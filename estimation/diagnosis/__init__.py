@@ -3,7 +3,8 @@
 The package contains the fit of the forward model to recordings and the selection of terms by evidence; simulation of
 test data, pictures and reports do not belong here. Modules in the order of the computation:
 
-1. ``data``: recorded inputs and outputs on the grids of the simulation.
+1. ``data``: recorded inputs and outputs on the grids of the simulation; ``drive_lines``: spectral lines of a drive;
+   ``resampling``; ``clipping``: readouts that are clipped.
 2. ``model``: simulated channels as a function of parameters; ``noise``: noise spectrum and whitening.
 3. ``fit``: whitened residuals, Jacobian and fit; ``initial``: initial state and growing windows.
 4. ``discrepancy``: flexible terms for effects without a law; ``screening``: first-order score of every candidate term.
@@ -12,5 +13,6 @@ test data, pictures and reports do not belong here. Modules in the order of the 
 7. ``profile_likelihood``: intervals; ``localisation``: channel, time and harmonics of a misfit;
    ``identifiability``: detectability of every effect; ``experiment_design``: further measurements.
 8. ``discrepancy_law``, ``effect_curve``, ``posterior``: a fitted effect as formula, curve and draws.
-9. ``diagnose``: verdict and findings; ``predict``: open-loop prediction.
+9. ``open_loop``: prediction error of a device; ``improvement``: the improved device; ``shares``: what each finding
+   explains; ``diagnose``: verdict and findings; ``predict``: prediction of a recording.
 """

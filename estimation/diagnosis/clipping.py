@@ -1,4 +1,4 @@
-"""Rails: samples that stand exactly at the largest value of a readout, recognised before anything is fitted."""
+"""Detection of clipped readouts before any fit: many samples exactly at the largest value, the rail."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from scanner.arrays import Array
 from scanner.terms import Parameter, Term
 
 MIN_CLIPPED_SAMPLES = 5
-"""Samples at one extreme value from which it is a rail: noise gives two or three samples the same largest
-value."""
+"""Number of samples at the extreme value from which it is a rail. By noise alone two or three samples share the largest
+value of a converter."""
 
 MIN_CLIPPED_RATIO = 3.0
-"""Samples at the extreme value over those at the most frequent of the values next to it. A converter's steps have many
-samples each, but no more at the top of a swing than this."""
+"""Number of samples at the extreme value over that at the most frequent value next to it. A sine without clipping
+already has more samples at its turning points, but by less than this factor."""
 
 NEIGHBOURS = 8
-"""Values next to the extreme one that are compared with it."""
+"""Distinct values next to the extreme one whose sample counts are compared with its own."""
 
 
 def rail(signal: Array) -> float | None:
     """Magnitude at which a signal of shape (n,) is clipped, None where it is not."""
-    size = np.abs(signal)
-    values, counts = np.unique(size, return_counts=True)
+    magnitude = np.abs(signal)
+    values, counts = np.unique(magnitude, return_counts=True)
     if values.size <= NEIGHBOURS or counts[-1] < MIN_CLIPPED_SAMPLES:
         return None
     if counts[-1] < MIN_CLIPPED_RATIO * counts[-1 - NEIGHBOURS : -1].max():
@@ -36,7 +36,7 @@ def rail(signal: Array) -> float | None:
 
 
 def rail_resolution(runs: Sequence[Run], candidate: Candidate) -> float:
-    """Half of the step below the rail that a candidate's limit was read from; 0 for a candidate that is fitted."""
+    """Uncertainty of a limit read from the rail: half the step to the next lower value; 0 for a fitted candidate."""
     if candidate.term.free_parameters:
         return 0.0
     steps = [
@@ -49,17 +49,17 @@ def rail_resolution(runs: Sequence[Run], candidate: Candidate) -> float:
 
 
 def clipped_readouts(runs: Sequence[Run], saturation: Term | None) -> list[Candidate]:
-    """The saturation of every readout that shows a rail, its limit fixed at the rail.
+    """The saturation term of every readout that is clipped, with its limit fixed at the rail.
 
     Args:
-        saturation: the catalogue's term; None where it is not looked for.
+        saturation: the catalogue's term; None if saturation is not a candidate.
     """
-    found: dict[str, Candidate] = {}
+    by_axis: dict[str, Candidate] = {}
     for run in runs:
         for output in run.outputs:
             limit = rail(output.full) if saturation is not None and output.kind == "sense" else None
             if limit is not None and saturation is not None:
                 fixed = Parameter("limit", "V", lambda scales, limit=limit: limit, kind="fixed")  # type: ignore[misc]
                 term = replace(saturation, parameters=(fixed,))
-                found.setdefault(output.axes[0], Candidate(term, output.axes[0], "sense"))
-    return list(found.values())
+                by_axis.setdefault(output.axes[0], Candidate(term, output.axes[0], "sense"))
+    return list(by_axis.values())

@@ -1,4 +1,4 @@
-"""The diagnosis: verdict, findings with their evidence, and the device that keeps what was found."""
+"""The diagnosis: verdict, findings with their evidence, and the improved device."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from estimation.diagnosis.clipping import rail_resolution
 from estimation.diagnosis.data import prepare_run
-from estimation.diagnosis.decomposition import remainder, share, unexplained
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
@@ -22,6 +21,7 @@ from estimation.diagnosis.model import Candidate
 from estimation.diagnosis.profile_likelihood import profile_interval
 from estimation.diagnosis.progressive_fit import UNIQUE_NAME_THRESHOLD
 from estimation.diagnosis.selection import Progress, SelectionResult, SelectionStep, select_terms
+from estimation.diagnosis.shares import describe_unexplained, find_remainder, share_of_finding
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -31,7 +31,8 @@ SCHEMA = "lissajous-diagnosis/1"
 METRIC = "reduced chi-square of the whitened residual on samples not used in the fit"
 
 PULL_LIMIT = 1e-3
-"""Probability of pulls on the nominal values as large as these, below which they are a mismatch by themselves."""
+"""Probability below which the deviations (pulls) of the fitted nominal values from the stated ones are a mismatch in
+themselves: one false alarm in a thousand recordings without any effect."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,13 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class Rival:
-    """Another effect in the finding's place: how probable it is, and what of the finding it cannot imitate [sigma].
+    """Another effect that may explain the data in place of a finding.
 
-    The distance is None where it was not worked out: for an effect without a law, and for the optics.
+    Attributes:
+        effect: its name.
+        probability: posterior probability that it is the true effect.
+        distance: norm of the finding's signal that remains if the rival is fitted to it [sigma]; None for an effect
+            without a law and for the optics, where it is not computed.
     """
 
     effect: str
@@ -58,7 +63,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class Finding:
-    """One effect that the nominal device leaves out, in the form of diagnosis.json."""
+    """One effect that the nominal device omits, with the keys of diagnosis.json (docs/reference/outputs.md)."""
 
     axis: str
     stage: str
@@ -78,15 +83,18 @@ class Finding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What came out.
+    """Result of a diagnosis.
 
     Attributes:
         verdict: ``"consistent"`` or ``"mismatch"``.
-        findings: in order of weight.
-        unexplained: what is left in words, None where nothing is.
-        device: improved: nominal values as fitted, terms added.
-        search: all fits behind it; None where the device states no mechanics that could be predicted.
-        optics: what the recordings with an intensity can tell of the optics, a table of each.
+        findings: the largest share of the misfit first.
+        unexplained: the unexplained misfit in words, None if there is none.
+        device: the improved device, with fitted nominal values and the terms of the findings.
+        search: the fits of the selection; None if the device states no mechanics, so that no motion can be predicted.
+        nominal: deviation of every nominal value from the stated one, in tolerances.
+        remainder: share, stage and channel of the largest misfit that no finding explains, None if there is none.
+        open_loop: prediction error of the nominal and the improved device, by channel.
+        optics: effects on the picture, for every recording with an intensity.
     """
 
     verdict: str
@@ -154,142 +162,158 @@ def nominal_device(recordings: Sequence[Recording], device: Device | None) -> De
     return nominal
 
 
-def build_diagnosis(found: SelectionResult) -> Diagnosis:
-    """The statement that a search supports."""
-    improvement = improve(found)
-    found = improvement.search
-    findings = [replace(_finding(found, each), share=share(found, each)) for each in found.steps]
-    findings.sort(key=lambda each: -(each.share or 0.0))
-    pulled = None if findings else _prior_tension_finding(found.final)
-    if pulled is not None:
-        findings.append(pulled)
-    left = remainder(found)
+def build_diagnosis(result: SelectionResult) -> Diagnosis:
+    """Verdict, findings and improved device from the result of a selection."""
+    improvement = improve(result)
+    result = improvement.search
+    findings = [replace(_finding(result, step), share=share_of_finding(result, step)) for step in result.steps]
+    findings.sort(key=lambda finding: -(finding.share or 0.0))
+    tension = None if findings else _prior_tension_finding(result.final)
+    if tension is not None:
+        findings.append(tension)
+    unexplained = describe_unexplained(result)
     return Diagnosis(
-        "mismatch" if findings or unexplained(found) else "consistent",
+        "mismatch" if findings or unexplained else "consistent",
         tuple(findings),
-        unexplained(found),
+        unexplained,
         improvement.device,
-        found,
-        _nominal(found.final),
-        left,
+        result,
+        _nominal(result.final),
+        find_remainder(result),
         improvement.to_json(),
     )
 
 
-def _finding(found: SelectionResult, each: SelectionStep) -> Finding:
-    candidate = each.candidate
-    unknown = candidate.term.effect in DISCREPANCY_TERMS
+def _finding(result: SelectionResult, step: SelectionStep) -> Finding:
+    candidate = step.candidate
+    has_law = candidate.term.effect not in DISCREPANCY_TERMS
     effect = _name(candidate)
-    options = {effect: 1.0}
-    for lead in each.rivals:
-        name = _name(lead.candidate)
-        options[name] = max(options.get(name, 0.0), float(np.exp(-0.5 * np.clip(lead.evidence_gap, 0.0, 1400.0))))
-    nothing = float(np.exp(-0.5 * np.clip(each.before.neg2_log_evidence - each.after.neg2_log_evidence, 0.0, 1400.0)))
+    weights = {effect: 1.0}  # evidence relative to that of the finding
+    for rival in step.rivals:
+        name = _name(rival.candidate)
+        weights[name] = max(weights.get(name, 0.0), _evidence_ratio(rival.evidence_gap))
+    without_effect = _evidence_ratio(step.before.neg2_log_evidence - step.after.neg2_log_evidence)
     if not candidate.term.free_parameters:
-        nothing = 0.0  # recognised in the samples, not by a fit
-    total = sum(options.values()) + nothing
-    distance = {} if unknown else _distances(found, each)
-    named = [lead for lead in each.rivals if lead.candidate.key in distance]
-    near = {_name(lead.candidate): distance[lead.candidate.key] for lead in reversed(named)}
-    as_good = {_name(lead.candidate) for lead in named if lead.misfit_gap < DISCRIMINATION_SIGMA**2}
+        without_effect = 0.0  # detected in the samples, not by a fit
+    total = sum(weights.values()) + without_effect
+    distance = _distances(result, step) if has_law else {}
+    comparable = [rival for rival in step.rivals if rival.candidate.key in distance]
+    distance_of = {_name(rival.candidate): distance[rival.candidate.key] for rival in reversed(comparable)}
+    fits_as_well = {_name(rival.candidate) for rival in comparable if rival.misfit_gap < DISCRIMINATION_SIGMA**2}
     rivals = tuple(
-        Rival(name, weight / total, near.get(name))
-        for name, weight in sorted(options.items(), key=lambda item: -item[1])
-        # what fits as well, with more numbers, is improbable and yet not told apart
-        if name != effect and (weight / total > 1e-4 or name in as_good)
+        Rival(name, weight / total, distance_of.get(name))
+        for name, weight in sorted(weights.items(), key=lambda item: -item[1])
+        # a rival that fits as well with more parameters is improbable, but the data do not exclude it
+        if name != effect and (weight / total > 1e-4 or name in fits_as_well)
     )
     return Finding(
         axis=candidate.axis,
         stage=candidate.term.stage,
         effect=effect,
         equation=candidate.term.equation,
-        parameters=() if unknown else parameter_estimates(found.likelihood, found.final, candidate),
-        where=describe_localisation(found.likelihood, candidate, each.before, each.after),
-        probability=options[effect] / total,
+        parameters=parameter_estimates(result.likelihood, result.final, candidate) if has_law else (),
+        where=describe_localisation(result.likelihood, candidate, step.before, step.after),
+        probability=weights[effect] / total,
         rivals=rivals,
-        heldout={"metric": METRIC, "before": each.before.validation_chi2, "after": found.final.validation_chi2},
+        heldout={"metric": METRIC, "before": step.before.validation_chi2, "after": result.final.validation_chi2},
         channel=candidate.channel,
         source=candidate.term.source,
-        advice=_advice(found, each, distance),
-        curve=correction_curve(each.after) if unknown else None,
+        advice=_advice(result, step, distance),
+        curve=None if has_law else correction_curve(step.after),
     )
 
 
-def _distances(found: SelectionResult, each: SelectionStep) -> dict[str, float]:
-    """How far each named rival stands from what was found, by key [sigma].
+def _evidence_ratio(gap: float) -> float:
+    """Ratio of two evidences whose -2 logarithms differ by ``gap``; at most 1, without underflow."""
+    return float(np.exp(-0.5 * np.clip(gap, 0.0, 1400.0)))
 
-    By first order at the rival's usual shape, or by what its own best fit leaves, where that found a nearer one.
+
+def _distances(result: SelectionResult, step: SelectionStep) -> dict[str, float]:
+    """Distance of every named rival from the finding, by key of the candidate [sigma].
+
+    It is computed from the rival's sensitivities, to first order, or from the misfit of the fitted rival if that is
+    smaller.
     """
-    taken = {other.key for other in found.final.model.candidates}
-    leads = [
-        lead
-        for lead in each.rivals
-        if lead.candidate.term.effect not in DISCREPANCY_TERMS and lead.candidate.key not in taken
+    present = {other.key for other in result.final.model.candidates}
+    rival_fits = [
+        rival
+        for rival in step.rivals
+        if rival.candidate.term.effect not in DISCREPANCY_TERMS and rival.candidate.key not in present
     ]
-    rivals = [lead.candidate for lead in leads]
-    first_order = distances_to_rivals(found.likelihood, found.final, each.candidate, rivals)
+    rivals = [rival.candidate for rival in rival_fits]
+    first_order = distances_to_rivals(result.likelihood, result.final, step.candidate, rivals)
     return {
-        lead.candidate.key: min(distance, float(np.sqrt(max(lead.misfit_gap, 0.0))))
-        for lead, distance in zip(leads, first_order, strict=True)
+        rival.candidate.key: min(distance, float(np.sqrt(max(rival.misfit_gap, 0.0))))
+        for rival, distance in zip(rival_fits, first_order, strict=True)
     }
 
 
-def _advice(found: SelectionResult, each: SelectionStep, distance: Mapping[str, float]) -> str | None:
-    """What would tell the finding from the rivals that it cannot be told from: worked out for the nearest of them."""
-    candidate = each.candidate
+def _advice(result: SelectionResult, step: SelectionStep, distance: Mapping[str, float]) -> str | None:
+    """What would distinguish the finding from its rivals: computed for the nearest, general advice for the others."""
+    candidate = step.candidate
     effect = candidate.term.effect
-    close = {
-        lead.candidate.key: lead.candidate
-        for lead in each.rivals
-        if lead.candidate.term.effect != effect
+    confusable = {
+        rival.candidate.key: rival.candidate
+        for rival in step.rivals
+        if rival.candidate.term.effect != effect
         and (
-            lead.evidence_gap < UNIQUE_NAME_THRESHOLD or distance.get(lead.candidate.key, np.inf) < DISCRIMINATION_SIGMA
+            rival.evidence_gap < UNIQUE_NAME_THRESHOLD
+            or distance.get(rival.candidate.key, np.inf) < DISCRIMINATION_SIGMA
         )
     }
-    said = []
-    nearest = min(close, key=lambda key: distance.get(key, np.inf), default=None)
+    parts = []
+    nearest = min(confusable, key=lambda key: distance.get(key, np.inf), default=None)
     if nearest is not None and distance.get(nearest, np.inf) < DISCRIMINATION_SIGMA:
-        said.append(
-            discrimination_advice(found.likelihood, found.final, candidate, close.pop(nearest), distance[nearest])
+        parts.append(
+            discrimination_advice(
+                result.likelihood, result.final, candidate, confusable.pop(nearest), distance[nearest]
+            )
         )
-    for other in close.values():
+    for other in confusable.values():
         text = candidate.term.confounders.get(other.term.effect) or other.term.confounders.get(effect)
-        said += [f"{other.term.effect}: {text}"] if text else []
-    return "; ".join(said) or None
+        parts += [f"{other.term.effect}: {text}"] if text else []
+    return "; ".join(parts) or None
 
 
 def _name(candidate: Candidate) -> str:
+    """Name of the effect in the findings; a discrepancy term is ``unknown``."""
     return "unknown" if candidate.term.effect in DISCREPANCY_TERMS else candidate.term.effect
 
 
 def parameter_estimates(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> tuple[ParameterEstimate, ...]:
     """Physical values of a candidate's parameters with their 95 % intervals, by profile likelihood.
 
-    The values are those of the improved device, whose undetermined nominal values are as stated.
+    The values are those of the improved device; nominal values that the recording does not determine are as stated.
     """
     scales = fit.model.scales(candidate.axis)
     values = fit.model.values(candidate, determined_only(fit))
     resolution = rail_resolution(likelihood.runs, candidate)
-    found = []
+    estimates = []
     for parameter, value in zip(candidate.term.parameters, values, strict=True):
-        at = fit.model.index("term", candidate.key, parameter.name)
+        index = fit.model.index("term", candidate.key, parameter.name)
         ends = [value - resolution, value + resolution]
-        if at is not None:
-            ends = [parameter.value(end, scales) for end in profile_interval(likelihood, fit, at)]
-        found.append(
+        if index is not None:
+            ends = [parameter.value(end, scales) for end in profile_interval(likelihood, fit, index)]
+        estimates.append(
             ParameterEstimate(parameter.name, float(value), (float(min(ends)), float(max(ends))), parameter.unit)
         )
-    return tuple(found)
+    return tuple(estimates)
 
 
 def _pulls(fit: Fit) -> list[tuple[float, str, str]]:
-    """(pull in tolerances, axis, ``stage.key``) of every nominal value, largest first."""
+    """Pull, the deviation from the stated value in tolerances, with axis and ``stage.key`` of every nominal value.
+
+    The largest comes first.
+    """
     pulls = [(float(fit.x[i]), f.owner, f.name) for i, f in enumerate(fit.model.parameters) if f.kind == "nominal"]
     return sorted(pulls, key=lambda pull: -abs(pull[0]))
 
 
 def _prior_tension_finding(fit: Fit) -> Finding | None:
-    """Nominal values that would have to lie further off than their tolerances allow, though no term explains it."""
+    """A finding for nominal values that deviate from the stated ones by more than their tolerances allow.
+
+    None if the deviations are as probable as ``PULL_LIMIT``.
+    """
     from scipy.stats import chi2
 
     pulls = _pulls(fit)
@@ -302,7 +326,7 @@ def _prior_tension_finding(fit: Fit) -> Finding | None:
         effect="unknown",
         equation=f"{name} off by {size:+.1f} tolerances",
         parameters=(),
-        where=f"{name} must lie {size:+.1f} of its tolerances off to explain the recording; the residual is clean",
+        where=f"{name} must deviate by {size:+.1f} tolerances to explain the recording; the residual is noise",
         probability=1.0,
         rivals=(),
         heldout={"metric": METRIC, "before": fit.validation_chi2, "after": fit.validation_chi2},

@@ -42,16 +42,19 @@ COMPARED_WINDOW_SHARE = 0.98
 """Share of a window whose samples are fitted: the whitening of the others depends on samples beyond the window."""
 
 DIVERGED_RESIDUAL, MAX_RESIDUAL = 1e6, 1e100
-"""Residual in place of one above the second number, whose square would overflow, of a trajectory that diverges."""
+"""Residuals of a diverging trajectory above the second number, whose square would overflow, are replaced by the
+first."""
 
 INITIAL_STEP = 1e-4
 """First difference step of every parameter, in prior standard deviations."""
 
 STEP_CHANGE_SIGMA = 0.3
-"""Change of the residual, as a norm [sigma], that a difference step causes: far above rounding, and still linear."""
+"""Norm of the change of the residual [sigma] that a difference step should cause: far above the rounding error, and
+small enough for the residual to change linearly."""
 
 MIN_STEP, MAX_STEP, STEP_WITHOUT_EFFECT = 1e-7, 3e-2, 1e-2
-"""Bounds of a difference step, and the step of a parameter that changes nothing, in prior standard deviations."""
+"""Bounds of a difference step, and the step of a parameter without effect, in prior standard deviations. Below the
+first, rounding dominates; above the second, the change is no longer linear."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,10 @@ class Fit:
     """A fitted model.
 
     Attributes:
-        model: what was fitted.
+        model: the fitted model.
         x: parameters at the best fit, shape (p,), in prior standard deviations.
         chi2: sum of squares of the fitted residuals.
-        penalty: what the priors add to the misfit.
+        penalty: sum of squares of x, weighted with the prior precisions.
         residual: whitened, all samples of all channels, shape (N,).
         jacobian: of the whitened residual, shape (N, p).
         rows: mask of the fitted samples, shape (N,).
@@ -90,6 +93,15 @@ class Fit:
     def validation_chi2(self) -> float:
         """Reduced chi-square of the held-out samples."""
         return float(np.mean(self.residual[self.validation_rows] ** 2))
+
+
+def held_out_samples(size: int, guard: tuple[int, int] = (0, 0)) -> Mask:
+    """Samples of a channel that no fit uses, shape (size,): every fifth block, without the guards at its ends."""
+    block = np.floor((np.arange(size) + 0.5) / size * TIME_BLOCKS).astype(int)
+    rows = block % VALIDATION_BLOCK_INTERVAL == VALIDATION_BLOCK_INTERVAL // 2
+    rows[: guard[0]] = False
+    rows[size - guard[1] :] = False
+    return rows
 
 
 class Likelihood:

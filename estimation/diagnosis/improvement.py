@@ -1,4 +1,4 @@
-"""The improved device: what was found is written where the recording determines it and where it predicts better."""
+"""The improved device: values that the recording determines, and terms that do not make its prediction worse."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.fit import Fit, fit_model
 from estimation.diagnosis.identifiability import determined_only
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
+from estimation.diagnosis.pruning import with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep, refit_without
-from estimation.diagnosis.shares import OpenLoop, is_worse, open_loop
 from scanner.device import Axis, Device
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 
 
 @dataclass(frozen=True)
 class Improvement:
-    """The device that a diagnosis writes.
+    """Improved device of a diagnosis.
 
     Attributes:
-        search: without the findings that were rejected.
-        device: never predicts worse than the nominal one, beyond the uncertainty of that likelihood.
-        nominal, improved: how the two devices predict every channel.
+        search: result of the selection without the rejected findings.
+        device: the improved device. Its open-loop error exceeds that of the nominal device by no more than the
+            uncertainty of that comparison.
+        nominal, improved: open-loop errors of the nominal and of the improved device, by channel.
     """
 
     search: SelectionResult
@@ -36,84 +38,85 @@ class Improvement:
     def to_json(self) -> dict[str, Any]:
         """The content of ``open_loop`` in diagnosis.json."""
         return {
-            name: {"nominal": each.to_json(), "improved": self.improved[name].to_json()}
-            for name, each in self.nominal.items()
+            name: {"nominal": loop.to_json(), "improved": self.improved[name].to_json()}
+            for name, loop in self.nominal.items()
         }
 
 
-def improve(found: SelectionResult) -> Improvement:
-    """Return the device with the findings that do not make its open-loop prediction worse.
+def improve(result: SelectionResult) -> Improvement:
+    """Improve the device by the findings that do not make its open-loop prediction worse.
 
-    A named law that makes it worse than the nominal device's, beyond the uncertainty of that likelihood, is rejected,
-    the weakest first. A law without a name is a finding all the same. Where the device with it predicts no better, the
-    device stays nominal.
+    As long as the device with all findings predicts worse than the nominal one, beyond the uncertainty of the
+    comparison, the weakest finding is removed. A discrepancy term always remains a finding, but if the device with its
+    measured law predicts any channel of any run worse, the nominal device is returned.
     """
-    runs, stated = found.likelihood.runs, found.final.model.device
+    runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
     while True:
-        unnamed = any(each.candidate.term.effect in DISCREPANCY_TERMS for each in found.steps)
-        device = improved_device(static_law(found) if unnamed else found.final)
+        unnamed = any(step.candidate.term.effect in DISCREPANCY_TERMS for step in result.steps)
+        device = improved_device(fit_static_law(result) if unnamed else result.final)
         improved = open_loop(runs, device)
-        if unnamed or not found.steps:
+        if unnamed or not result.steps:
             better = all(_is_better([run], stated, device) for run in runs)
-            return Improvement(found, device if better else stated, nominal, improved if better else nominal)
+            return Improvement(result, device if better else stated, nominal, improved if better else nominal)
         if not is_worse(nominal, improved):
-            return Improvement(found, device, nominal, improved)
-        found = without_weakest(found)
+            return Improvement(result, device, nominal, improved)
+        result = without_weakest(result)
 
 
 def _is_better(runs: Sequence[Run], stated: Device, device: Device) -> bool:
-    """Whether ``device`` predicts no channel of the runs with a larger error than the stated device."""
+    """Whether ``device`` predicts every channel of the runs with an error at most that of the stated device."""
     nominal, improved = open_loop(runs, stated), open_loop(runs, device)
-    return all(improved[name].error <= each.error for name, each in nominal.items())
+    return all(improved[name].error <= loop.error for name, loop in nominal.items())
 
 
-def static_law(found: SelectionResult) -> Fit:
-    """The fit with the part alone of its free correction that a device file can state; see ``measured_law_table``."""
-    fit, free = found.final, found.final.model.candidates[-1]
-    static = STATIC_PARAMETERS.get(free.term.effect, ())
-    parameters = tuple(
-        each if each.kind == "fixed" or each.name in static else replace(each, kind="fixed", scale=lambda scales: 0.0)
-        for each in free.term.parameters
-    )
-    fewer = Candidate(replace(free.term, parameters=parameters), free.axis, free.channel)
-    others = fit.model.candidates[:-1]
-    model = Model(fit.model.runs, fit.model.device, [*others, fewer] if static else others, fit.model.mains)
-    return fit_model(found.likelihood, model, model.map_parameters_from(fit.model, fit.x))
+def fit_static_law(result: SelectionResult) -> Fit:
+    """Refit the final model with only the static part of its discrepancy term, which a device file can state.
+
+    See ``measured_law_table``.
+    """
+    model, discrepancy = result.final.model, result.final.model.candidates[-1]
+    static = STATIC_PARAMETERS.get(discrepancy.term.effect, ())
+    candidates = [*model.candidates[:-1], *([with_free_parameters(discrepancy, static)] if static else [])]
+    reduced = Model(model.runs, model.device, candidates, model.mains)
+    return fit_model(result.likelihood, reduced, reduced.map_parameters_from(model, result.final.x))
 
 
-def without_weakest(found: SelectionResult) -> SelectionResult:
-    """A search's result without the finding that explains least."""
-    weakest = min(found.steps, key=lambda each: each.before.chi2 + each.before.penalty)
-    rest = [each for each in found.steps if each is not weakest]
-    final = refit_without(found.likelihood, found.final, weakest.candidate) if rest else found.nominal
+def without_weakest(result: SelectionResult) -> SelectionResult:
+    """The result of a selection without the finding whose removal raises the misfit least, refitted."""
+    weakest = min(result.steps, key=lambda step: step.before.chi2 + step.before.penalty)
+    remaining = [step for step in result.steps if step is not weakest]
+    final = refit_without(result.likelihood, result.final, weakest.candidate) if remaining else result.nominal
 
-    def refitted(each: SelectionStep) -> SelectionStep:
-        before = refit_without(found.likelihood, final, each.candidate) if len(rest) > 1 else found.nominal
-        return replace(each, before=before, after=final)
+    def refit(step: SelectionStep) -> SelectionStep:
+        before = refit_without(result.likelihood, final, step.candidate) if len(remaining) > 1 else result.nominal
+        return replace(step, before=before, after=final)
 
-    return replace(found, final=final, steps=tuple(map(refitted, rest)))
+    return replace(result, final=final, steps=tuple(map(refit, remaining)))
 
 
 def improved_device(fit: Fit) -> Device:
-    """The device with its nominal values as far as the recording determines them, and the terms that were found."""
+    """The device with the fitted nominal values, as far as the recording determines them, and the fitted terms."""
     fit = replace(fit, x=determined_only(fit))
     device = fit.model.device
     axes: dict[str, Axis] = dict(device.axes)
-    shared = device.readout
+    shared_readout = device.readout
     for name in fit.model.axes:
-        made = fit.model.nominal(name, fit.x)
-        if shared is not None:
-            shared = made.readout if name == next(iter(device.axes)) else shared
-            made = replace(made, readout=None)
+        axis = fit.model.nominal(name, fit.x)
+        if shared_readout is not None:
+            shared_readout = axis.readout if name == next(iter(device.axes)) else shared_readout
+            axis = replace(axis, readout=None)
         terms = {effect: dict(values) for effect, values in device.axis(name).terms.items()}
-        for each in fit.model.candidates:
-            if each.axis == name and each.term.effect not in DISCREPANCY_TERMS:
-                values = fit.model.values(each, fit.x)
-                terms[each.term.effect] = {p.name: float(v) for p, v in zip(each.term.parameters, values, strict=True)}
-                if variant := each.term.channels.index(each.channel):
-                    terms[each.term.effect]["variant"] = variant
-            elif each.axis == name and (table := measured_law_table(fit)) is not None:
+        for candidate in fit.model.candidates:
+            term = candidate.term
+            if candidate.axis != name:
+                continue
+            if term.effect not in DISCREPANCY_TERMS:
+                values = fit.model.values(candidate, fit.x)
+                terms[term.effect] = {p.name: float(v) for p, v in zip(term.parameters, values, strict=True)}
+                if variant := term.channels.index(candidate.channel):
+                    terms[term.effect]["variant"] = variant
+            elif (table := measured_law_table(fit)) is not None:
                 terms[MEASURED_LAW] = table
-        axes[name] = replace(made, terms=terms)
-    return replace(device, axes=axes, readout=shared)
+        axes[name] = replace(axis, terms=terms)
+    return replace(device, axes=axes, readout=shared_readout)

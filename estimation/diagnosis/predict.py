@@ -1,4 +1,4 @@
-"""Prediction: a recording's drive played through a device, open loop from the first samples on."""
+"""Open-loop prediction of a recording: the response of a device to the recorded drive."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.diagnosis.data import Run, prepare_run
-from estimation.diagnosis.shares import with_start
+from estimation.diagnosis.open_loop import fit_start_only
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.recording import Recording
@@ -17,13 +17,14 @@ from scanner.terms.measured_law import beyond
 
 @dataclass(frozen=True)
 class Predicted:
-    """One channel on the recording's own clock.
+    """Prediction of one channel at its recorded sample times.
 
     Attributes:
-        values: shape (n,), NaN where the drive was not recorded.
-        measured: what was recorded there.
-        unit, sample_rate, start: of both.
-        noise_sd: stated, None where none is.
+        values: predicted, shape (n,), NaN where the drive was not recorded.
+        measured: recorded, shape (n,).
+        unit: of both.
+        sample_rate, start: of both [Hz], [s].
+        noise_sd: stated standard deviation of the noise of a sample, None where none is stated.
     """
 
     values: Array
@@ -43,18 +44,21 @@ class Predicted:
 
 
 def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
-    """Every sense and angle channel that ``device`` would have shown, its terms included.
+    """Predict every recorded sense and angle channel from the recorded drive, with the terms of ``device`` included.
 
-    Only the mirror's state at the first sample is taken from the channels, from the first few turns; every value of the
-    device stays as it is stated.
+    Only the mirror's angle and rate at the first sample are fitted, to the first few periods of the channels. The
+    values of the device are not adjusted.
+
+    Returns:
+        The prediction of each channel by its name.
 
     Raises:
-        BadInput: nothing to compare with, or a channel missing or unusable.
+        BadInput: the recording has no sense or angle channel, or a channel is missing or invalid.
     """
     run = prepare_run(recording, device)
-    model, x = with_start([run], device)
+    model, x = fit_start_only([run], device)
     return {
-        output.name: _on_own_clock(run, index, signal, recording)
+        output.name: _at_sample_times(run, index, signal, recording)
         for index, (output, signal) in enumerate(zip(run.outputs, model.full_signals(x), strict=True))
     }
 
@@ -62,14 +66,14 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
 def beyond_measured_laws(recording: Recording, device: Device) -> dict[str, float]:
     """Fraction of the predicted samples, by axis, that lie beyond the range in which a law of the device was measured.
 
-    There the law continues with the slope at the edge, so the prediction is an extrapolation. Axes without a measured
-    law are left out.
+    Beyond its range a measured law continues linearly, so the prediction is an extrapolation there. Axes without a
+    measured law are not listed.
     """
     laws = {name: axis.terms[MEASURED_LAW] for name, axis in device.axes.items() if MEASURED_LAW in axis.terms}
     if not laws:
         return {}
     run = prepare_run(recording, device)
-    model, x = with_start([run], device)
+    model, x = fit_start_only([run], device)
     trajectories = model.trajectories(
         run,
         0,
@@ -79,17 +83,21 @@ def beyond_measured_laws(recording: Recording, device: Device) -> dict[str, floa
         1.0,
     )
     sensed = dict(zip((output.name for output in run.outputs), model.full_signals(x), strict=True))
-    found = {}
+    fractions = {}
     for name, law in laws.items():
         if name in trajectories:
-            path = trajectories[name]
-            signal = next((s for key, s in sensed.items() if key in (f"sense_{name}", "sense")), path.angle)
-            variables = {"mechanics": [path.angle, path.rate], "optics": [path.angle], "readout": [signal]}
-            found[name] = beyond(law, variables.get(law["stage"], [path.voltage]))
-    return found
+            trajectory = trajectories[name]
+            signal = next((s for key, s in sensed.items() if key in (f"sense_{name}", "sense")), trajectory.angle)
+            variables = {
+                "mechanics": [trajectory.angle, trajectory.rate],
+                "optics": [trajectory.angle],
+                "readout": [signal],
+            }
+            fractions[name] = beyond(law, variables.get(law["stage"], [trajectory.voltage]))
+    return fractions
 
 
-def _on_own_clock(run: Run, index: int, signal: Array, recording: Recording) -> Predicted:
+def _at_sample_times(run: Run, index: int, signal: Array, recording: Recording) -> Predicted:
     """A signal on the integration grid, at every sample of its channel, by a cubic spline."""
     from scipy.interpolate import CubicSpline
 

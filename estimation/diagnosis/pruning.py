@@ -6,6 +6,7 @@ named terms even where a law with two of its amplitudes fits better.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from math import comb, log
 
@@ -27,16 +28,20 @@ def prune_by_evidence(likelihood: Likelihood, fit: Fit) -> Fit | None:
     required = _required_parameters(fit, indices)
     if not required:
         return None
-    names = {fit.model.parameters[i].name for i in required}
-    parameters = tuple(
-        p if p.kind == "fixed" or p.name in names else replace(p, kind="fixed", scale=lambda scales: 0.0)
-        for p in candidate.term.parameters
-    )
-    pruned = Candidate(replace(candidate.term, parameters=parameters), candidate.axis, candidate.channel)
+    pruned = with_free_parameters(candidate, {fit.model.parameters[i].name for i in required})
     model = Model(fit.model.runs, fit.model.device, [*fit.model.candidates[:-1], pruned], fit.model.mains)
     refit = fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
     choice = 2.0 * log(comb(len(indices), len(required)))
     return replace(refit, neg2_log_evidence=refit.neg2_log_evidence + choice)
+
+
+def with_free_parameters(candidate: Candidate, names: Collection[str]) -> Candidate:
+    """A candidate of whose parameters only those with ``names`` are free; the others are fixed at 0."""
+    parameters = tuple(
+        p if p.kind == "fixed" or p.name in names else replace(p, kind="fixed", scale=lambda scales: 0.0)
+        for p in candidate.term.parameters
+    )
+    return Candidate(replace(candidate.term, parameters=parameters), candidate.axis, candidate.channel)
 
 
 def _required_parameters(fit: Fit, indices: list[int]) -> list[int]:

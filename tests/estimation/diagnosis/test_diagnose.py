@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimation.diagnosis.data import decimate, is_steady, prepare_run, resample_drive, strongest_line
+from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.drive_lines import is_steady, strongest_line
 from estimation.diagnosis.exchange import fit_exchanges
 from estimation.diagnosis.fit import Likelihood, fit_model
 from estimation.diagnosis.initial import (
@@ -25,6 +26,7 @@ from estimation.diagnosis.initial import (
 from estimation.diagnosis.interference import strongest_foreign_line
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.noise import make_whitener, noise_psd
+from estimation.diagnosis.resampling import decimate, resample_drive
 from estimation.diagnosis.screening import all_candidates
 from recon.cli import main
 from scanner.device import Device
@@ -316,7 +318,7 @@ def test_diagnose_and_predict_write_the_documented_files_and_keys(
 
 @pytest.mark.parametrize(
     ("drop", "complaint"),
-    [("drive_x", "linear drive"), ("sense_x", "no channel that the device could be held against")],
+    [("drive_x", "linear drive"), ("sense_x", "no channel that the device can simulate")],
 )
 def test_a_missing_channel_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], drop: str, complaint: str

@@ -14,7 +14,8 @@ from estimation.diagnosis.fit import Likelihood, fit_model
 from estimation.diagnosis.identifiability import determined_only
 from estimation.diagnosis.initial import flat_whiteners
 from estimation.diagnosis.model import Model
-from estimation.diagnosis.shares import OpenLoop, is_worse, open_loop, remainder_of, share_of
+from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
+from estimation.diagnosis.shares import explained_share, remaining_share
 from scanner.device import Axis, Device, Mechanics, Position
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -22,9 +23,9 @@ from tests.support.bench import DEVICE, bench_recording
 
 
 def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
-    assert share_of(without=5.0, complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.95)
-    assert remainder_of(complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.05)
-    assert share_of(without=1.0, complete=1.2, nominal=5.0, noise=1.0) == 0.0
+    assert explained_share(without=5.0, complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.95)
+    assert remaining_share(complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.05)
+    assert explained_share(without=1.0, complete=1.2, nominal=5.0, noise=1.0) == 0.0
 
 
 def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> None:
@@ -33,10 +34,10 @@ def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> No
     assert is_worse(nominal, {"sense_x": OpenLoop(1.4, 10.0, 0.1)})
 
 
-def test_a_rail_is_recognised_from_samples_at_one_value() -> None:
+def test_a_rail_is_detected_from_samples_at_one_value() -> None:
     rng = np.random.default_rng(3)
     wave = np.sin(np.linspace(0.0, 60.0, 4000)) + 0.01 * rng.normal(size=4000)
-    assert rail(np.clip(wave, None, 0.8)) is None  # the lower half swings further
+    assert rail(np.clip(wave, None, 0.8)) is None  # the lower half is not clipped
     assert rail(np.clip(wave + 0.5, None, 1.2)) == pytest.approx(1.2)
     assert rail(wave) is None
     assert rail(np.round(wave * 64) / 64) is None  # a converter's steps are no rail
@@ -91,13 +92,13 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     )
     assert "measured-law" in improved.device.axis("x").terms
     assert Device.from_toml(improved.device.to_toml()) == improved.device
-    before, after = (open_loop([run], one)["sense_x"].error for one in (device, improved.device))
+    before, after = (open_loop([run], d)["sense_x"].error for d in (device, improved.device))
     assert after < 0.3 * before
 
 
 @pytest.mark.parametrize(
     ("rate", "samples", "what"),
-    [(100.0, 5000, "sampled at 100 Hz, too slowly for a resonance at 1000 Hz"), (2e4, 100, "fewer than 8 turns")],
+    [(100.0, 5000, "sampled at 100 Hz, too slowly for a resonance at 1000 Hz"), (2e4, 100, "fewer than 8 periods")],
 )
 def test_a_recording_that_cannot_serve_is_refused(rate: float, samples: int, what: str) -> None:
     axis = Axis(Mechanics(1.0, 2.0, (2 * np.pi * 1e3) ** 2), readout=Position(1.0, 1e-3), name="x")

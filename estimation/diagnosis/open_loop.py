@@ -1,0 +1,104 @@
+"""Open-loop prediction by a device: its error in every channel on held-out samples, and the comparison of two devices.
+
+Errors are in the unit of the channel and not whitened, as a user measures them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from estimation.diagnosis.data import Run
+from estimation.diagnosis.fit import TIME_BLOCKS, Likelihood, fit_model, held_out_samples
+from estimation.diagnosis.initial import fit_initial_state, flat_whiteners, window_schedule
+from estimation.diagnosis.model import Model
+from scanner.arrays import Array
+from scanner.device import Device
+
+FIXED_PARAMETER_PRECISION = 1e14
+"""Prior precision of a value of the device that a prediction may not adjust."""
+
+DIVERGED_ERROR = 1e6
+"""Error that is assumed where a prediction diverges, in the channel's unit: its square is finite."""
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Prediction of one channel by a device, on held-out samples.
+
+    Attributes:
+        error: root-mean-square error, in the channel's unit.
+        deviation: standard deviation of the recorded samples, in the channel's unit.
+        sd: standard uncertainty of ``error``, from its scatter between held-out blocks.
+    """
+
+    error: float
+    deviation: float
+    sd: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Error, and error as a fraction of the signal."""
+        return {"rmse": self.error, "fraction": self.error / max(self.deviation, 1e-300)}
+
+
+def fit_start_only(runs: Sequence[Run], device: Device) -> tuple[Model, Array]:
+    """Model of a device with its stated values, and parameters of which only the initial state of every run is fitted.
+
+    The initial state is fitted to the first periods of the motion.
+    """
+    model = Model(runs, device, mains=())
+    is_start = np.array([f.kind in ("start", "hidden") for f in model.parameters], bool)
+    model.precision = np.where(is_start, model.precision, FIXED_PARAMETER_PRECISION)
+    likelihood = Likelihood(runs, flat_whiteners(model))
+    first = window_schedule(model)[0]
+    x = fit_model(likelihood, model, fit_initial_state(likelihood, model, first).x, first, 12, tolerance=1e-3).x
+    return model, np.where(is_start, x, 0.0)
+
+
+def open_loop(runs: Sequence[Run], device: Device) -> dict[str, OpenLoop]:
+    """Open-loop error of every channel over all runs; each run starts from its own fitted initial state."""
+    squared_errors: dict[str, list[Array]] = {}
+    data: dict[str, list[Array]] = {}
+    with np.errstate(over="ignore", invalid="ignore"):
+        for run in runs:
+            model, x = fit_start_only([run], device)
+            for output, signal in zip(run.outputs, model.outputs(x)[0], strict=True):
+                rows = held_out_samples(output.data.size, output.guard)
+                error = np.nan_to_num(
+                    output.data - signal, nan=DIVERGED_ERROR, posinf=DIVERGED_ERROR, neginf=DIVERGED_ERROR
+                )
+                blocks = np.floor((np.arange(error.size) + 0.5) / error.size * TIME_BLOCKS)[rows]
+                squares = [float(np.mean(error[rows][blocks == block] ** 2)) for block in np.unique(blocks)]
+                squared_errors.setdefault(output.name, []).append(np.array(squares))
+                data.setdefault(output.name, []).append(output.data[rows])
+    by_channel = {}
+    for name, parts in squared_errors.items():
+        squares_of_blocks = np.concatenate(parts)
+        count = squares_of_blocks.size
+        rms = float(np.sqrt(squares_of_blocks.mean()))
+        scatter = float(squares_of_blocks.std() / np.sqrt(max(count - 1, 1)))
+        deviation = float(np.sqrt(np.mean([part.var() for part in data[name]])))
+        by_channel[name] = OpenLoop(rms, deviation, scatter / max(2.0 * rms, 1e-300))
+    return by_channel
+
+
+def is_worse(nominal: Mapping[str, OpenLoop], improved: Mapping[str, OpenLoop]) -> bool:
+    """Whether a device predicts worse than the nominal one, by more than 1 % and twice the uncertainty.
+
+    The errors of all channels are added, each as a fraction of its signal: a readout lag may change the angle by a
+    thousandth of its amplitude while the error of the sense signal falls to a tenth.
+    """
+    before, before_sd = _relative_error(nominal)
+    after, after_sd = _relative_error(improved)
+    return bool(after - before > 2.0 * np.hypot(before_sd, after_sd) + 0.01 * before)
+
+
+def _relative_error(channels: Mapping[str, OpenLoop]) -> tuple[float, float]:
+    """Root sum of squares of the errors of all channels as fractions of their signals, and its uncertainty."""
+    deviation = [max(channel.deviation, 1e-300) for channel in channels.values()]
+    error, sd = np.array([(channel.error, channel.sd) for channel in channels.values()]).T / deviation
+    total = float(np.linalg.norm(error))
+    return total, float(np.linalg.norm(error * sd)) / max(total, 1e-300)
