@@ -79,19 +79,26 @@ class Drive(Checked):
 
     Attributes:
         kind: ``"electrostatic"``, torque ``C'(theta) V^2 / 2``, or ``"linear"``, torque ``torque_per_volt V``.
-        torque_per_volt: torque per volt of a linear drive, which needs it [N m / V].
+        torque_per_volt: torque per volt of a linear drive, which needs it unless the axis has no mechanics [N m / V].
+        frequency: of the drive voltage, for a recording without a drive channel [Hz].
     """
 
     KINDS: ClassVar[tuple[str, ...]] = ("electrostatic", "linear")
 
     kind: str
     torque_per_volt: float | None = field(default=None, metadata=NONZERO | CAN_BE_OFF)
+    frequency: float | None = field(default=None, metadata=POSITIVE | CAN_BE_OFF)
 
     def __post_init__(self) -> None:
         device_toml.check_kind(self.kind, self.KINDS)
-        if self.kind == "linear" and self.torque_per_volt is None:
+        if self.kind == "linear" and self.torque_per_volt is None and self.frequency is None:
             raise DeviceInvalid("is missing", channel="torque_per_volt", hint="a linear drive needs it [N m / V]")
         super().__post_init__()
+
+    @property
+    def motion_per_drive(self) -> float:
+        """Frequency of the motion by that of the drive: a half for combs, which pull at either end of the motion."""
+        return 0.5 if self.kind == "electrostatic" else 1.0
 
 
 @dataclass(frozen=True)
@@ -225,6 +232,13 @@ class Axis:
     extra: Mapping[str, Any] = field(default_factory=dict)
     name: str = field(default="", compare=False)
     source: str | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        drive = self.drive
+        if drive and drive.kind == "linear" and drive.torque_per_volt is None and self.mechanics:
+            key = ".".join(part for part in (self.name, "drive.torque_per_volt") if part)
+            hint = "a linear drive of an axis with mechanics needs it [N m / V]"
+            raise DeviceInvalid("is missing", file=self.source, channel=key, hint=hint)
 
     @property
     def resonance(self) -> float:

@@ -27,6 +27,7 @@ COMMANDS = {
     "diagnose": "locate, name and model what the nominal device leaves out",
     "design": "find drive frequencies for a wanted field, resolution, frame rate and fill",
     "blur-study": "compare phantoms, scans, drifts, noise, estimators, resolutions and p in one table",
+    "new-device": "write a commented device file for a kind of scanner",
     "info": "list what a recording or an instrument's file holds, with a mapping to start from",
     "convert": "turn an instrument's file into a recording",
     "completion": "print a script that completes commands, options and files in bash, zsh or fish",

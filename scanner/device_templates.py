@@ -1,0 +1,295 @@
+"""Device files to start from: a commented TOML text for a kind of scanner, filled with what is known of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import hypot, pi, sqrt
+
+from scanner.device import AXES
+from scanner.errors import BadInput
+
+COMB_STIFFNESS = 9.6e-6
+"""Stiffness of a comb-driven mirror whose stiffness is not stated [N m / rad]: that of chen2020."""
+COMB_C0 = 5.71e-12
+"""Amplitude of its capacitance [F], of the same mirror."""
+COMB_AMPLITUDE_THETA0 = 0.9
+"""Amplitude over theta0 at which its combs are used: that of the named device ``imaging``."""
+COMB_VOLTS, COMB_THETA0, COMB_QUALITY = 30.0, 0.2, 120.0
+"""Amplitude and offset of the voltage [V] that sustains that amplitude for this theta0 [rad] and Q."""
+COMB_DETUNING = 0.67
+"""Half the drive's frequency over the resonance, less one, times Q: where that voltage sustains the amplitude."""
+MIRROR_INERTIA = 1.0e-10
+"""Moment of inertia of a linearly driven axis [kg m2]: not stated, and only the scale of b, k and torque."""
+LINEAR_VOLTS = 10.0
+"""Voltage of a linear drive that reaches the amplitude [V]: sets the torque per volt where none is stated."""
+
+
+@dataclass(frozen=True)
+class KnownAxis:
+    """What is known of one axis; None where it is not.
+
+    Attributes:
+        resonance: of the motion [Hz].
+        quality: quality factor.
+        amplitude: half the scanned range, mechanical [rad].
+        drive_frequency: of the drive voltage [Hz].
+    """
+
+    resonance: float | None = None
+    quality: float | None = None
+    amplitude: float | None = None
+    drive_frequency: float | None = None
+
+
+@dataclass(frozen=True)
+class ScannerKind:
+    """A kind of scanner and its typical values.
+
+    Attributes:
+        title: in words.
+        is_parametric: comb drives, which move at half the drive's frequency.
+        x, y: typical values; a drive frequency stands only where the axis is not driven at its resonance.
+        sensor: what the position readout is, for the comment.
+        gain: of the position readout [V / rad].
+        noise_sd: of the position readout [V].
+        metres_per_radian: displacement of the beam by mechanical angle [m / rad]; None if there is no typical value.
+    """
+
+    title: str
+    x: KnownAxis
+    y: KnownAxis
+    is_parametric: bool = False
+    sensor: str = "position-sensitive detector"
+    gain: float = 20.0
+    noise_sd: float = 2.0e-3
+    metres_per_radian: float | None = None
+
+
+KINDS = {
+    "parametric": ScannerKind(
+        "comb-driven mirror, all combs on one sense electrode",
+        KnownAxis(13763.0, 120.0, 0.18),
+        KnownAxis(3252.0, 120.0, 0.18),
+        is_parametric=True,
+    ),
+    "electromagnetic": ScannerKind(
+        "electromagnetic mirror with a position detector", KnownAxis(2000.0, 100.0, 0.08), KnownAxis(835.0, 100.0, 0.08)
+    ),
+    "piezo": ScannerKind(
+        "piezoelectric mirror with a piezoresistive sensor",
+        KnownAxis(20000.0, 500.0, 0.15),
+        KnownAxis(1100.0, 200.0, 0.1),
+        sensor="piezoresistive bridge",
+        gain=1.0,
+        noise_sd=2.0e-4,
+    ),
+    "fibre": ScannerKind(
+        "resonant fibre with a position detector; angle = deflection of the tip / length of the fibre",
+        KnownAxis(1000.0, 100.0, 0.1),
+        KnownAxis(1009.0, 100.0, 0.1),
+        noise_sd=5.0e-3,
+        metres_per_radian=2.5e-3,
+    ),
+    "afm": ScannerKind(
+        "piezo stage with position sensors, driven far below its resonance; 1 rad of this file is 1 um of the stage",
+        KnownAxis(500.0, 20.0, 5.0, 20.0),
+        KnownAxis(500.0, 20.0, 5.0, 0.5),
+        sensor="position sensor of the stage",
+        gain=0.0133,
+        noise_sd=7.0e-5,
+        metres_per_radian=1.0e-6,
+    ),
+    "galvo": ScannerKind(
+        "resonant mirror (x) and galvanometer (y), each with the position output of its controller",
+        KnownAxis(7960.0, 100.0, 0.08),
+        KnownAxis(300.0, 0.7, 0.08, 30.0),
+        sensor="position output of the controller",
+        gain=10.0,
+        noise_sd=5.0e-3,
+    ),
+}
+"""Kinds of scanners by name. Typical values are those of the recipes."""
+
+
+def new_device(
+    kind: str, known: Mapping[str, KnownAxis], name: str | None = None, frequencies_only: bool = False
+) -> str:
+    """Return a commented device file for a kind of scanner.
+
+    Args:
+        kind: a key of ``KINDS``.
+        known: what is known of ``"x"`` and ``"y"``; typical values fill the rest.
+        name: of the device; the kind's where None.
+        frequencies_only: state nothing but the drive frequencies, which must be known, and the field. Phases then come
+            from the picture.
+
+    Raises:
+        BadInput: no such kind, or a drive frequency is missing.
+    """
+    if kind not in KINDS:
+        raise BadInput(f"no kind of scanner is named {kind!r}", hint=f"there are {', '.join(KINDS)}")
+    scanner = KINDS[kind]
+    axes = {axis: known.get(axis, KnownAxis()) for axis in AXES}
+    filled = {axis: _fill(scanner, getattr(scanner, axis), axes[axis]) for axis in AXES}
+    parts = [_heading(kind, scanner, filled), f"name = {json.dumps(name or kind)}"]
+    if frequencies_only:
+        parts = [FREQUENCIES_HEADING, *parts[1:], *_frequencies(scanner, axes), _scan(scanner, axes, filled)]
+        return _aligned("\n\n".join(parts))
+    for axis in AXES:
+        parts.append((_comb_axis if scanner.is_parametric else _linear_axis)(scanner, axis, axes[axis], filled[axis]))
+    if scanner.is_parametric:
+        parts.append(SHARED_READOUT)
+    parts.append(_scan(scanner, axes, filled))
+    return _aligned("\n\n".join(parts))
+
+
+def _aligned(text: str) -> str:
+    """The text with the comments behind values in one column."""
+    lines = (line.partition("  # ") for line in text.splitlines())
+    return "".join((f"{left.rstrip():<28}# {comment}" if mark else left) + "\n" for left, mark, comment in lines)
+
+
+def _fill(scanner: ScannerKind, typical: KnownAxis, known: KnownAxis) -> KnownAxis:
+    """Known values, and typical ones in place of the others; a known drive frequency determines the resonance."""
+    quality = known.quality or typical.quality or 1.0
+    ratio = 2.0 * (1.0 + COMB_DETUNING / quality) if scanner.is_parametric else 1.0
+    off_resonance = typical.drive_frequency is not None
+    from_drive = None if off_resonance or known.drive_frequency is None else known.drive_frequency / ratio
+    resonance = known.resonance or from_drive or typical.resonance or 1.0
+    drive = known.drive_frequency or typical.drive_frequency or ratio * resonance
+    return KnownAxis(resonance, quality, known.amplitude or typical.amplitude, drive)
+
+
+def _heading(kind: str, scanner: ScannerKind, filled: Mapping[str, KnownAxis]) -> str:
+    drives = [f"--drive-{axis} {_volts(scanner, filled[axis])}" for axis in AXES]
+    moved = [(filled[axis].drive_frequency or 1.0) / (2.0 if scanner.is_parametric else 1.0) for axis in AXES]
+    rate = float(f"{360 * max(moved):.2g}")
+    duration = float(f"{min(200 / min(moved), max(12 / min(moved), 0.2)):.2g}")
+    simulate = f"lissajous simulate --device device.toml {' '.join(drives)} \\\n#     --rate {rate:g}"
+    return f"""\
+# Device file: {scanner.title}.
+# Written by `lissajous new-device --kind {kind}`. SI units; angles of the mirror (mechanical) in rad.
+# "typical" marks what was not stated: replace it by the value from the data sheet or from `lissajous identify`.
+# Try it without an instrument:
+#   {simulate} --duration {duration:g} --drift -0.0005 -o scan.h5"""
+
+
+def _volts(scanner: ScannerKind, axis: KnownAxis) -> str:
+    """Frequency, amplitude and offset of a drive that reaches the amplitude, as ``simulate`` takes them."""
+    if not scanner.is_parametric:
+        return f"{axis.drive_frequency:.8g},{LINEAR_VOLTS:g},0"
+    volts = COMB_VOLTS * _theta0(axis) / COMB_THETA0 * sqrt(COMB_QUALITY / (axis.quality or 1.0))
+    return f"{axis.drive_frequency:.8g},{volts:.3g},{volts:.3g}"
+
+
+def _theta0(axis: KnownAxis) -> float:
+    return (axis.amplitude or 1.0) / COMB_AMPLITUDE_THETA0
+
+
+def _mechanics(axis: str, known: KnownAxis, filled: KnownAxis, inertia: float) -> str:
+    omega = 2 * pi * (filled.resonance or 1.0)
+    k, b = inertia * omega**2, inertia * omega / (filled.quality or 1.0)
+    of_resonance = known.resonance or known.drive_frequency
+    return f"""\
+[{axis}.mechanics]  # J theta'' + b theta' + k theta = torque
+J = {inertia:.6g}  # kg m2, typical; resonance and Q follow from b / J and k / J
+b = {b:.6g}  # N m s, for a Q of {filled.quality:g}{_mark(known.quality)}
+k = {k:.6g}  # N m / rad, for a resonance of {filled.resonance:.8g} Hz{_mark(of_resonance)}
+
+[{axis}.tolerance]  # relative standard uncertainty of a value; 2 % where none is stated
+k = {0.002 if of_resonance else 0.02}  # twice that of the resonance
+b = {0.05 if known.quality else 0.2}"""
+
+
+def _comb_axis(scanner: ScannerKind, axis: str, known: KnownAxis, filled: KnownAxis) -> str:
+    inertia = COMB_STIFFNESS / (2 * pi * (filled.resonance or 1.0)) ** 2
+    return f"""\
+{_mechanics(axis, known, filled, inertia)}
+C0 = 0.02
+theta0 = 0.02
+
+[{axis}.capacitance]  # C(theta) = C0 exp(-((theta - theta_th) / theta0)^2) + Cb
+C0 = {COMB_C0:g}  # F, typical
+Cb = 9.79e-12  # F, typical
+theta0 = {_theta0(filled):.4g}  # rad, typical for an amplitude of {filled.amplitude:g} rad
+theta_th = 0.0  # rad
+
+[{axis}.drive]
+kind = "electrostatic"  # torque C'(theta) V^2 / 2; the mirror moves at half the drive's frequency
+{_drive_frequency(known, filled)}"""
+
+
+def _linear_axis(scanner: ScannerKind, axis: str, known: KnownAxis, filled: KnownAxis) -> str:
+    omega = 2 * pi * (filled.resonance or 1.0)
+    ratio = (filled.drive_frequency or 1.0) / (filled.resonance or 1.0)
+    response = hypot(1.0 - ratio**2, ratio / (filled.quality or 1.0))
+    torque = MIRROR_INERTIA * omega**2 * (filled.amplitude or 1.0) * response / LINEAR_VOLTS
+    return f"""\
+{_mechanics(axis, known, filled, MIRROR_INERTIA)}
+
+[{axis}.drive]
+kind = "linear"  # torque = torque_per_volt V
+torque_per_volt = {torque:.4g}  # N m / V, typical: {LINEAR_VOLTS:g} V reach {filled.amplitude:g} rad
+{_drive_frequency(known, filled)}
+
+[{axis}.readout]  # {scanner.sensor}: V = gain theta + offset
+kind = "position"
+gain = {scanner.gain:g}  # V / rad, typical
+offset = 0.0  # V
+noise_sd = {scanner.noise_sd:g}  # V, typical
+bits = 16  # resolution of the converter, typical"""
+
+
+def _frequencies(scanner: ScannerKind, known: Mapping[str, KnownAxis]) -> list[str]:
+    """The drives of both axes, of which nothing but the frequency is stated."""
+    kind = "electrostatic" if scanner.is_parametric else "linear"
+    moves = "half the drive's" if scanner.is_parametric else "the drive's"
+    if missing := [axis for axis in AXES if known[axis].drive_frequency is None]:
+        hint = "from the picture alone the phase can be found, not the frequency"
+        raise BadInput("is not stated", channel=f"--drive-frequency-{missing[0]}", hint=hint)
+    return [
+        f'[{axis}.drive]\nkind = "{kind}"  # the mirror moves at {moves} frequency\n'
+        f"frequency = {known[axis].drive_frequency!r}  # Hz; a recorded drive channel is used in its place"
+        for axis in AXES
+    ]
+
+
+def _drive_frequency(known: KnownAxis, filled: KnownAxis) -> str:
+    comment = "Hz; only used where no drive was recorded"
+    if known.drive_frequency is None:
+        return f"# frequency = {filled.drive_frequency:.8g}  # {comment}"
+    return f"frequency = {known.drive_frequency!r}  # {comment}"
+
+
+def _scan(scanner: ScannerKind, known: Mapping[str, KnownAxis], filled: Mapping[str, KnownAxis]) -> str:
+    lines = ["[scan]  # field of view; the amplitudes fill it"]
+    for axis in AXES:
+        lines.append(f"half_angle_{axis} = {filled[axis].amplitude:g}  # rad{_mark(known[axis].amplitude)}")
+    lines.append('angle = "mechanical"  # or "optical": half angles and all reported angles are those of the beam')
+    metres = scanner.metres_per_radian
+    stated = f"metres_per_radian = {metres:g}" if metres else "# metres_per_radian = 1.0e-3"
+    return "\n".join([*lines, f"{stated}  # displacement of the beam on the sample, for pictures to scale"])
+
+
+def _mark(known: float | None) -> str:
+    return ", as stated" if known else ", typical"
+
+
+FREQUENCIES_HEADING = """\
+# Device file of a scanner of which only the drive frequencies and the field are known. `reconstruct` finds the phases
+# in the picture. Sign and amplitude of the motion cannot be found there: the field is taken as the amplitude."""
+
+SHARED_READOUT = """\
+[readout]  # one for both axes, channel sense; for channels sense_x and sense_y write [x.readout] and [y.readout]
+kind = "amdm"  # V = a_cir C + b_cir; or "transimpedance": V = -R_s V_bias C'(theta) theta'
+a_cir = -3.574e11  # V / F, typical
+b_cir = 9.9  # V, typical
+lpf_hz = [40800.0, 41100.0]  # corner frequencies of the low-pass sections, typical
+noise_var = 1.92e-4  # V2, typical
+bits = 12  # resolution of the converter, typical
+
+[tolerance]  # of the shared readout
+a_cir = 0.02
+b_cir = 0.02"""
