@@ -14,7 +14,7 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
 from estimation.diagnosis.fit import Fit, Likelihood
-from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_only
+from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_parameters
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.localisation import describe_localisation
 from estimation.diagnosis.model import Candidate
@@ -286,7 +286,7 @@ def parameter_estimates(likelihood: Likelihood, fit: Fit, candidate: Candidate) 
     The values are those of the improved device; nominal values that the recording does not determine are as stated.
     """
     scales = fit.model.scales(candidate.axis)
-    values = fit.model.values(candidate, determined_only(fit))
+    values = fit.model.values(candidate, determined_parameters(fit))
     resolution = rail_resolution(likelihood.runs, candidate)
     estimates = []
     for parameter, value in zip(candidate.term.parameters, values, strict=True):

@@ -19,8 +19,8 @@ from scanner.lowpass import apply_lowpass
 from scanner.terms import Parameter, SignalContext, Term
 
 FORCE_DEGREE = 5
-"""Highest total degree of the force polynomial in angle and rate. Higher degrees are hard to tell from lower ones over
-one range of amplitudes."""
+"""Highest total degree of the force polynomial in angle and rate. Over one range of amplitudes, higher degrees can
+hardly be distinguished from lower ones."""
 
 FORCE_POWERS = tuple((i, n - i) for n in range(2, FORCE_DEGREE + 1) for i in range(n, -1, -1))
 """Powers (i, j) of angle and rate in the force polynomial, in the order of its coefficients."""
@@ -30,7 +30,7 @@ FORCE_DRIFT_COSINES = 3
 monotonic drift; more belong to ``free-stiffness``."""
 
 STIFFNESS_COSINES, DAMPING_COSINES = 20, 8
-"""Numbers of cosines over the duration of stiffness and damping in ``free-stiffness``, the term without other freedom.
+"""Numbers of cosines over the duration of stiffness and damping in ``free-stiffness``, which has no other parameters.
 Damping acts on the channels through the slow amplitude only, so fewer are identifiable."""
 
 OFFSET_COSINES, GAIN_COSINES, DELAY_COSINES = 6, 28, 20
@@ -43,7 +43,8 @@ any rate-independent hysteresis (Prandtl-Ishlinskii); factors of two cover small
 
 AMPLITUDE_MEMORY_SHARES = (0.05, 0.25)
 """Time constants with which stiffness and damping follow the squared amplitude, as heating does, as shares of the
-duration. Slower ones look like a drift, faster ones like an amplitude dependence without memory."""
+duration. Slower ones cannot be distinguished from a drift, faster ones not from an amplitude dependence without
+memory."""
 
 DELAY_MEMORY_PERIODS = (1.0, 4.0, 16.0)
 """Time constants with which a delay follows the squared amplitude, in periods of the motion. Their weighted sum
@@ -57,134 +58,141 @@ MAPPING_KNOTS = np.linspace(-1.0, 1.0, 15)
 """Angles, in amplitudes, between which the correction of a reference angle is linear. Fifteen knots resolve a seventh
 of the amplitude."""
 
-SOURCE = "free correction: polynomials and cosines, no physics of their own"
+SOURCE = "discrepancy term (Kennedy & O'Hagan 2001): polynomials and cosines without a physical model"
 
 
 @njit(cache=True)
-def _cosines(turn, sizes):  # type: ignore[no-untyped-def]
-    """sum_j sizes[j - 1] cos(j turn)."""
-    first = np.cos(turn)
-    total, before, wave = 0.0, 1.0, first
-    for i in range(len(sizes)):
-        total += sizes[i] * wave
-        before, wave = wave, 2.0 * first * wave - before
+def _cosines(phase, coefficients):  # type: ignore[no-untyped-def]
+    """sum_j coefficients[j - 1] cos(j phase)."""
+    cosine = np.cos(phase)
+    total, previous, current = 0.0, 1.0, cosine
+    for i in range(len(coefficients)):
+        total += coefficients[i] * current
+        previous, current = current, 2.0 * cosine * current - previous
     return total
 
 
 @njit(cache=True)
 def apply_play(signal, width):  # type: ignore[no-untyped-def]
-    """Output of a play operator of half-width ``width`` on ``signal``, shape (n,), at rest at the first sample."""
-    out = np.empty_like(signal)
-    held = signal[0]
+    """Output of a play operator of half-width ``width`` for ``signal``, shape (n,), equal to it at the first sample."""
+    output = np.empty_like(signal)
+    state = signal[0]
     for i in range(signal.size):
-        held = min(max(held, signal[i] - width), signal[i] + width)
-        out[i] = held
-    return out
+        state = min(max(state, signal[i] - width), signal[i] + width)
+        output[i] = state
+    return output
 
 
 @njit(TORQUE_LAW, cache=True)
 def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
+    """Force polynomial, drift and memory: torque [N m] and the rates of the two hidden states."""
     x, y = theta / p[0], omega / (p[0] * p[1])
-    total, at = 0.0, 3
+    total, index = 0.0, 3
     for n in range(2, FORCE_DEGREE + 1):
         for j in range(n + 1):
-            total += p[at] * x ** (n - j) * y**j
-            at += 1
-    total += (p[at] * z0 + p[at + 1] * z1) * x + (p[at + 2] * z0 + p[at + 3] * z1) * y
-    turn = np.pi * t / p[2]
-    total += _cosines(turn, p[at + 4 :: 2]) * x + _cosines(turn, p[at + 5 :: 2]) * y
-    swing = x * x + y * y
+            total += p[index] * x ** (n - j) * y**j
+            index += 1
+    total += (p[index] * z0 + p[index + 1] * z1) * x + (p[index + 2] * z0 + p[index + 3] * z1) * y
+    phase = np.pi * t / p[2]
+    total += _cosines(phase, p[index + 4 :: 2]) * x + _cosines(phase, p[index + 5 :: 2]) * y
+    amplitude_squared = x * x + y * y
     return (
-        -total * nominal[2] * p[0],
-        (swing - z0) / (p[2] * AMPLITUDE_MEMORY_SHARES[0]),
-        (swing - z1) / (p[2] * AMPLITUDE_MEMORY_SHARES[1]),
+        -total * nominal.k * p[0],
+        (amplitude_squared - z0) / (p[2] * AMPLITUDE_MEMORY_SHARES[0]),
+        (amplitude_squared - z1) / (p[2] * AMPLITUDE_MEMORY_SHARES[1]),
     )
 
 
 @njit(TORQUE_LAW, cache=True)
 def _drifting_force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    turn, damping = np.pi * t / p[1], 2 + STIFFNESS_COSINES
-    force = _cosines(turn, p[2:damping]) * theta + _cosines(turn, p[damping:]) * omega / p[0]
-    return -force * nominal[2], 0.0, 0.0
+    """Torque [N m] of a stiffness and a damping that depend on time."""
+    phase, first_damping = np.pi * t / p[1], 2 + STIFFNESS_COSINES
+    force = _cosines(phase, p[2:first_damping]) * theta + _cosines(phase, p[first_damping:]) * omega / p[0]
+    return -force * nominal.k, 0.0, 0.0
 
 
 @njit(CAPACITANCE_LAW, cache=True)
 def _profile(theta, p, nominal):  # type: ignore[no-untyped-def]
-    u = (theta - nominal[5]) / nominal[4]
-    bell = nominal[3] * np.exp(-u * u)
+    """Extra capacitance [F], a Gaussian times a polynomial, and its slope over the angle [F/rad]."""
+    u = (theta - nominal.theta_th) / nominal.theta0
+    gaussian = nominal.C0 * np.exp(-u * u)
     value, slope = 0.0, 0.0
     for i in range(5):
         n = (1, 3, 4, 5, 6)[i]
         value += p[i] * u**n
         slope += p[i] * (n * u ** (n - 1) - 2.0 * u ** (n + 1))
-    return bell * value, bell * slope / nominal[4]
+    return gaussian * value, gaussian * slope / nominal.theta0
 
 
-def cosine_series(turn: Array, sizes: Sequence[float]) -> Array:
-    """sum_j sizes[j] cos(j turn), of the shape of ``turn``."""
-    return np.asarray(_chebyshev(np.cos(turn).ravel(), np.asarray(sizes, float)).reshape(turn.shape))
+def cosine_series(phase: Array, coefficients: Sequence[float]) -> Array:
+    """sum_j coefficients[j] cos(j phase), of the shape of ``phase`` [rad]."""
+    return np.asarray(_chebyshev(np.cos(phase).ravel(), np.asarray(coefficients, float)).reshape(phase.shape))
 
 
 @njit(cache=True, fastmath={"contract"})
-def _chebyshev(cosine, sizes):  # type: ignore[no-untyped-def]
-    """sum_j sizes[j] T_j(cosine) by Clenshaw's recurrence, piece by piece as the processor's first cache holds them."""
-    out = np.empty_like(cosine)
+def _chebyshev(cosine, coefficients):  # type: ignore[no-untyped-def]
+    """sum_j coefficients[j] T_j(cosine) by Clenshaw's recurrence, in pieces that fit into the first cache."""
+    series = np.empty_like(cosine)
     for first in range(0, cosine.size, 512):
         c = cosine[first : first + 512]
-        one, two = np.zeros(c.size), np.zeros(c.size)
-        for j in range(sizes.size - 1, 0, -1):
+        newer, older = np.zeros(c.size), np.zeros(c.size)
+        for j in range(coefficients.size - 1, 0, -1):
             for i in range(c.size):
-                two[i] = sizes[j] + 2.0 * c[i] * one[i] - two[i]
-            one, two = two, one
+                older[i] = coefficients[j] + 2.0 * c[i] * newer[i] - older[i]
+            newer, older = older, newer
         for i in range(c.size):
-            out[first + i] = sizes[0] + c[i] * one[i] - two[i]
-    return out
+            series[first + i] = coefficients[0] + c[i] * newer[i] - older[i]
+    return series
 
 
-def _drive(voltage: Array, p: Sequence[float], view: SignalContext) -> Array:
-    time = view.time[:-1, None] + view.step * np.array([0.0, 0.5, 1.0])
-    turn, size, rate = np.pi * time / p[0], p[1], p[2]
-    swing = voltage - view.raw_voltage.mean()
-    slope = np.gradient(view.raw_voltage, view.step) / rate
+def _drive(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
+    """Drive voltage with a gain, an offset and a delay that depend on time and on the voltage."""
+    time = context.time[:-1, None] + context.step * np.array([0.0, 0.5, 1.0])
+    phase, size, rate = np.pi * time / p[0], p[1], p[2]
+    alternating = voltage - context.raw_voltage.mean()
+    slope = np.gradient(context.raw_voltage, context.step) / rate
     slopes = np.stack([slope[:-1], 0.5 * (slope[:-1] + slope[1:]), slope[1:]], axis=1)
-    u, v = swing / size, np.clip(slopes / size, -MAX_DRIVE_SLOPE, MAX_DRIVE_SLOPE)
-    gain, offset = cosine_series(turn, [p[3], *p[9:12]]), cosine_series(turn, [0.0, *p[12:]])
-    bent = u * u * (p[5] + p[6] * u) + v * (p[7] * u + p[8] * v * v)
-    return voltage + gain * swing + size * (offset + bent) + p[4] * slopes
+    u, v = alternating / size, np.clip(slopes / size, -MAX_DRIVE_SLOPE, MAX_DRIVE_SLOPE)
+    gain, offset = cosine_series(phase, [p[3], *p[9:12]]), cosine_series(phase, [0.0, *p[12:]])
+    nonlinear = u * u * (p[5] + p[6] * u) + v * (p[7] * u + p[8] * v * v)
+    return voltage + gain * alternating + size * (offset + nonlinear) + p[4] * slopes
 
 
-def _readout(signal: Array, p: Sequence[float], view: SignalContext) -> Array:
-    turn, size, rate, amplitude = np.pi * view.time / p[0], p[1], p[2], p[3]
+def _readout(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    """Readout with an error that depends on the signal, its rate, the angle, the rate, time and previous samples."""
+    phase, size, rate, amplitude = np.pi * context.time / p[0], p[1], p[2], p[3]
     u = (signal - signal.mean()) / size
-    slope = np.gradient(signal, view.step) / rate
+    slope = np.gradient(signal, context.step) / rate
     gains = 12 + OFFSET_COSINES
     memories = gains + GAIN_COSINES
-    offset, gain = cosine_series(turn, [0.0, *p[12:gains]]), cosine_series(turn, [0.0, *p[gains:memories]])
-    behind = sum(
+    offset, gain = cosine_series(phase, [0.0, *p[12:gains]]), cosine_series(phase, [0.0, *p[gains:memories]])
+    hysteresis = sum(
         part * (apply_play(signal, width * size) - signal)
         for part, width in zip(p[memories:], PLAY_HALF_WIDTHS, strict=True)
     )
-    x, v = view.theta / amplitude, view.rate / (amplitude * rate)
-    way = v / np.sqrt(x * x + v * v + 1e-6)
-    by_rate = v * (p[7] + p[8] * x) + way * (p[9] + way * way * (p[10] + way * way * p[11]))
-    bent = u * (gain + u * (p[4] + p[5] * u)) + offset
-    return signal * (1.0 + by_rate) + size * bent + p[6] * slope + behind
+    x, v = context.theta / amplitude, context.rate / (amplitude * rate)
+    w = v / np.sqrt(x * x + v * v + 1e-6)
+    by_rate = v * (p[7] + p[8] * x) + w * (p[9] + w * w * (p[10] + w * w * p[11]))
+    by_signal = u * (gain + u * (p[4] + p[5] * u)) + offset
+    return signal * (1.0 + by_rate) + size * by_signal + p[6] * slope + hysteresis
 
 
-def _timing(signal: Array, p: Sequence[float], view: SignalContext) -> Array:
-    swing = (view.theta**2 + (view.rate / p[1]) ** 2) / p[2] ** 2
-    fading = p[1] / (2.0 * np.pi) ** 2  # cut-off of a memory of one period [Hz]
-    behind = sum(
-        m * (apply_lowpass(swing, fading / n, view.step) - swing)
+def _timing(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    """Signal delayed by an amount that depends on time, on the amplitude and on previous amplitudes."""
+    r2 = (context.theta**2 + (context.rate / p[1]) ** 2) / p[2] ** 2
+    cutoff = p[1] / (2.0 * np.pi) ** 2  # of a low-pass whose time constant is one period [Hz]
+    memory = sum(
+        m * (apply_lowpass(r2, cutoff / n, context.step) - r2)
         for m, n in zip(p[5:8], DELAY_MEMORY_PERIODS, strict=True)
     )
-    late = cosine_series(np.pi * view.time / p[0], p[8:]) + swing * (p[3] + p[4] * swing) + behind
-    slope = np.gradient(signal, view.step)
+    delay = cosine_series(np.pi * context.time / p[0], p[8:]) + r2 * (p[3] + p[4] * r2) + memory
+    slope = np.gradient(signal, context.step)
     # to second order: at a delay of 0.1 rad the second-order term is 0.5 % of the signal
-    return signal - late * (slope - 0.5 * late * np.gradient(slope, view.step))
+    return signal - delay * (slope - 0.5 * delay * np.gradient(slope, context.step))
 
 
-def _optics(signal: Array, p: Sequence[float], view: SignalContext) -> Array:
+def _optics(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
+    """Reference angle with a piecewise linear error over the angle."""
     return signal + p[0] * np.interp(signal / p[0], MAPPING_KNOTS, p[1:])
 
 

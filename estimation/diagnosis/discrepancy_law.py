@@ -1,4 +1,4 @@
-"""The law that a free correction measured: a curve with its band, and the few strongest parts as a formula."""
+"""Law of a fitted discrepancy term: a curve with its band, a formula of its largest parts, and a table for a device."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from scanner.arrays import Array
 from scanner.terms import NaturalScales
 
 MIN_CHI2_PER_TERM = 12.0
-"""Fall of chi-square that a part of a formula has to be worth."""
+"""Rise of chi-square, if a part of the formula is removed, from which the part remains. Of fifty parts without any true
+contribution, one exceeds it in a recording out of forty."""
 
-LENGTH = "T: the recording's length"
+LENGTH = "T: duration of the recording"
 STATE = "x = θ/A, y = θ'/(A ω)"
 VARIABLES = {
-    "free-mechanics": ("f/(k A)", f"{STATE}, H_s: x² + y² as remembered over s T, {LENGTH}"),
+    "free-mechanics": ("f/(k A)", f"{STATE}, H_s: x² + y² behind a low-pass with time constant s T, {LENGTH}"),
     "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
     "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
     "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),
@@ -33,10 +34,10 @@ VARIABLES = {
         "δy/s",
         f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), P_h: play of half-width h, s: the signal's rms, {LENGTH}",
     ),
-    "free-timing": ("delay/s", f"r² = x² + y², {STATE}, M_n: what is remembered over n turns, {LENGTH}"),
+    "free-timing": ("delay/s", f"r² = x² + y², {STATE}, M_n: low-pass with a time constant of n periods, {LENGTH}"),
     "free-optics": ("δθ/A", "x = θ/A"),
 }
-"""What the formula of a free correction gives, and the variables that it is written in."""
+"""Left side of the formula of each discrepancy term, and the definition of its variables."""
 
 POLYNOMIALS = {
     "free-mechanics": {
@@ -54,20 +55,24 @@ POLYNOMIALS = {
         "r2": "r²", "r4": "r⁴", **{f"m{i}": f"(M_{turns:g}[r²] − r²)" for i, turns in enumerate(DELAY_MEMORY_PERIODS)},
     },
 }  # fmt: skip
-"""Parts of free corrections that are no cosines, as a formula shows them."""
+"""Symbol in the formula of every parameter whose part is not a cosine, by discrepancy term."""
 
-SWAYING = {"k": "x ", "b": "y ", "g": "u ", "o": "", "d": ""}
-"""What the cosines of each letter multiply."""
+COSINE_FACTORS = {"k": "x ", "b": "y ", "g": "u ", "o": "", "d": ""}
+"""Variable that a cosine over time multiplies, by the first letter of the parameter's name."""
 
 POWER = ("", "", "²", "³", "⁴", "⁵")
+"""Exponents as a formula shows them, by their value."""
 
 
 class Section(NamedTuple):
-    """A cut through a free correction along which its law can be drawn.
+    """A line through the variables of a discrepancy term, along which its law can be drawn.
 
     Attributes:
-        columns: of the parameters that are seen along it, what one unit of each adds, each of the shape of ``grid``.
-        label, unit: of the law. grid: of what it is drawn over; x_label: what that is.
+        columns: by parameter, the contribution to the law of one unit of it, shape of ``grid``. Parameters without a
+            contribution along this line are not listed.
+        label, unit: quantity that the law changes, and its unit.
+        grid: values of the variable on the horizontal axis, shape (n,).
+        x_label: name and unit of that variable.
     """
 
     columns: dict[str, Array]
@@ -78,29 +83,34 @@ class Section(NamedTuple):
 
 
 def correction_curve(fit: Fit) -> dict[str, Any]:
-    """The law that the last, free correction of a fit measured: a curve with its band of one standard deviation.
+    """Curve of the last term of a fit, a discrepancy term, with its band of one standard deviation.
 
-    It is drawn along the section on which most of it stands.
+    It is drawn along the section on which the law is largest relative to its possible contributions.
+
+    Returns:
+        the content of ``curve`` in diagnosis.json: labels, units, points and formula.
     """
     candidate = fit.model.candidates[-1]
     scales = fit.model.scales(candidate.axis)
-    at = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
-    names = [fit.model.parameters[i].name for i in at]
-    sizes = np.array([p.value(1.0, scales) for p in candidate.term.free_parameters])
+    indices = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
+    names = [fit.model.parameters[i].name for i in indices]
+    scale_factors = np.array([p.value(1.0, scales) for p in candidate.term.free_parameters])
 
     def basis(section: Section) -> Array:
         nothing = np.zeros(section.grid.size)
-        return sizes * np.stack([section.columns.get(name, nothing) for name in names], axis=1)
+        return scale_factors * np.stack([section.columns.get(name, nothing) for name in names], axis=1)
 
     def share(section: Section) -> float:
-        """Mean square of the law along a section, over its largest unit: sections have units of their own."""
+        """Mean square of the law along a section, relative to its largest column: sections differ in units."""
         largest = max(np.abs(column).max() for column in section.columns.values())
-        return float(np.mean((basis(section) @ fit.x[at] / largest) ** 2))
+        return float(np.mean((basis(section) @ fit.x[indices] / largest) ** 2))
 
     section = max(_sections(candidate.term.effect, scales), key=share)
     columns = basis(section)
-    value = columns @ fit.x[at]
-    band = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", columns, fit.covariance[np.ix_(at, at)], columns), 0.0))
+    value = columns @ fit.x[indices]
+    band = np.sqrt(
+        np.maximum(np.einsum("ij,jk,ik->i", columns, fit.covariance[np.ix_(indices, indices)], columns), 0.0)
+    )
     points = [[float(a), float(b), float(c)] for a, b, c in zip(section.grid, value, band, strict=True)]
     return {
         "x": section.x_label,
@@ -108,18 +118,18 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
         "unit": section.unit,
         "columns": [section.x_label, section.label, "sd"],
         "points": points,
-        "formula": formula(fit, at),
+        "formula": formula(fit, indices),
     }
 
 
 def _sections(effect: str, s: NaturalScales) -> list[Section]:
-    """The ways in which the law of a free correction can be drawn."""
+    """Lines along which the law of a discrepancy term can be drawn."""
     u = np.linspace(-1.0, 1.0, 121)
-    turn = 0.5 * np.pi * (u + 1.0)
-    time = s.duration * turn / np.pi
+    phase = 0.5 * np.pi * (u + 1.0)
+    time = s.duration * phase / np.pi
 
-    def waves(letter: str, most: int = 40) -> dict[str, Array]:
-        return {f"{letter}{j}": np.cos(j * turn) for j in range(most)}
+    def waves(letter: str, count: int = 40) -> dict[str, Array]:
+        return {f"{letter}{j}": np.cos(j * phase) for j in range(count)}
 
     match effect:
         case "free-mechanics":
@@ -149,19 +159,22 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
         case "free-readout":
             x, v = np.cos(np.pi * u), -np.sin(np.pi * u)
             by_rate = {"w0": v, "w1": v * x, "w2": v, "w3": v**3, "w4": v**5}
-            swing = np.sqrt(2.0) * np.tile(x, 2)  # the second time round is the loop that a steady swing goes
-            loops = {f"m{i}": (apply_play(swing, width) - swing)[x.size :] for i, width in enumerate(PLAY_HALF_WIDTHS)}
+            steady_oscillation = np.sqrt(2.0) * np.tile(x, 2)  # the second period is the steady loop
+            loops = {
+                f"m{i}": (apply_play(steady_oscillation, width) - steady_oscillation)[x.size :]
+                for i, width in enumerate(PLAY_HALF_WIDTHS)
+            }
             return [
                 Section({"y0": u**2, "y1": u**3}, "signal error / rms", "1", u, "signal / rms"),
-                Section(by_rate, "gain error at full swing", "1", np.pi * u, "phase of the swing (rad)"),
-                Section(loops, "signal error / rms", "1", np.pi * u, "phase of the swing (rad)"),
+                Section(by_rate, "gain error at full amplitude", "1", np.pi * u, "phase of the oscillation (rad)"),
+                Section(loops, "signal error / rms", "1", np.pi * u, "phase of the oscillation (rad)"),
                 Section(waves("g"), "gain error", "1", time, "time (s)"),
                 Section(waves("o"), "offset / rms", "1", time, "time (s)"),
             ]
         case "free-timing":
             r = 0.5 * (u + 1.0)
-            swing = Section({"r2": r**2, "r4": r**4}, "delay", "s", s.amplitude * r, "swing (rad)")
-            return [Section(waves("d"), "delay", "s", time, "time (s)"), swing]
+            steady_oscillation = Section({"r2": r**2, "r4": r**4}, "delay", "s", s.amplitude * r, "amplitude (rad)")
+            return [Section(waves("d"), "delay", "s", time, "time (s)"), steady_oscillation]
         case _:
             hats = {
                 f"c{i}": s.amplitude * np.interp(u, MAPPING_KNOTS, hat)
@@ -171,7 +184,7 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
 
 
 def _symbol(effect: str, name: str) -> str:
-    """A parameter's part of the law, for a reader."""
+    """Symbol of a parameter in the formula."""
     letter, number = name[0], name[1:]
     if name in POLYNOMIALS.get(effect, {}):
         return POLYNOMIALS[effect][name]
@@ -181,26 +194,33 @@ def _symbol(effect: str, name: str) -> str:
     if letter == "c":
         return f"hat(x − {MAPPING_KNOTS[int(number)]:.2g})".replace("− -", "+ ")
     wave = "" if number == "0" else f"cos({number} π t/T)".replace("(1 ", "(")
-    return SWAYING[letter] + wave
+    return COSINE_FACTORS[letter] + wave
 
 
-def formula(fit: Fit, at: list[int], most: int = 4) -> str:
-    """The few strongest parts of a free correction (sparse regression: backward elimination until each is worth it)."""
+def formula(fit: Fit, indices: list[int], max_parts: int = 4) -> str:
+    """Formula of the last term of a fit, a discrepancy term, reduced to its largest parts by backward elimination.
+
+    Parts are removed until each raises chi-square by ``MIN_CHI2_PER_TERM`` if it is removed.
+
+    Args:
+        indices: of the term's parameters in ``fit.x``.
+        max_parts: of the formula.
+    """
     candidate = fit.model.candidates[-1]
-    information = np.linalg.inv(fit.covariance[np.ix_(at, at)])
-    push = information @ fit.x[at]
-    values, kept = fit.x[at], list(range(len(at)))
-    while kept:
-        inner = information[np.ix_(kept, kept)]
-        values = np.linalg.solve(inner, push[kept])
-        worth = values**2 / np.diag(np.linalg.inv(inner))
-        weakest = int(np.argmin(worth))
-        if worth[weakest] > MIN_CHI2_PER_TERM and len(kept) <= most:
+    information = np.linalg.inv(fit.covariance[np.ix_(indices, indices)])
+    score = information @ fit.x[indices]
+    values, selected = fit.x[indices], list(range(len(indices)))
+    while selected:
+        inner = information[np.ix_(selected, selected)]
+        values = np.linalg.solve(inner, score[selected])
+        chi2_rise = values**2 / np.diag(np.linalg.inv(inner))
+        weakest = int(np.argmin(chi2_rise))
+        if chi2_rise[weakest] > MIN_CHI2_PER_TERM and len(selected) <= max_parts:
             break
-        kept.pop(weakest)
+        selected.pop(weakest)
         values = np.delete(values, weakest)
     scales, effect = fit.model.scales(candidate.axis), candidate.term.effect
-    free = [candidate.term.free_parameters[i] for i in kept]
+    free = [candidate.term.free_parameters[i] for i in selected]
     parts = [f"{p.value(v, scales):.3g} {_symbol(effect, p.name)}".strip() for p, v in zip(free, values, strict=True)]
     law, variables = VARIABLES[effect]
     return f"{law} = {' + '.join(parts) or '0'}".replace("+ -", "− ") + f" with {variables}"
@@ -211,48 +231,48 @@ STATIC_PARAMETERS = {
     "free-readout": ("y0", "y1"),
     "free-drive": ("v0", "v2", "v3"),
 }
-"""Parameters of a free correction that are a law of the state alone, not of time or of what went before."""
+"""Parameters of a discrepancy term that depend on the present state only, not on time or on previous states."""
 
 
 def measured_law_table(fit: Fit) -> dict[str, Any] | None:
-    """The static part of the last, free correction of a fit, as ``[x.terms.measured-law]`` states it, in SI units.
+    """The static part of the last term of a fit, a discrepancy term, as table ``[x.terms.measured-law]`` in SI units.
 
-    None where the correction has no static law that a device file can state: a delay, a capacitance, or nothing but a
-    dependence on time.
+    None if the term has no static law that a device file can state: a delay, a capacitance, or a dependence on time
+    only.
     """
     candidate, scales = fit.model.candidates[-1], fit.model.scales(fit.model.candidates[-1].axis)
     static = STATIC_PARAMETERS.get(candidate.term.effect, ())
-    at = [i for i, f in enumerate(fit.model.parameters) if f.owner == candidate.key and f.name in static]
-    names = [fit.model.parameters[i].name for i in at]
-    free = {each.name: each for each in candidate.term.free_parameters}
-    sizes = np.array([free[name].value(1.0, scales) for name in names])
-    value = dict(zip(names, (sizes * fit.x[at]).tolist(), strict=True))
-    sd = dict(zip(names, (np.abs(sizes) * np.sqrt(np.diag(fit.covariance)[at])).tolist(), strict=True))
+    indices = [i for i, f in enumerate(fit.model.parameters) if f.owner == candidate.key and f.name in static]
+    names = [fit.model.parameters[i].name for i in indices]
+    free_parameters = {parameter.name: parameter for parameter in candidate.term.free_parameters}
+    scale_factors = np.array([free_parameters[name].value(1.0, scales) for name in names])
+    value = dict(zip(names, (scale_factors * fit.x[indices]).tolist(), strict=True))
+    sd = dict(zip(names, (np.abs(scale_factors) * np.sqrt(np.diag(fit.covariance)[indices])).tolist(), strict=True))
     run = next(run for run in fit.model.runs if candidate.axis in run.inputs)
     match candidate.term.effect:
         case "free-mechanics":
             unit, angle, rate = scales.k * scales.amplitude, scales.amplitude, scales.amplitude * scales.rate
-            powers = [list(each) for each in FORCE_POWERS]
+            powers = [list(exponents) for exponents in FORCE_POWERS]
             factors = [unit / (angle**i * rate**j) for i, j in FORCE_POWERS]
-            moved = [run.scales[candidate.axis] for run in fit.model.runs if candidate.axis in run.scales]
+            run_scales = [run.scales[candidate.axis] for run in fit.model.runs if candidate.axis in run.scales]
             variables, centre = ["angle", "rate"], [0.0, 0.0]
-            reach = [max(each.amplitude for each in moved), max(each.amplitude * each.rate for each in moved)]
+            half_width = [max(s.amplitude for s in run_scales), max(s.amplitude * s.rate for s in run_scales)]
         case "free-readout":
-            output = next(each for each in run.outputs if each.kind == "sense" and candidate.axis in each.axes)
+            output = next(o for o in run.outputs if o.kind == "sense" and candidate.axis in o.axes)
             size = scales.sense_rms
             powers, factors = [[2], [3]], [1.0 / size, 1.0 / size**2]
             variables, centre = ["signal"], [float(output.data.mean())]
-            reach = [float(np.abs(output.data - output.data.mean()).max())]
+            half_width = [float(np.abs(output.data - output.data.mean()).max())]
         case "free-drive":
-            volts, size = run.inputs[candidate.axis].voltage, scales.voltage_rms
+            voltage, size = run.inputs[candidate.axis].voltage, scales.voltage_rms
             powers, factors = [[1], [2], [3]], [1.0, 1.0 / size, 1.0 / size**2]
-            variables, centre = ["voltage"], [float(volts.mean())]
-            reach = [float(np.abs(volts - volts.mean()).max())]
+            variables, centre = ["voltage"], [float(voltage.mean())]
+            half_width = [float(np.abs(voltage - voltage.mean()).max())]
         case _:
             return None
     table: dict[str, Any] = {"stage": candidate.term.stage, "variables": variables, "centre": centre}
-    table["lower"] = [c - r for c, r in zip(centre, reach, strict=True)]
-    table["upper"] = [c + r for c, r in zip(centre, reach, strict=True)]
+    table["lower"] = [c - r for c, r in zip(centre, half_width, strict=True)]
+    table["upper"] = [c + r for c, r in zip(centre, half_width, strict=True)]
     table["powers"] = powers
     table["coefficients"] = [value.get(key, 0.0) * factor for key, factor in zip(static, factors, strict=True)]
     table["coefficients_sd"] = [sd.get(key, 0.0) * factor for key, factor in zip(static, factors, strict=True)]

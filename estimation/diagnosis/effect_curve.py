@@ -26,14 +26,14 @@ from scanner.integrator.nodes import nodes_to_samples
 from scanner.integrator.trajectories import CapacitanceTerm
 
 CURVE_SAMPLES = 4000
-"""Times of the run at which the change by an effect is evaluated; a hundred for each bin of its curve."""
+"""Number of times of the run at which the change by an effect is evaluated: a hundred per bin of its curve."""
 
 CURVE_BINS = 40
-"""Bins of an effect's curve."""
+"""Number of bins of an effect's curve."""
 
 MODULATION_ADVANTAGE = 4.0
-"""Factor by which a time-dependent coefficient (of stiffness, damping or gain) has to reduce the unexplained variance
-against the best plain curve before it is shown in its place."""
+"""Ratio of unexplained variances from which a time-dependent coefficient (of stiffness, damping or gain) is drawn
+instead of the best plain curve. Below it the plain curve is easier to read and explains nearly as much."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class EffectCurve:
 
 
 def effect_curve(fit: Fit, candidate: Candidate, bins: int = CURVE_BINS) -> EffectCurve | None:
-    """The curve of a catalogue effect with its 95 % band; None if it has a memory, or changes nothing in the run.
+    """The curve of a catalogue effect with its 95 % band; None if it has hidden states or no effect in the run.
 
-    The motion stays as fitted, whatever the parameters: the band is that of the effect alone.
+    The fitted motion is used for all parameter values, so the band is that of the effect alone.
     """
     term = candidate.term
     if term.effect in DISCREPANCY_TERMS or term.hidden_state_scales:
@@ -88,7 +88,7 @@ def _timing_curve(
         def curve(p: Array) -> Array:
             return np.degrees(np.sum([-np.arctan(x / corner) for corner in corners(values(p))], axis=0))
 
-        labels, shown, logarithmic = ("frequency (kHz)", "phase shift (°)"), 1e-3 * x, True
+        labels, x_drawn, logarithmic = ("frequency (kHz)", "phase shift (°)"), 1e-3 * x, True
     else:
         clock = term.clock
         assert clock is not None
@@ -97,20 +97,20 @@ def _timing_curve(
         def curve(p: Array) -> Array:
             return 1e6 * (clock(x, values(p)) - x)
 
-        labels, shown, logarithmic = ("time (ms)", "shift in time (µs)"), 1e3 * x, False
+        labels, x_drawn, logarithmic = ("time (ms)", "shift in time (µs)"), 1e3 * x, False
     band = np.percentile([curve(p) for p in draw_parameters(fit)], [2.5, 97.5], axis=0)
-    return EffectCurve(shown, curve(fit.x), band, *labels, logarithmic)
+    return EffectCurve(x_drawn, curve(fit.x), band, *labels, logarithmic)
 
 
 @dataclass(frozen=True)
 class _Representation:
-    """A way to show a change d(t): as coefficient c(variable) in d = c · regressor.
+    """Representation of a change d(t) by a coefficient c: d = c(variable) · regressor.
 
     Attributes:
         x_label, y_label: quantity and unit.
-        variable: shape (n,), over which the coefficient is shown.
+        variable: on which the coefficient depends, shape (n,).
         regressor: shape (n,); ones for a plain curve.
-        scale: of the coefficient, into the unit of ``y_label``.
+        scale: factor from the coefficient to the unit of ``y_label``.
     """
 
     x_label: str
@@ -121,13 +121,13 @@ class _Representation:
 
     def coefficients(self, change: Array, bins: int) -> Array:
         """Least-squares coefficient in each bin, shape (bins,), NaN for an empty bin."""
-        place = _bin_indices(self.variable, bins)
-        weight = np.bincount(place, self.regressor**2, bins)
+        bin_index = _bin_indices(self.variable, bins)
+        weight = np.bincount(bin_index, self.regressor**2, bins)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(weight > 0.0, np.bincount(place, change * self.regressor, bins) / weight, np.nan)
+            return np.where(weight > 0.0, np.bincount(bin_index, change * self.regressor, bins) / weight, np.nan)
 
     def unexplained(self, change: Array, bins: int) -> float:
-        """Mean square of ``change`` that the coefficients leave."""
+        """Mean square of ``change`` that the coefficients do not explain."""
         fitted = self.coefficients(change, bins)[_bin_indices(self.variable, bins)] * self.regressor
         return float(np.nanmean((change - fitted) ** 2))
 
@@ -138,12 +138,12 @@ class _Representation:
 def _state_curve(
     fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], run_index: int, bins: int
 ) -> EffectCurve | None:
-    """The change by an effect against the variable that explains it best."""
+    """The change by an effect over the variable that explains most of its variance."""
     trajectories = axis_trajectories(fit, fit.x, run_index)
     trajectory = trajectories[candidate.axis]
-    others = tuple(active for active in trajectory.active_terms if active.term is not candidate.term)
+    other_terms = tuple(active for active in trajectory.active_terms if active.term is not candidate.term)
     nominal = fit.model.nominal(candidate.axis, fit.x)
-    without = replace(trajectory, axis=with_constants(nominal, others), active_terms=others)
+    without = replace(trajectory, axis=with_constants(nominal, other_terms), active_terms=other_terms)
     size = trajectory.angle.size
     other_angle = next((t.angle for name, t in trajectories.items() if name != candidate.axis), np.zeros(size))
     samples = np.linspace(0, size - 1, min(CURVE_SAMPLES, size)).astype(np.intp)
@@ -155,20 +155,20 @@ def _state_curve(
     fitted = change(fit.x)
     if not fitted.any():
         return None
-    shown = _choose_representation(_representations(without, candidate, samples), fitted, bins)
-    place = _bin_indices(shown.variable, bins)
-    x = np.bincount(place, shown.variable, bins) / np.maximum(np.bincount(place, minlength=bins), 1)
-    y = shown.curve(fitted, bins)
-    drawn = np.stack([shown.curve(change(p), bins) for p in draw_parameters(fit)])
-    visited = np.isfinite(y)
-    band = np.percentile(drawn[:, visited], [2.5, 97.5], axis=0)
-    return EffectCurve(x[visited], y[visited], band, shown.x_label, shown.y_label)
+    representation = _choose_representation(_representations(without, candidate, samples), fitted, bins)
+    bin_index = _bin_indices(representation.variable, bins)
+    x = np.bincount(bin_index, representation.variable, bins) / np.maximum(np.bincount(bin_index, minlength=bins), 1)
+    y = representation.curve(fitted, bins)
+    drawn = np.stack([representation.curve(change(p), bins) for p in draw_parameters(fit)])
+    not_empty = np.isfinite(y)
+    band = np.percentile(drawn[:, not_empty], [2.5, 97.5], axis=0)
+    return EffectCurve(x[not_empty], y[not_empty], band, representation.x_label, representation.y_label)
 
 
 def _representations(without: AxisTrajectory, candidate: Candidate, samples: NDArray[np.intp]) -> list[_Representation]:
     """Plain curves first, then time-dependent coefficients, whose regressor is not constant."""
     time, angle, rate = without.drive.time[samples], without.angle[samples], without.rate[samples]
-    one, quantity = np.ones(samples.size), _changed_quantity(candidate)
+    ones, quantity = np.ones(samples.size), _changed_quantity(candidate)
     variables = {"angle (mrad)": 1e3 * angle, "rate (rad/s)": rate, "time (ms)": 1e3 * time}
     variables["voltage (V)"] = without.voltage[samples]
     modulations = {}
@@ -181,7 +181,7 @@ def _representations(without: AxisTrajectory, candidate: Candidate, samples: NDA
         variables = {"level of the sense signal (V)": level} | variables
         modulations["change of gain (%)"] = level - level.mean(), 100.0
     usable = {name: v for name, v in variables.items() if np.ptp(v) > 1e-9 * np.abs(v).max()}
-    plain = [_Representation(name, quantity, v, one) for name, v in usable.items()]
+    plain = [_Representation(name, quantity, v, ones) for name, v in usable.items()]
     products = [_Representation("time (ms)", name, 1e3 * time, r, scale) for name, (r, scale) in modulations.items()]
     return plain + products
 
@@ -189,12 +189,12 @@ def _representations(without: AxisTrajectory, candidate: Candidate, samples: NDA
 def _choose_representation(options: Sequence[_Representation], change: Array, bins: int) -> _Representation:
     plain = [option for option in options if not np.ptp(option.regressor)]
     products = [option for option in options if np.ptp(option.regressor)]
-    best = min(plain, key=lambda option: option.unexplained(change, bins))
+    best_plain = min(plain, key=lambda option: option.unexplained(change, bins))
     if products:
         product = min(products, key=lambda option: option.unexplained(change, bins))
-        if MODULATION_ADVANTAGE * product.unexplained(change, bins) < best.unexplained(change, bins):
+        if MODULATION_ADVANTAGE * product.unexplained(change, bins) < best_plain.unexplained(change, bins):
             return product
-    return best
+    return best_plain
 
 
 def _changed_quantity(candidate: Candidate) -> str:
@@ -234,9 +234,7 @@ def _change(
         without, axis=with_constants(without.axis, [active]), active_terms=(*without.active_terms, active)
     )
     if active.channel.startswith("angle"):
-        after, before = (
-            apply_channel_terms("angle", each.angle, [each], each.axis.readout) for each in (changed, without)
-        )
+        after, before = (apply_channel_terms("angle", t.angle, [t], t.axis.readout) for t in (changed, without))
         return (after - before)[samples]
     readout = without.axis.readout
     if readout is None:

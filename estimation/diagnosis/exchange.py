@@ -142,16 +142,16 @@ def _exchange_start(
     return model, x
 
 
-def rivals_of(best: Fit, others: Sequence[Fit]) -> RivalFits:
+def rivals_of(fit: Fit, fits: Sequence[Fit]) -> RivalFits:
     """The last terms of ``others`` as rivals of the best fit."""
-    misfit = best.chi2 + best.penalty
+    misfit = fit.chi2 + fit.penalty
     return tuple(
         RivalFit(
-            fit.neg2_log_evidence - best.neg2_log_evidence,
-            fit.model.candidates[-1],
-            fit.chi2 + fit.penalty - misfit,
+            rival.neg2_log_evidence - fit.neg2_log_evidence,
+            rival.model.candidates[-1],
+            rival.chi2 + rival.penalty - misfit,
         )
-        for fit in others
+        for rival in fits
     )
 
 
@@ -160,14 +160,14 @@ def exchange_to_convergence(likelihood: Likelihood, fit: Fit, pool: Sequence[Can
     rivals: dict[str, RivalFits] = {}
     for _ in range(MAX_EXCHANGES):
         rivals = {}
-        better = None
+        exchanged = None
         for candidate in fit.model.candidates[len(fit.model.candidates) - newest :]:
-            others = fit_exchanges(likelihood, fit, (candidate,), pool)
-            if others and others[0].neg2_log_evidence < fit.neg2_log_evidence - MIN_EXCHANGE_GAIN:
-                better = others[0]
+            exchanges = fit_exchanges(likelihood, fit, (candidate,), pool)
+            if exchanges and exchanges[0].neg2_log_evidence < fit.neg2_log_evidence - MIN_EXCHANGE_GAIN:
+                exchanged = exchanges[0]
                 break
-            rivals[candidate.key] = rivals_of(fit, others)
-        if better is None:
+            rivals[candidate.key] = rivals_of(fit, exchanges)
+        if exchanged is None:
             break
-        fit = better
+        fit = exchanged
     return ExchangeResult(fit, rivals)

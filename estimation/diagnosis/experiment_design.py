@@ -22,42 +22,45 @@ from estimation.diagnosis.screening import amplitude_indices
 from scanner.arrays import Array
 
 RELATIVE_ANGLE_NOISE_SD = 1e-3
-"""Noise of a proposed angle channel, in amplitudes of the motion: an assumed detector that resolves a thousandth of
-it."""
+"""Standard deviation of the noise of a proposed angle channel, in amplitudes of the motion: assumes a detector that
+resolves a thousandth of the amplitude."""
 
 
 def distances_to_rivals(
     likelihood: Likelihood, fit: Fit, candidate: Candidate, rivals: Sequence[Candidate]
 ) -> list[float]:
-    """Norm of the fitted effect of a candidate that remains after each rival is fitted in its place [sigma].
+    """Norm of the fitted effect of a candidate that remains after each rival is fitted to it [sigma].
 
-    For a rival without any effect it is the norm of the whole effect.
+    For a rival without any effect it is the norm of the effect itself.
     """
-    own = np.array([f.kind in ("term", "hidden") and f.owner == candidate.key for f in fit.model.parameters])
-    signal, rest = _effect_signal(likelihood, fit, candidate)[fit.rows], fit.jacobian[np.ix_(fit.rows, ~own)]
-    found = []
+    of_candidate = np.array([f.kind in ("term", "hidden") and f.owner == candidate.key for f in fit.model.parameters])
+    signal = _effect_signal(likelihood, fit, candidate)[fit.rows]
+    other_columns = fit.jacobian[np.ix_(fit.rows, ~of_candidate)]
+    distances = []
     for blocks in candidate_sensitivities(likelihood, fit, rivals):
-        shown = [block[fit.rows] for block in blocks]
-        size, apart = unexplained_norms(rest, fit.model.precision[~own], signal[:, None], shown)
-        found.append(float(min([size[0], *apart[0]])))
-    return found
+        rows_of_blocks = [block[fit.rows] for block in blocks]
+        size, after_rival = unexplained_norms(
+            other_columns, fit.model.precision[~of_candidate], signal[:, None], rows_of_blocks
+        )
+        distances.append(float(min([size[0], *after_rival[0]])))
+    return distances
 
 
 def _effect_signal(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Array:
     """Effect of a candidate on the whitened residual, shape (N,); to first order if it has an amplitude."""
-    moving = amplitude_indices(fit.model, candidate)
-    if moving:
-        return np.asarray(fit.jacobian[:, moving] @ fit.x[moving])
-    kept = [each for each in fit.model.candidates if each is not candidate]
-    less = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
-    return fit.residual - likelihood.residual(less, less.map_parameters_from(fit.model, fit.x))
+    amplitudes = amplitude_indices(fit.model, candidate)
+    if amplitudes:
+        return np.asarray(fit.jacobian[:, amplitudes] @ fit.x[amplitudes])
+    remaining = [other for other in fit.model.candidates if other is not candidate]
+    without = Model(fit.model.runs, fit.model.device, remaining, fit.model.mains)
+    return fit.residual - likelihood.residual(without, without.map_parameters_from(fit.model, fit.x))
 
 
 @dataclass(frozen=True)
 class CandidateExperiment:
     """A proposed measurement: the model of all runs, its parameters, and the whiteners of all channels."""
 
-    what: str
+    description: str
     model: Model
     x: Array
     whiteners: Sequence[Sequence[Whitener]]
@@ -67,11 +70,11 @@ def rank_experiments(
     likelihood: Likelihood, fit: Fit, candidate: Candidate, rival: Candidate
 ) -> list[tuple[str, float]]:
     """Further measurements, each with the distance [sigma] to ``rival`` that it would give; the best first."""
-    found = []
-    for each in _candidate_experiments(likelihood, fit, candidate.axis):
-        together = linearise_simulated(each.model, each.x, each.whiteners)
-        found.append((each.what, distances_to_rivals(*together, candidate, [rival])[0]))
-    return sorted(found, key=lambda pair: -pair[1])
+    ranked = []
+    for experiment in _candidate_experiments(likelihood, fit, candidate.axis):
+        simulated = linearise_simulated(experiment.model, experiment.x, experiment.whiteners)
+        ranked.append((experiment.description, distances_to_rivals(*simulated, candidate, [rival])[0]))
+    return sorted(ranked, key=lambda pair: -pair[1])
 
 
 def discrimination_advice(
@@ -79,33 +82,39 @@ def discrimination_advice(
 ) -> str:
     """Distance to a confounder in words, and the measurements that would distinguish the two."""
     name = rival.term.effect
-    said = f"{name} lies {distance:.1f} σ away, {DISCRIMINATION_SIGMA} are needed"
+    distance_text = f"{name} is at a distance of {distance:.1f} σ, {DISCRIMINATION_SIGMA} are needed"
     computed = [
-        f"{what}: {d:.1f} σ" for what, d in rank_experiments(likelihood, fit, candidate, rival) if d > 1.2 * distance
+        f"{description}: {d:.1f} σ"
+        for description, d in rank_experiments(likelihood, fit, candidate, rival)
+        if d > 1.2 * distance
     ]
-    known = candidate.term.confounders.get(name) or rival.term.confounders.get(candidate.term.effect)
-    return "; ".join([said, *computed, *([known] if known else [])])
+    general = candidate.term.confounders.get(name) or rival.term.confounders.get(candidate.term.effect)
+    return "; ".join([distance_text, *computed, *([general] if general else [])])
 
 
 def _candidate_experiments(likelihood: Likelihood, fit: Fit, axis: str) -> Iterator[CandidateExperiment]:
-    """Measurements that could be added to the runs of ``fit``."""
+    """Measurements that could be added to the runs of ``fit``: an angle channel, and a second run of each variation."""
     runs, whiteners = fit.model.runs, likelihood.whiteners
-    r = next(i for i, run in enumerate(runs) if axis in run.inputs)
+    index = next(i for i, run in enumerate(runs) if axis in run.inputs)
     if not any(output.name == f"angle_{axis}" for run in runs for output in run.outputs):
-        seeing = _with_angle(runs[r], axis)
-        noise = (*whiteners[r], stated_whitener(seeing.outputs[-1]))
+        with_angle = _with_angle(runs[index], axis)
+        with_noise = (*whiteners[index], stated_whitener(with_angle.outputs[-1]))
         yield _candidate_experiment(
-            f"with its angle recorded, noise {RELATIVE_ANGLE_NOISE_SD:g} of the swing",
-            fit, r, (*runs[:r], seeing, *runs[r + 1 :]), (*whiteners[:r], noise, *whiteners[r + 1 :]),
-        )  # fmt: skip
-    for what, second, swing in _variations(fit.model, runs[r], axis):
-        yield _candidate_experiment(f"beside {what}", fit, r, (*runs, second), (*whiteners, whiteners[r]), swing)
+            f"with its angle recorded, noise {RELATIVE_ANGLE_NOISE_SD:g} of the amplitude",
+            fit,
+            index,
+            (*runs[:index], with_angle, *runs[index + 1 :]),
+            (*whiteners[:index], with_noise, *whiteners[index + 1 :]),
+        )
+    for description, run, amplitude_factor in _variations(fit.model, runs[index], axis):
+        extended = (*runs, run), (*whiteners, whiteners[index])
+        yield _candidate_experiment(f"with {description} in addition", fit, index, *extended, amplitude_factor)
 
 
 def _with_angle(run: Run, axis: str) -> Run:
-    seen = next(output for output in run.outputs if axis in output.axes)
+    sensed = next(output for output in run.outputs if axis in output.axes)
     noise = RELATIVE_ANGLE_NOISE_SD * run.scales[axis].amplitude
-    angle = replace(seen, name=f"angle_{axis}", kind="angle", axes=(axis,), noise_sd=noise)
+    angle = replace(sensed, name=f"angle_{axis}", kind="angle", axes=(axis,), noise_sd=noise)
     return replace(run, outputs=(*run.outputs, angle))
 
 
@@ -115,7 +124,7 @@ def _variations(model: Model, run: Run, axis: str) -> Iterator[tuple[str, Run, f
     if drive is not None and drive.kind == "linear":
         yield "a recording at half the drive", _scale_drive(run, 0.5, 0.5), 0.5
     elif scales.voltage_rms <= 1e-6 * abs(scales.voltage_mean):
-        yield "a ringdown from half the swing", run, 0.5
+        yield "a ringdown from half the amplitude", run, 0.5
         if scales.voltage_mean:
             yield "a ringdown at 1.5 times the bias", _scale_drive(run, 1.5, 1.5), 1.0
     else:
@@ -123,24 +132,30 @@ def _variations(model: Model, run: Run, axis: str) -> Iterator[tuple[str, Run, f
         yield "a ringdown at the drive's mean voltage", _scale_drive(run, 1.0, 0.0), 1.0
 
 
-def _scale_drive(run: Run, mean: float, swing: float) -> Run:
-    """The run with the mean of each drive scaled by ``mean`` and its alternating part by ``swing``."""
+def _scale_drive(run: Run, mean_factor: float, alternating_factor: float) -> Run:
+    """The run with the mean and the alternating part of each drive scaled."""
     inputs = {}
-    for name, each in run.inputs.items():
-        middle = each.voltage.mean()
-        inputs[name] = replace(each, voltage=mean * middle + swing * (each.voltage - middle))
+    for name, drive in run.inputs.items():
+        average = drive.voltage.mean()
+        inputs[name] = replace(drive, voltage=mean_factor * average + alternating_factor * (drive.voltage - average))
     return replace(run, inputs=inputs)
 
 
-def _candidate_experiment(what: str, fit: Fit, r: int, runs: Sequence[Run], whiteners: Sequence[Sequence[Whitener]],
-          swing: float = 1.0) -> CandidateExperiment:  # fmt: skip
-    """Model of ``runs`` at the fitted parameters; a new run starts from the state of run ``r`` times ``swing``."""
-    old = fit.model
-    model = Model(runs, old.device, old.candidates, old.mains)
-    x = model.map_parameters_from(old, fit.x)
-    for i, free in enumerate(model.parameters):
-        if free.kind == "start" and free.run == len(old.runs):
-            start = old.index("start", free.owner, free.name, r)
-            assert start is not None
-            x[i] = swing * fit.x[start]
-    return CandidateExperiment(what, model, x, whiteners)
+def _candidate_experiment(
+    description: str,
+    fit: Fit,
+    index: int,
+    runs: Sequence[Run],
+    whiteners: Sequence[Sequence[Whitener]],
+    amplitude_factor: float = 1.0,
+) -> CandidateExperiment:
+    """Model of ``runs`` at the fitted parameters; a new run starts from the state of run ``index`` times the factor."""
+    fitted = fit.model
+    model = Model(runs, fitted.device, fitted.candidates, fitted.mains)
+    x = model.map_parameters_from(fitted, fit.x)
+    for i, parameter in enumerate(model.parameters):
+        if parameter.kind == "start" and parameter.run == len(fitted.runs):
+            fitted_start = fitted.index("start", parameter.owner, parameter.name, index)
+            assert fitted_start is not None
+            x[i] = amplitude_factor * fit.x[fitted_start]
+    return CandidateExperiment(description, model, x, whiteners)

@@ -25,20 +25,22 @@ DISCRIMINATION_SIGMA = 4.5
 """Distance [sigma] from which an effect is identified alone. The wrong one of two effects at this distance is chosen
 with a probability of about 1 %."""
 
-
-ROUNDING = 1e-9
-"""Of a tolerance, below which a nominal value has not moved."""
+MIN_NOMINAL_CHANGE = 1e-9
+"""Change of a nominal value, in tolerances, below which it is rounding and the value counts as unchanged."""
 
 MAX_POSTERIOR_VARIANCE = 0.5
-"""Posterior over prior variance of a direction of the nominal values from which the recording does not determine it:
-there its own information is less than that of the stated tolerance."""
+"""Ratio of posterior to prior variance of a direction of the nominal values above which the recording does not
+determine it: then the recording has less information on it than the stated tolerance."""
 
 
-def determined_only(fit: Fit) -> Array:
-    """Free numbers of a fit, shape of ``fit.x``, with nominal values moved only along directions that it determines.
+def determined_parameters(fit: Fit) -> Array:
+    """Parameters of a fit with the nominal values changed only along directions that the recording determines.
 
-    Along the others (gain against torque in a linear drive) they stay at their nominal values. All other numbers take
-    the values that are best under that condition, to first order.
+    Along the others, for example readout gain against torque of a linear drive, they have their stated values. All
+    other parameters are refitted under that condition, to first order.
+
+    Returns:
+        shape of ``fit.x``.
     """
     nominal = [i for i, f in enumerate(fit.model.parameters) if f.kind == "nominal"]
     covariance = fit.covariance
@@ -50,8 +52,8 @@ def determined_only(fit: Fit) -> Array:
     condition[:, nominal] = fixed
     gain = covariance @ condition.T @ np.linalg.inv(condition @ covariance @ condition.T)
     x = fit.x - gain @ (condition @ fit.x)
-    still = [i for i in nominal if abs(x[i]) < ROUNDING]
-    x[still] = 0.0
+    unchanged = [i for i in nominal if abs(x[i]) < MIN_NOMINAL_CHANGE]
+    x[unchanged] = 0.0
     return np.asarray(x)
 
 
@@ -75,44 +77,52 @@ class Detectability:
 def detectability(likelihood: Likelihood, fit: Fit, terms: Iterable[Term]) -> list[Detectability]:
     """Detectability of every effect that ``fit`` does not contain, the largest first.
 
-    An effect with a time constant or frequency has the median size over the grid of that parameter; for a confounder
-    the grid point that fits best is used.
+    The sensitivity to an effect with a time constant or frequency depends on that parameter: the effect itself is
+    evaluated at the grid point of median size, a confounder at the one that fits best.
     """
-    taken = {each.key for each in fit.model.candidates}
-    candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in taken]
+    present = {each.key for each in fit.model.candidates}
+    candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in present]
     blocks = candidate_sensitivities(likelihood, fit, candidates)
-    found = [(candidate, block) for candidate, own in zip(candidates, blocks, strict=True) for block in own]
-    if not found:
+    linearisations = [
+        (candidate, block) for candidate, of_candidate in zip(candidates, blocks, strict=True) for block in of_candidate
+    ]
+    if not linearisations:
         return []
-    sizes, apart = discrimination_distances(fit, [block for _, block in found], likelihood.rows)
-    keys = np.array([candidate.key for candidate, _ in found])
-    effects = np.array([candidate.term.effect for candidate, _ in found])
-    shown = []
+    sizes, distances = discrimination_distances(fit, [block for _, block in linearisations], likelihood.rows)
+    keys = np.array([candidate.key for candidate, _ in linearisations])
+    effects = np.array([candidate.term.effect for candidate, _ in linearisations])
+    results = []
     for candidate in candidates:
-        own = np.flatnonzero(keys == candidate.key)
-        if not own.size:
+        of_candidate = np.flatnonzero(keys == candidate.key)
+        if not of_candidate.size:
             continue
-        i = own[np.argsort(sizes[own])[own.size // 2]]
-        others = np.flatnonzero(effects != candidate.term.effect)
-        nearest = min(others, key=lambda j: apart[i, j], default=i)
-        shown.append(Detectability(candidate, float(sizes[i]), found[nearest][0], float(apart[i, nearest])))
-    return sorted(shown, key=lambda each: -each.sigma)
+        i = of_candidate[np.argsort(sizes[of_candidate])[of_candidate.size // 2]]
+        other_effects = np.flatnonzero(effects != candidate.term.effect)
+        nearest = min(other_effects, key=lambda j: distances[i, j], default=i)
+        results.append(
+            Detectability(candidate, float(sizes[i]), linearisations[nearest][0], float(distances[i, nearest]))
+        )
+    return sorted(results, key=lambda result: -result.sigma)
 
 
 def candidate_sensitivities(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> list[list[Array]]:
-    """Sensitivities to every candidate around ``fit``, shape (N, q), for each point of linearisation with any effect.
+    """Sensitivities of the whitened samples to every candidate around ``fit``.
 
     The effect of the unknown initial hidden state is projected out, because it is no evidence for the term.
+
+    Returns:
+        for each candidate a list of arrays of shape (N, q): one for each point of linearisation with any effect.
     """
-    rows, shown = likelihood.rows, []
-    for screened in score_candidate_starts(likelihood, fit, candidates):
+    rows, sensitivities = likelihood.rows, []
+    for scores in score_candidate_starts(likelihood, fit, candidates):
         blocks = []
-        for each in screened:
-            own, hidden = np.split(each.columns, [max(1, len(amplitude_indices(each.model, each.candidate)))], axis=1)
-            if np.any(own):
-                blocks.append(own - hidden @ np.linalg.lstsq(hidden[rows], own[rows], rcond=None)[0])
-        shown.append(blocks)
-    return shown
+        for score in scores:
+            amplitudes = max(1, len(amplitude_indices(score.model, score.candidate)))
+            columns, hidden = np.split(score.columns, [amplitudes], axis=1)
+            if np.any(columns):
+                blocks.append(columns - hidden @ np.linalg.lstsq(hidden[rows], columns[rows], rcond=None)[0])
+        sensitivities.append(blocks)
+    return sensitivities
 
 
 def discrimination_distances(fit: Fit, blocks: Sequence[Array], rows: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -139,19 +149,19 @@ def unexplained_norms(nominal: Array, precision: Array, signals: Array, blocks: 
     Returns:
         (norm after the nominal values, shape (n,); norm after confounder j too, shape (n, len(blocks))).
     """
-    whole = np.column_stack([signals, *blocks])
-    cross = nominal.T @ whole
-    gram = whole.T @ whole - cross.T @ np.linalg.solve(nominal.T @ nominal + np.diag(precision), cross)
+    columns = np.column_stack([signals, *blocks])
+    cross = nominal.T @ columns
+    gram = columns.T @ columns - cross.T @ np.linalg.solve(nominal.T @ nominal + np.diag(precision), cross)
     n = signals.shape[1]
     ends = n + np.cumsum([0, *(block.shape[1] for block in blocks)])
     size = np.maximum(np.diag(gram)[:n], 0.0)
-    apart = np.empty((n, len(blocks)))
+    remaining = np.empty((n, len(blocks)))
     for j in range(len(blocks)):
         part = slice(ends[j], ends[j + 1])
         overlap = gram[part, :n]
         inner = gram[part, part] + np.eye(blocks[j].shape[1])
-        apart[:, j] = size - np.einsum("ij,ij->j", overlap, np.linalg.solve(inner, overlap))
-    return np.sqrt(size), np.sqrt(np.maximum(apart, 0.0))
+        remaining[:, j] = size - np.einsum("ij,ij->j", overlap, np.linalg.solve(inner, overlap))
+    return np.sqrt(size), np.sqrt(np.maximum(remaining, 0.0))
 
 
 def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Likelihood, Fit]:
@@ -160,9 +170,9 @@ def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whi
         replace(run, outputs=tuple(replace(o, data=signal) for o, signal in zip(run.outputs, signals, strict=True)))
         for run, signals in zip(model.runs, model.outputs(x), strict=True)
     ]
-    made = Model(runs, model.device, model.candidates, model.mains)
+    simulated = Model(runs, model.device, model.candidates, model.mains)
     likelihood = Likelihood(runs, whiteners)
-    return likelihood, linearise_at(likelihood, made, x)
+    return likelihood, linearise_at(likelihood, simulated, x)
 
 
 def stated_whitener(output: Output) -> Whitener:

@@ -10,7 +10,7 @@ from estimation.diagnosis.data import Run
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.fit import Fit, fit_model
-from estimation.diagnosis.identifiability import determined_only
+from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.model import Model
 from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
 from estimation.diagnosis.pruning import with_free_parameters
@@ -97,7 +97,7 @@ def without_weakest(result: SelectionResult) -> SelectionResult:
 
 def improved_device(fit: Fit) -> Device:
     """The device with the fitted nominal values, as far as the recording determines them, and the fitted terms."""
-    fit = replace(fit, x=determined_only(fit))
+    fit = replace(fit, x=determined_parameters(fit))
     device = fit.model.device
     axes: dict[str, Axis] = dict(device.axes)
     shared_readout = device.readout

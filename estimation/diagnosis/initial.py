@@ -7,21 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimation.diagnosis.data import Output
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models
+from estimation.diagnosis.fit import INITIAL_STEP, Fit, Likelihood, fit_model, fit_models
 from estimation.diagnosis.model import Model
 from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener, near_lines, noise_psd
 from scanner.arrays import Array
 
 FIRST_WINDOW_PERIODS = 5
-"""Periods of the motion in the first window. Errors of the nominal frequency cost less than half a cycle of phase in
-it."""
+"""Periods of the motion in the first window: so few that an error of the nominal frequency within its tolerance changes
+the phase by less than half a cycle."""
 
 WINDOW_GROWTH = 3.0
-"""Ratio of successive windows. A frequency fitted over one window predicts the phase over three times its length to
-much less than half a cycle."""
+"""Ratio of the lengths of successive windows. A frequency that was fitted over one window predicts the phase over three
+times its length with an error far below half a cycle."""
 
 EXCLUDED_HARMONICS = 12
-"""Multiples of the motion's frequency around which no noise is measured, because misfit concentrates there."""
+"""Harmonics of the motion around which no noise is measured, because a misfit concentrates there."""
 
 
 def window_schedule(model: Model) -> list[float]:
@@ -45,7 +45,7 @@ def flat_whiteners(model: Model) -> list[list[Whitener]]:
 
 def estimate_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
     """Whiteners for the noise in the residual of a model at ``x``, estimated off the harmonics of motion and drive."""
-    made = []
+    whiteners = []
     for run, signals in zip(model.runs, model.outputs(x), strict=True):
         row = []
         for output, signal in zip(run.outputs, signals, strict=True):
@@ -57,8 +57,8 @@ def estimate_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
                 width = 0.0
             psd, first = noise_psd(output.data - signal, output.bins, output.step, lines, width)
             row.append(make_whitener(psd, output.data.size, output.guard, first))
-        made.append(row)
-    return made
+        whiteners.append(row)
+    return whiteners
 
 
 def _lines_overlap(output: Output, lines: Array, width: float, motion: float) -> bool:
@@ -73,37 +73,44 @@ def fit_initial_state(
 ) -> Fit:
     """Fit the initial angle and rate over the first window, from a grid of amplitudes and phases for each run.
 
-    An even capacitance determines the phase modulo pi only. Of two equivalent starts the first is used; the sign that
-    distinguishes them is not identifiable from the recording.
+    An even capacitance determines the phase modulo pi only: the sign of the motion is not identifiable from the
+    recording, and the first of two equivalent starts is used.
+
+    Args:
+        stop: end of the window as a fraction of the recordings.
+        grid: numbers of amplitudes and phases.
+        finalists: starts of lowest misfit from which the fit is run.
     """
     x = np.zeros(len(model.parameters))
-    starts: list[list[Array]] = []
+    states: list[list[Array]] = []
     for r, run in enumerate(model.runs):
         for axis in run.inputs:
-            at = _start_indices(model, axis, r)
-            scored = []
-            for size in np.geomspace(0.03, 1.5, grid[0]):
+            indices = _start_indices(model, axis, r)
+            misfits = []
+            for amplitude in np.geomspace(0.03, 1.5, grid[0]):
                 for phase in 2 * np.pi * np.arange(grid[1]) / grid[1]:
-                    x[at] = size * np.cos(phase), size * np.sin(phase)
-                    scored.append((_misfit(model, r, x, stop), x[at].copy()))
-            scored.sort(key=lambda pair: pair[0])
-            x[at] = scored[0][1]
-            starts.append([values for _, values in scored[:finalists]])
+                    x[indices] = amplitude * np.cos(phase), amplitude * np.sin(phase)
+                    misfits.append((_misfit(model, r, x, stop), x[indices].copy()))
+            misfits.sort(key=lambda pair: pair[0])
+            x[indices] = misfits[0][1]
+            states.append([values for _, values in misfits[:finalists]])
     starts_x = [x.copy() for _ in range(finalists)]
-    for i, one in enumerate(starts_x):
-        place = iter(starts)
+    for i, x_start in enumerate(starts_x):
+        best_states = iter(states)
         for r, run in enumerate(model.runs):
             for axis in run.inputs:
-                one[_start_indices(model, axis, r)] = next(place)[i]
-    fits = fit_models(likelihood, [(model, one) for one in starts_x], stop, max_iterations=10)
+                x_start[_start_indices(model, axis, r)] = next(best_states)[i]
+    fits = fit_models(likelihood, [(model, x_start) for x_start in starts_x], stop, max_iterations=10)
     return min(fits, key=lambda fit: fit.chi2 + fit.penalty)
 
 
 def _start_indices(model: Model, axis: str, r: int) -> list[int]:
+    """Indices in x of the initial angle and rate of an axis in run ``r``."""
     return [i for i, f in enumerate(model.parameters) if (f.kind, f.owner, f.run) == ("start", axis, r)]
 
 
 def _misfit(model: Model, r: int, x: Array, stop: float) -> float:
+    """Sum over the channels of run ``r`` of the residual's variance relative to that of the channel."""
     total = 0.0
     for output, signal in zip(model.runs[r].outputs, model.outputs(x, stop)[r], strict=True):
         data = output.data[: signal.size]
@@ -114,8 +121,14 @@ def _misfit(model: Model, r: int, x: Array, stop: float) -> float:
 def fit_progressively(
     likelihood: Likelihood, model: Model, x: Array, stops: Sequence[float], max_iterations: int = 6
 ) -> list[Fit]:
-    """Fits over windows of increasing length, each started from the one before."""
-    steps = np.full(x.size, 1e-4)
+    """Fits over windows of increasing length, each started at the result of the previous one.
+
+    Args:
+        x: start of the first fit, shape (p,).
+        stops: ends of the windows as fractions of the recordings.
+        max_iterations: of each fit; twice as many for the last one.
+    """
+    steps = np.full(x.size, INITIAL_STEP)
     fits: list[Fit] = []
     for stop in stops:
         last = stop == stops[-1]

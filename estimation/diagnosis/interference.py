@@ -10,27 +10,28 @@ from estimation.diagnosis.noise import near_lines, noise_psd, periodogram
 from scanner.arrays import Array
 
 LINE_DETECTION_RATIO = 30.0
-"""Power of a bin over the noise around it from which it is a line. Noise exceeds it with probability exp(-30) per bin,
-which is negligible among a million bins."""
+"""Ratio of the power of a bin to the noise around it from which it is a line. Noise exceeds it with a probability of
+exp(-30) per bin, which is negligible among a million bins."""
 
 MOTION_HARMONICS = 19
-"""Harmonics of the motion that are not interference. Above it they lie below the noise of the sense channel."""
+"""Number of harmonics of the motion that are excluded from the search. Higher ones are weaker than the noise of the
+sense channel."""
 
 MIN_LINES_OF_BROAD_DRIVE = 50
-"""Number of lines of a drive from which an interfering tone may coincide with one of them by chance. Then a line that
-exceeds its neighbours in the residual also counts."""
+"""Number of lines of a drive from which an interfering tone may coincide with one of them. Such a tone is searched
+among the lines of the drive, as a line that exceeds its neighbours in the residual."""
 
 NEIGHBOUR_BINS = 64
-"""Bins on either side whose 90 % quantile a line among those of a broad drive must exceed."""
+"""Bins on either side of a line among those of a broad drive, whose 90 % quantile is the level it is compared with."""
 
 
-def strongest_foreign_line(fit: Fit) -> float | None:
-    """Frequency [Hz] of the strongest line of a sense channel off the harmonics of motion and drive, or None.
+def strongest_interfering_line(fit: Fit) -> float | None:
+    """Frequency [Hz] of the strongest line of a sense channel that is no harmonic of motion or drive, or None.
 
-    If the drive has many lines, a tone among them counts if there is no other. Hum counts too; the fit decides by its
-    size whether it is noise or interference.
+    If there is none and the drive has many lines, a tone that coincides with one of them is returned. Mains hum is
+    included; the fit decides by its amplitude whether it is noise or interference.
     """
-    best = among = (0.0, 0.0)
+    off_lines = among_lines = (0.0, 0.0)
     model = fit.model
     x = np.array(
         [
@@ -42,24 +43,24 @@ def strongest_foreign_line(fit: Fit) -> float | None:
         for output, signal in zip(run.outputs, signals, strict=True):
             if output.kind != "sense":
                 continue
-            rest = output.data - signal
-            rest = rest[output.guard[0] : rest.size - output.guard[1]]
-            power = periodogram(rest - rest.mean())[: output.bins]
-            duration = rest.size * output.step
+            residual = output.data - signal
+            residual = residual[output.guard[0] : residual.size - output.guard[1]]
+            power = periodogram(residual - residual.mean())[: output.bins]
+            duration = residual.size * output.step
             frequency = np.arange(power.size) / duration
             motion = run.scales[output.axes[0]].rate / (2 * np.pi)
             lines = [*(motion * np.arange(1, MOTION_HARMONICS + 1)), *run.lines[output.axes[0]]]
             width = max(0.06 * motion, 4.0 / duration) if run.lines[output.axes[0]].size < 200 else 4.0 / duration
-            ratio = power / noise_psd(rest, power.size, output.step, lines, width)[0]
+            ratio = power / noise_psd(residual, power.size, output.step, lines, width)[0]
             ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0
-            best = max(best, _strongest(ratio, power, duration))
+            off_lines = max(off_lines, _strongest(ratio, power, duration))
             if run.lines[output.axes[0]].size > MIN_LINES_OF_BROAD_DRIVE:
                 ratio = power / percentile_filter(power, 90, 2 * NEIGHBOUR_BINS + 1)
                 ratio[
                     near_lines(frequency, lines[:MOTION_HARMONICS], 4.0 / duration) | (frequency < 2.5 / duration)
                 ] = 0.0
-                among = max(among, _strongest(ratio, power, duration))
-    for height, line in (best, among):
+                among_lines = max(among_lines, _strongest(ratio, power, duration))
+    for height, line in (off_lines, among_lines):
         if height > LINE_DETECTION_RATIO:
             return line
     return None

@@ -20,19 +20,19 @@ from scanner.arrays import Array
 MEDIAN_TO_MEAN_POWER = float(np.log(2.0))
 """Median over mean of a bin of the periodogram of Gaussian noise, which has an exponential distribution."""
 
-
 MEDIAN_RELATIVE_SPREAD = 1.44
 """Relative standard deviation of a noise level from the median of n bins, times the root of n: 1 / ln 2 for an
 exponential distribution."""
 
 MIN_BINS_PER_BAND = 14
-"""Bins in a band of the running median, which then knows the level to 40 %."""
+"""Smallest number of bins in a band of the running median; it determines the noise level to 40 %."""
 
 EXTRAPOLATION_SLOPE_SD = 0.3
-"""Standard deviation of the power-law exponent with which the spectrum is extrapolated below its first band."""
+"""Standard deviation of the power-law exponent with which the spectrum is extrapolated below its first band. It widens
+the noise there by the mean of a log-normal level, so that slow noise is not reported as a drift."""
 
 EXCLUDED_LOW_HALF_BINS = 6
-"""Half bins from 0 Hz on in which no noise is measured: so slow a variation may be an effect such as a drift."""
+"""Number of half bins, from 0 Hz on, in which no noise is measured: such slow variation may be an effect, a drift."""
 
 SLOPE_PRIOR_SD = 0.6
 """Prior standard deviation of the exponent by which slow noise may rise more steeply than extrapolated. Two medians of
@@ -46,7 +46,7 @@ class Whitener:
     Attributes:
         size: samples of the residual.
         weights: one over the noise's standard deviation in every half bin that is compared, shape (samples,).
-        keep: which whitened samples are compared, shape (2 (m - 1),).
+        keep: mask of the whitened samples that are compared, shape (2 (m - 1),).
         guard: samples at the start and end of the residual that are not compared.
         psd: variance of every bin, shape (m,).
         first: lowest bin whose noise was measured; the spectrum is extrapolated below it. 0 if all bins were measured.
@@ -76,8 +76,8 @@ class Whitener:
         would create a step for red noise, whose whitened form extends far into the recording and resembles a drift.
         """
         first, last = self.guard
-        seen = residual[first : residual.size - last]
-        mirrored = np.concatenate([seen[:first][::-1], seen, seen[seen.size - last :][::-1]])
+        inside = residual[first : residual.size - last]
+        mirrored = np.concatenate([inside[:first][::-1], inside, inside[inside.size - last :][::-1]])
         return np.asarray(idct(dct(mirrored, norm="ortho")[: self.samples] * self.weights, norm="ortho"))
 
     def low_frequency_excess_allowance(self, residual: Array) -> float:
@@ -128,7 +128,7 @@ def noise_psd(
 
     Args:
         residual: shape (n,).
-        bins: number of bins wanted, from 0 Hz on.
+        bins: number of bins of the result, from 0 Hz on.
         step: between samples [s].
         lines: frequencies of motion and drive, which are excluded [Hz].
         width: excluded on either side of a line [Hz].
@@ -163,8 +163,8 @@ def near_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -
     return np.cumsum(marks[:-1]) > 0
 
 
-def _running_median(position: Array, power: Array, wanted: Array) -> tuple[Array, float]:
-    """Mean power at the wanted positions, from medians over bands that widen with frequency.
+def _running_median(position: Array, power: Array, targets: Array) -> tuple[Array, float]:
+    """Mean power at the target positions, from medians over bands whose width grows with frequency.
 
     Bands contain at least ``MIN_BINS_PER_BAND`` bins and span at least a quarter of their frequency.
 
@@ -184,11 +184,11 @@ def _running_median(position: Array, power: Array, wanted: Array) -> tuple[Array
         bias_correction = 1.0 + (MEDIAN_RELATIVE_SPREAD**2 - 0.72) / (high - low)
         levels.append(np.median(power[low:high]) / MEDIAN_TO_MEAN_POWER * bias_correction)
     floor = max(max(levels) * 1e-14, 1e-300)
-    heights = np.log(np.maximum(levels, floor))
-    smooth = np.interp(wanted, centres, heights)
-    if heights.size > 1:
-        slope = np.clip((heights[0] - heights[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
-        below = wanted < centres[0]
-        distance = np.log(centres[0] / np.maximum(wanted[below], 0.5))
+    log_levels = np.log(np.maximum(levels, floor))
+    smooth = np.interp(targets, centres, log_levels)
+    if log_levels.size > 1:
+        slope = np.clip((log_levels[0] - log_levels[1]) / np.log(centres[1] / centres[0]), 0.0, 2.0)
+        below = targets < centres[0]
+        distance = np.log(centres[0] / np.maximum(targets[below], 0.5))
         smooth[below] += slope * distance + 0.5 * (EXTRAPOLATION_SLOPE_SD * distance) ** 2  # mean of a log-normal level
     return np.exp(smooth), float(centres[0])

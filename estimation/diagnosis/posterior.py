@@ -12,10 +12,10 @@ from scanner.arrays import Array
 from scanner.forward_model import AxisTrajectory
 
 POSTERIOR_DRAWS = 40
-"""Draws from the posterior behind a 95 % band. The band's ends have a standard error of a tenth of its width."""
+"""Draws from the posterior for a 95 % band. The ends of the band have a standard error of a tenth of its width."""
 
 PORTRAIT_CELLS = 24
-"""Cells of a phase portrait along each side: about 4 % of the swing each."""
+"""Number of cells of a phase portrait along each side: each is about 4 % of the peak-to-peak range."""
 
 PICTURE_HALF_WIDTH_PX = 200
 """Pixels from the middle of a line to its end, in a picture of 400 pixels."""

@@ -14,17 +14,19 @@ PARABOLIC_TOLERANCE = 0.1
 """Relative error of the square root of the rise up to which an end is found by scaling, as on a parabola."""
 
 PROFILE_TOLERANCE = 0.2
-"""Misfit that a refit at a fixed parameter may leave. Of a rise of 3.84 it moves an end of the interval by 3 %."""
+"""Tolerance of the misfit of a refit at a fixed parameter. Relative to the rise of 3.84 it changes an end of the
+interval by 3 %."""
 
 MAX_PROFILE_REFITS = 6
-"""Refits on the way to one end of an interval. Each moves by a factor of two at most, so six reach a factor of 64."""
+"""Largest number of refits in the search for one end of an interval. Each changes the distance by at most a factor of
+two, so six reach a factor of 64."""
 
 
 def profile_interval(likelihood: Likelihood, fit: Fit, i: int) -> tuple[float, float]:
-    """95 % interval of x[i].
+    """95 % interval of x[i], (lower end, upper end), in prior standard deviations.
 
     The profile is first evaluated at the ends of the parabolic interval, with all other parameters refitted by one
-    Gauss-Newton step. Where the rise there is not that of an interval's end, the likelihood is not parabolic, and the
+    Gauss-Newton step. If the rise there is not that at an end of the interval, the likelihood is not parabolic, and the
     end is searched by refits.
 
     Source: Venzon & Moolgavkar, Applied Statistics 37, 87 (1988).
@@ -37,19 +39,19 @@ def _profile_endpoint(likelihood: Likelihood, fit: Fit, i: int, side: float) -> 
     """Distance from x[i] to the end of its interval on one side, -1 or 1."""
     covariance, precision = fit.covariance, fit.model.precision
     minimum, ridge = fit.chi2 + fit.penalty, covariance[:, i] / covariance[i, i]
-    reach = float(side * Z_95 * np.sqrt(covariance[i, i]))
+    distance = float(side * Z_95 * np.sqrt(covariance[i, i]))
 
     def relative_rise(misfit: float) -> float:
         """Square root of the rise to a misfit, relative to that at an end of the interval."""
         return float(np.sqrt(max(misfit - minimum, 1e-12)) / Z_95)
 
-    x = fit.x + ridge * reach
-    others = np.arange(x.size) != i
-    fitted = fit.jacobian[np.ix_(fit.rows, others)]
+    x = fit.x + ridge * distance
+    is_free = np.arange(x.size) != i
+    fitted = fit.jacobian[np.ix_(fit.rows, is_free)]
     residual = likelihood.residual(fit.model, x)[fit.rows]
-    gradient = fitted.T @ residual + precision[others] * x[others]
+    gradient = fitted.T @ residual + precision[is_free] * x[is_free]
     refitted = x.copy()
-    refitted[others] -= np.linalg.solve(fitted.T @ fitted + np.diag(precision[others]), gradient)
+    refitted[is_free] -= np.linalg.solve(fitted.T @ fitted + np.diag(precision[is_free]), gradient)
     refitted_residual = likelihood.residual(fit.model, refitted)[fit.rows]
     rise = relative_rise(
         min(r @ r + precision @ (trial * trial) for r, trial in ((residual, x), (refitted_residual, refitted)))
@@ -57,9 +59,9 @@ def _profile_endpoint(likelihood: Likelihood, fit: Fit, i: int, side: float) -> 
     for _ in range(MAX_PROFILE_REFITS):
         if abs(rise - 1.0) < PARABOLIC_TOLERANCE:
             break
-        reach *= np.clip(1.0 / rise, 0.5, 2.0)
+        distance *= np.clip(1.0 / rise, 0.5, 2.0)
         trial = fit_model(
-            likelihood, fit.model, fit.x + ridge * reach, max_iterations=4, tolerance=PROFILE_TOLERANCE, fixed=i
+            likelihood, fit.model, fit.x + ridge * distance, max_iterations=4, tolerance=PROFILE_TOLERANCE, fixed=i
         )
-        ridge, rise = (trial.x - fit.x) / reach, relative_rise(trial.chi2 + trial.penalty)
-    return float(reach / np.clip(rise, 0.5, 2.0))
+        ridge, rise = (trial.x - fit.x) / distance, relative_rise(trial.chi2 + trial.penalty)
+    return float(distance / np.clip(rise, 0.5, 2.0))

@@ -19,7 +19,7 @@ from estimation.diagnosis.initial import (
     flat_whiteners,
     window_schedule,
 )
-from estimation.diagnosis.interference import strongest_foreign_line
+from estimation.diagnosis.interference import strongest_interfering_line
 from estimation.diagnosis.model import MAINS_HZ, Candidate, Model
 from estimation.diagnosis.noise import Whitener
 from estimation.diagnosis.progressive_fit import (
@@ -406,7 +406,7 @@ def _min_entropy_whiteners(fits: Iterable[Fit]) -> list[list[Whitener]]:
 
 def with_interference_line(likelihood: Likelihood, fit: Fit) -> Fit:
     """The same fit, with the strongest interfering line in the natural scales of its runs."""
-    line = strongest_foreign_line(fit)
+    line = strongest_interfering_line(fit)
     if line is None:
         return fit
     runs = tuple(

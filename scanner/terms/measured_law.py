@@ -76,11 +76,11 @@ def added(values: Array, p: Sequence[float]) -> Array:
     return np.asarray(_along(np.asarray(p, float), np.ascontiguousarray(values, float).ravel()).reshape(values.shape))
 
 
-def _output(signal: Array, p: Sequence[float], view: SignalContext) -> Array:
+def _output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
     return signal + added(signal, p)
 
 
-def _voltage(voltage: Array, p: Sequence[float], view: SignalContext) -> Array:
+def _voltage(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
     return voltage + added(voltage, p)
 
 

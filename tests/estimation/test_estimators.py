@@ -37,7 +37,7 @@ USER_TERM = """
 from scanner.terms import Parameter, Term
 
 
-def output(signal, p, view):
+def output(signal, p, context):
     return signal + p[0]
 
 

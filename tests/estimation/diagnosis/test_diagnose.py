@@ -23,7 +23,7 @@ from estimation.diagnosis.initial import (
     flat_whiteners,
     window_schedule,
 )
-from estimation.diagnosis.interference import strongest_foreign_line
+from estimation.diagnosis.interference import strongest_interfering_line
 from estimation.diagnosis.model import Candidate, Model
 from estimation.diagnosis.noise import make_whitener, noise_psd
 from estimation.diagnosis.resampling import decimate, resample_drive
@@ -243,7 +243,7 @@ def test_a_foreign_tone_among_the_lines_of_a_multisine_is_detected() -> None:
         data = moved + rng.normal(0, 2e-3, moved.size) + tone * wave
         disturbed = Model([replace(run, outputs=(replace(run.outputs[0], data=data),))], DEVICE)
         likelihood = Likelihood(disturbed.runs, flat_whiteners(disturbed))
-        line = strongest_foreign_line(
+        line = strongest_interfering_line(
             fit_model(likelihood, disturbed, np.zeros(len(disturbed.parameters)), max_iterations=1)
         )
         assert (line is not None and abs(line - 336.0) < 3.0) == detected

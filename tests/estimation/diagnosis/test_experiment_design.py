@@ -48,13 +48,15 @@ def test_the_advice_names_measurements_that_separate_confounders(fitted: tuple[L
     (distance,) = distances_to_rivals(likelihood, fit, CUBIC, [QUINTIC])
     distances = dict(rank_experiments(likelihood, fit, CUBIC, QUINTIC))
     assert (
-        distances["with its angle recorded, noise 0.001 of the swing"]
+        distances["with its angle recorded, noise 0.001 of the amplitude"]
         > 4.5
-        > distances["beside a recording at half the drive"]
+        > distances["with a recording at half the drive in addition"]
     )
     assert min(distances.values()) > distance
     text = discrimination_advice(likelihood, fit, CUBIC, QUINTIC, distance)
-    assert text.startswith(f"quintic-stiffness lies {distance:.1f} σ away, 4.5 are needed; with its angle recorded")
+    assert text.startswith(
+        f"quintic-stiffness is at a distance of {distance:.1f} σ, 4.5 are needed; with its angle recorded"
+    )
     assert "second, larger amplitude" in text
 
 

@@ -11,7 +11,7 @@ import pytest
 from estimation.diagnosis.clipping import rail
 from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.fit import Likelihood, fit_model
-from estimation.diagnosis.identifiability import determined_only
+from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.initial import flat_whiteners
 from estimation.diagnosis.model import Model
 from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
@@ -56,10 +56,10 @@ def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
     assert abs(valley[names.index("readout.gain")]) > 0.3
     moved = fit.x.copy()
     moved[at] += 2.0 * valley
-    settled = determined_only(replace(fit, x=moved))
-    assert determined_only(fit)[at] == pytest.approx(settled[at], abs=1e-3)
+    settled = determined_parameters(replace(fit, x=moved))
+    assert determined_parameters(fit)[at] == pytest.approx(settled[at], abs=1e-3)
     assert valley @ settled[at] == pytest.approx(0.0, abs=1e-9)
-    changed = likelihood.residual(model, determined_only(fit)) - fit.residual
+    changed = likelihood.residual(model, determined_parameters(fit)) - fit.residual
     assert np.sum(changed[likelihood.rows] ** 2) < 1.0
 
 

@@ -39,7 +39,7 @@ def test_a_delay_that_grows_with_the_amplitude_is_unknown_in_the_timing() -> Non
     assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "timing")]
     curve = diagnosis.findings[0].curve
     assert curve is not None
-    assert (curve["x"], curve["y"]) == ("swing (rad)", "delay")
+    assert (curve["x"], curve["y"]) == ("amplitude (rad)", "delay")
     swing, delay, sd = np.array(curve["points"]).T
     assert (np.abs(delay - 2e-6 * (swing / 1e-3) ** 2) < 4.0 * sd + 1e-9).all()
     assert sd[-1] < 0.1 * delay[-1]
@@ -64,7 +64,7 @@ def test_backlash_of_the_readout_is_unknown_in_the_readout() -> None:
     assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "readout")]
     curve = diagnosis.findings[0].curve
     assert curve is not None
-    assert (curve["x"], curve["y"]) == ("phase of the swing (rad)", "signal error / rms")
+    assert (curve["x"], curve["y"]) == ("phase of the oscillation (rad)", "signal error / rms")
     assert "P_0" in curve["formula"]
 
 
