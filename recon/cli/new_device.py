@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from scanner.device_templates import KINDS
 
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the device file to write")
-    parser.add_argument("--kind", choices=KINDS, required=True, help="of the scanner")
+    parser.add_argument("--kind", choices=KINDS, default="parametric", help="of the scanner (parametric)")
     parser.add_argument("--name", help="of the device (the kind)")
     parser.add_argument(
         "--frequencies-only",
