@@ -20,7 +20,7 @@ import numpy as np
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.predict import predict
 from scanner.arrays import Array
-from scanner.device import Axis, Device, Drive, Mechanics, Position
+from scanner.device import Acceleration, Axis, Device, Drive, Mechanics, Position
 from scanner.recording import Recording
 
 Case = tuple[list[Recording], list[Recording], Device]
@@ -107,13 +107,11 @@ def _stage(data: Path) -> Case:
 def _f16(data: Path) -> Case:
     from scipy.io import loadmat
 
-    from scanner.device import Acceleration  # type: ignore[attr-defined]
-
     content = loadmat(data / "f16/full_multisine_level7.mat")
     force, acceleration = content["Force"][0], content["Acceleration"][0]
     resonance = 2 * np.pi * 7.3
     axis = Axis(
-        Mechanics(1.0, resonance / 120, resonance**2), drive=Drive("linear", 0.02), readout=Acceleration(1.0, 1e-3),
+        Mechanics(1.0, resonance / 120, resonance**2), drive=Drive("linear", 4e-4), readout=Acceleration(1.0, 1e-3),
         tolerance={"J": 1e-9, "gain": 1e-9, "k": 0.05, "b": 0.5, "torque_per_volt": 0.5}, name="x",
     )  # fmt: skip
     made = _one_axis("f16", axis, drive_x=(force, "V", 400.0), sense_x=(acceleration, "V", 400.0))

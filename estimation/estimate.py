@@ -15,14 +15,16 @@ def default_estimator(recording: Recording, device: Device) -> str:
     """Name of the estimator that suits the channels of a recording.
 
     Returns:
-        ``"tracker"`` with a capacitive readout; ``"picture"`` with the drives and an intensity but no sense and
-        no angle channel; otherwise ``"sensor"``.
+        ``"tracker"`` with a capacitive readout or a sensor of velocity or acceleration; ``"picture"`` with the drives
+        and an intensity but neither sense nor angle channel; otherwise ``"sensor"``.
     """
-    capacitive = any(
+    followed = any(
         f"sense_{name}" in recording and axis.readout is not None and not isinstance(axis.readout, Position)
         for name, axis in device.axes.items()
     )
-    if "sense" in recording or capacitive:
+    unmeasured = [axis for axis in device.axes if not any(f"{kind}_{axis}" in recording for kind in ("sense", "angle"))]
+    derivative = any(f"{kind}_{axis}" in recording for axis in unmeasured for kind in ("velocity", "acceleration"))
+    if "sense" in recording or followed or derivative:
         return "tracker"
     driven = "intensity" in recording and all(f"drive_{axis}" in recording for axis in device.axes)
     measured = any(f"{kind}_{axis}" in recording for axis in device.axes for kind in ("sense", "angle"))

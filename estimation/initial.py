@@ -108,11 +108,11 @@ def fit_initial_motion(sense: SenseChannel, device: Device, references: Mapping[
             axes[name], mean = _from_capacitance(sense, device.axis(name), frequencies[name], name, phasors, line_sd)
             offset -= mean
         else:
-            gain = float(readout_response(sense.readout, 0.0).real)
+            gain = complex(readout_response(sense.readout, frequencies[name]))
             phase = float(np.angle(1j * line / gain))  # Re(Z e^{i psi}) = A sin(psi + phase) for Z = -i A e^{i phase}
             sd = line_sd / abs(gain)
             axes[name] = InitialAxisMotion(
-                abs(line / gain), phase, sd, sd * abs(gain / line), "known: position readout"
+                abs(line / gain), phase, sd, sd * abs(gain / line), f"known: {sense.readout.kind} readout"
             )
     return InitialMotion(axes, offset, noise_sd, n / rate)
 

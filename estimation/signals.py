@@ -7,10 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.reference import PhaseReference, absolute_reference, dominant_frequency, drive_reference
+from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
-from scanner.device import Device, Position, Readout
+from scanner.device import Acceleration, Device, MotionSensor, Readout, Velocity
 from scanner.errors import BadInput, ChannelMissing, DeviceInvalid
 from scanner.recording import Recording
+
+WHITE_NOISE_DIFFERENCE_ORDER = 6
+"""Order of the differences by which a sensor's noise is measured: sixth differences suppress an oversampled motion
+completely, and of white noise they have sqrt(924) times the standard deviation."""
+
+NOISE_SAMPLES = 1 << 18
+"""Samples from the start in which the noise of a sensor is measured."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +65,30 @@ def sense_channels(recording: Recording, device: Device, gaps_ok: bool = False) 
         signals = [SenseChannel(recording["sense"], device.readout, tuple(device.axes))]
     else:
         signals = [
-            SenseChannel(recording.require(f"sense_{name}", "this estimator needs it"), axis.require_readout(), (name,))
+            _reference_sensor(recording, name)
+            or SenseChannel(
+                recording.require(f"sense_{name}", "this estimator needs it"), axis.require_readout(), (name,)
+            )
             for name, axis in device.axes.items()
         ]
     for sense in signals:
         check_signal(sense.channel, gaps_ok=gaps_ok)
     return signals
+
+
+def _reference_sensor(recording: Recording, axis: str) -> SenseChannel | None:
+    """The recorded velocity or acceleration of an axis without sense channel, as a readout of gain 1."""
+    for sensor in () if f"sense_{axis}" in recording else (Velocity, Acceleration):
+        if (name := f"{sensor.kind}_{axis}") in recording:
+            channel = recording[name]
+            return SenseChannel(channel, sensor(1.0, white_noise_sd(channel.read(0, NOISE_SAMPLES))), (axis,))
+    return None
+
+
+def white_noise_sd(values: Array) -> float:
+    """Standard deviation of the white noise of an oversampled signal, from its sixth differences, in its unit."""
+    differences = np.diff(values[np.isfinite(values)], n=WHITE_NOISE_DIFFERENCE_ORDER)
+    return float(np.median(np.abs(differences)) / 0.6745 / np.sqrt(924.0)) if differences.size else 0.0
 
 
 def drive_channel(recording: Recording, axis: str, gaps_ok: bool = False) -> Channel | None:
@@ -125,7 +151,7 @@ def phase_reference(
 
 def is_capacitive(readout: Readout) -> bool:
     """Whether the readout measures a capacitance: its signal has twice the motion's frequency and no sign."""
-    return not isinstance(readout, Position)
+    return not isinstance(readout, MotionSensor)
 
 
 def intensity_clock(recording: Recording, fallback: Channel) -> tuple[float, float, int]:

@@ -38,7 +38,7 @@ from estimation.term_absorption import (
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
-from scanner.forward_model import ActiveTerm, angle_signal, sense_signal, stated_terms
+from scanner.forward_model import ActiveTerm, reference_signal, sense_signal, stated_terms
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 
@@ -127,7 +127,7 @@ def _corrected(recording: Recording, bare: Device, terms: Terms, functions: Func
             nominal.append(trajectory(axis, (), drive, angles[name]))
             complete.append(trajectory(axis, tuple(terms[name]), drive, with_terms))
         if kind == "angle":
-            contribution = angle_signal(complete[0]) - angle_signal(nominal[0])
+            contribution = reference_signal(complete[0]) - reference_signal(nominal[0])
         else:
             readout = bare.sensed_axis(axes[0]).require_readout()
             contribution = sense_signal(readout, complete) - sense_signal(readout, nominal)

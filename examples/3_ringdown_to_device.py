@@ -21,7 +21,7 @@ nominal = lissajous.load_device("chen2019")
 axis = nominal.axis("x")
 mechanics = axis.mechanics
 true = replace(axis, mechanics=replace(mechanics, k=1.005 * mechanics.k, b=1.08 * mechanics.b))
-plan = Plan({"x": Constant(10.0)}, duration=0.08, sample_rate=200e3, angles=True)
+plan = Plan({"x": Constant(10.0)}, duration=0.08, sample_rate=200e3, references=("angle",))
 clean, _ = simulate(replace(nominal, axes={"x": true}), plan, seed=1, start={"x": InitialState(0.15, 0.0)})
 
 # %%

@@ -42,7 +42,8 @@ def with_terms(device: Device, terms: dict[str, dict[str, float]]) -> Device:
 
 def calibration(true: Device, nominal: Device, duration: float = CALIBRATION) -> Recording:
     """A recording of both axes driven, with the sense signal and the angles of a position detector."""
-    recording, _ = simulate(true, Plan(Experiment().drives, duration, angles=True), seed=SEED + 1, nominal=nominal)
+    plan = Plan(Experiment().drives, duration, references=("angle",))
+    recording, _ = simulate(true, plan, seed=SEED + 1, nominal=nominal)
     rng = np.random.default_rng(SEED)
     channels = {}
     for name, channel in recording.channels.items():

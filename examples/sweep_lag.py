@@ -44,14 +44,14 @@ def papers_own(true: Device) -> Device:
     return replace(true, axes={"x": replace(axis, readout=replace(readout, lpf_hz=()))})
 
 
-def driven(frequency: float, duration: float, angles: bool = False) -> Plan:
+def driven(frequency: float, duration: float, references: tuple[str, ...] = ()) -> Plan:
     """30 V + 30 V sin at ``frequency`` [Hz], for ``duration`` [s]."""
-    return Plan({"x": Sine(frequency, 30.0, 30.0)}, duration, angles=angles)
+    return Plan({"x": Sine(frequency, 30.0, 30.0)}, duration, references=references)
 
 
 def on_the_bench(true: Device, nominal: Device, frequency: float, seed: int) -> Recording:
     """Sense signal and the detector's angle."""
-    recording, _ = simulate(true, driven(frequency, LENGTH, angles=True), seed=seed, nominal=nominal)
+    recording, _ = simulate(true, driven(frequency, LENGTH, references=("angle",)), seed=seed, nominal=nominal)
     channels = {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
     angle, *told = channels["angle_x"]
     noise = DETECTOR_NOISE * np.random.default_rng(seed).standard_normal(angle.size)

@@ -74,7 +74,7 @@ def simulate_experiment(
         duration=experiment.duration,
         sample_rate=experiment.sample_rate,
         drift={axis: Drift(exponential(change, experiment.drift_tau)) for axis, change in experiment.drift.items()},
-        angles=experiment.angles,
+        references=("angle",) if experiment.angles else (),
     )
     recording, truth = simulate(experiment.device, plan, Scene(light, experiment.detector), seed, nominal=nominal)
     return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}

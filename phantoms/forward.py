@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.waveforms import Waveform
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, Device, Position, Readout
+from scanner.channel import CHANNEL_UNITS
+from scanner.device import Amdm, Axis, Device, MotionSensor, Readout
 from scanner.drift import Drift
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.forward_model import (
     ActiveTerm,
     AxisTrajectory,
     DriveInput,
-    angle_signal,
+    reference_signal,
     sense_signal,
     simulate_axis,
     simulate_coupled,
@@ -84,7 +85,8 @@ class Plan:
         settle: time that the drives have been running before the recording starts [s].
         drift: by axis name; from the recording's start on.
         sense_range: full scale of the converter of the sense channels [V], centred on 0.
-        angles: write the true angles as reference channels ``angle_x``, ``angle_y`` too.
+        references: kinds of reference channel of every axis that are written too, of
+            ``scanner.forward_model.REFERENCE_ORDERS``: ``"angle"``, ``"velocity"``, ``"acceleration"``.
     """
 
     drives: Mapping[str, Waveform]
@@ -94,7 +96,7 @@ class Plan:
     settle: float = 0.05
     drift: Mapping[str, Drift] = field(default_factory=dict)
     sense_range: float = 10.0
-    angles: bool = False
+    references: tuple[str, ...] = ()
 
 
 def drive_inputs(axis: Axis, plan: Plan, t0: float, t1: float) -> DriveInput:
@@ -204,10 +206,11 @@ def sense_channels(device: Device) -> dict[str, tuple[Readout, tuple[str, ...]]]
     """Return the sense channels of the device, each with its readout and the axes that it senses.
 
     Raises:
-        DeviceInvalid: a position sensor for several axes.
+        DeviceInvalid: a sensor of the motion for several axes.
     """
-    if isinstance(device.readout, Position) and len(device.axes) > 1:
-        raise DeviceInvalid("a position sensor reads one axis", channel="readout", hint="give each axis its own")
+    if isinstance(device.readout, MotionSensor) and len(device.axes) > 1:
+        what = f"a {device.readout.kind} sensor reads one axis"
+        raise DeviceInvalid(what, channel="readout", hint="give each axis its own")
     if device.readout is not None:
         return {"sense": (device.readout, tuple(device.axes))}
     return {f"sense_{name}": (axis.readout, (name,)) for name, axis in device.axes.items() if axis.readout}
@@ -239,7 +242,9 @@ def _motion_pieces(
 
 
 def _settling_steps(readout: Readout, step: float) -> int:
-    """Steps after which the transients of a readout's sections are negligible."""
+    """Steps after which the transients of a readout's sections are negligible; 2 for the derivatives of a motion."""
+    if isinstance(readout, MotionSensor):
+        return 2
     slowest = min(readout.lpf_hz, default=np.inf) if isinstance(readout, Amdm) else np.inf
     return int(np.ceil(SETTLE_TIME_CONSTANTS / (2 * np.pi * slowest * step)))
 
@@ -277,8 +282,8 @@ def simulate(
     for paths in _motion_pieces(device, plan, start):
         for name, path in paths.items():
             parts.setdefault(f"truth_{name}", []).append(path.angle[: -1 : plan.substeps])
-            if plan.angles:
-                parts.setdefault(f"angle_{name}", []).append(angle_signal(path)[: -1 : plan.substeps])
+            for kind in plan.references:
+                parts.setdefault(f"{kind}_{name}", []).append(reference_signal(path, kind)[: -1 : plan.substeps])
         for channel, (readout, axes) in sense_channels(device).items():
             motions = [lead[name].joined_with(paths[name]) if name in lead else paths[name] for name in axes]
             new = len(paths[axes[0]].drive.voltage)
@@ -291,7 +296,7 @@ def simulate(
     whole = {name: np.concatenate(values) for name, values in parts.items()}
     truth = {f"angle_{name}": whole.pop(f"truth_{name}") for name in device.axes}
     channels: dict[str, tuple[NDArray[Any], str]] = {
-        name: (values, "rad" if name.startswith("angle") else "V") for name, values in whole.items()
+        name: (values, CHANNEL_UNITS[name]) for name, values in whole.items()
     }
     time = np.arange(round(plan.duration * plan.sample_rate)) / plan.sample_rate
     channels |= {f"drive_{name}": (drive(time), "V") for name, drive in plan.drives.items()}

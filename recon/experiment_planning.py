@@ -155,9 +155,8 @@ def simulate_excitation(excitation: Excitation, device: Device) -> Recording:
     if missing and device.readout is not None:
         raise BadInput("shares its readout and is left out", channel=missing[0], hint="state every axis")
     device = replace(device, axes={name: device.axes[name] for name in excitation.drives})
-    plan = Plan(
-        excitation.drives, excitation.duration, excitation.sample_rate, angles=excitation.angle_noise is not None
-    )
+    references = ("angle",) if excitation.angle_noise is not None else ()
+    plan = Plan(excitation.drives, excitation.duration, excitation.sample_rate, references=references)
     start = {}
     for name, axis in device.axes.items():
         linear = axis.drive is not None and axis.drive.kind == "linear"

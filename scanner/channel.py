@@ -34,12 +34,16 @@ CHANNEL_UNITS = {
     "drive_x": "V", "drive_y": "V", "bias_x": "V", "bias_y": "V",
     "sense_x": "V", "sense_y": "V", "sense": "V",
     "angle_x": "rad", "angle_y": "rad",
+    "velocity_x": "rad/s", "velocity_y": "rad/s",
+    "acceleration_x": "rad/s2", "acceleration_y": "rad/s2",
 }  # fmt: skip
 """Unit of the samples that a channel returns, by its name. Other channels keep the unit that they were recorded in."""
 
 CONVERSIONS = {
     "V": {"V": 1.0, "mV": 1e-3, "uV": 1e-6},
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": pi / 180},
+    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": pi / 180},
+    "rad/s2": {"rad/s2": 1.0, "rad/s²": 1.0, "rad/s^2": 1.0, "mrad/s2": 1e-3, "deg/s2": pi / 180},
 }
 """Accepted units for each unit of ``CHANNEL_UNITS``, with the factor that converts to it."""
 

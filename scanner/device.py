@@ -146,8 +146,26 @@ class Transimpedance(Checked):
     bits: int | None = field(default=None, metadata=WHOLE | CAN_BE_OFF)
 
 
+class MotionSensor(Checked):
+    """A readout that follows the motion itself: ``V = gain d^n theta / dt^n + offset``.
+
+    Attributes:
+        kind: of the readout.
+        order: n, the time derivatives of the angle that the output follows.
+        gain: [V / (rad / s^n)].
+        offset: output at rest [V].
+        noise_sd: standard deviation of the output's noise [V].
+    """
+
+    kind: ClassVar[str]
+    order: ClassVar[int]
+    gain: float
+    offset: float
+    noise_sd: float
+
+
 @dataclass(frozen=True)
-class Position(Checked):
+class Position(MotionSensor):
     """A position sensor: ``V = gain theta + offset``.
 
     Attributes:
@@ -158,6 +176,47 @@ class Position(Checked):
     """
 
     kind: ClassVar[str] = "position"
+    order: ClassVar[int] = 0
+
+    gain: float = field(metadata=NONZERO)
+    noise_sd: float = field(metadata=NOT_NEGATIVE)
+    offset: float = field(default=0.0, metadata=FINITE)
+    bits: int | None = field(default=None, metadata=WHOLE | CAN_BE_OFF)
+
+
+@dataclass(frozen=True)
+class Velocity(MotionSensor):
+    """A velocity sensor, such as a laser Doppler vibrometer: ``V = gain theta' + offset``.
+
+    Attributes:
+        gain: volts per radian a second of mechanical angle [V s / rad].
+        noise_sd: standard deviation of the output's noise [V].
+        offset: output at rest [V].
+        bits: resolution of the converter.
+    """
+
+    kind: ClassVar[str] = "velocity"
+    order: ClassVar[int] = 1
+
+    gain: float = field(metadata=NONZERO)
+    noise_sd: float = field(metadata=NOT_NEGATIVE)
+    offset: float = field(default=0.0, metadata=FINITE)
+    bits: int | None = field(default=None, metadata=WHOLE | CAN_BE_OFF)
+
+
+@dataclass(frozen=True)
+class Acceleration(MotionSensor):
+    """An acceleration sensor: ``V = gain theta'' + offset``.
+
+    Attributes:
+        gain: volts per radian a second squared of mechanical angle [V s^2 / rad].
+        noise_sd: standard deviation of the output's noise [V].
+        offset: output at rest [V].
+        bits: resolution of the converter.
+    """
+
+    kind: ClassVar[str] = "acceleration"
+    order: ClassVar[int] = 2
 
     gain: float = field(metadata=NONZERO)
     noise_sd: float = field(metadata=NOT_NEGATIVE)
@@ -206,8 +265,10 @@ class Scan(Checked):
         return self.half_angle_x / self.angle_scale, self.half_angle_y / self.angle_scale
 
 
-Readout = Amdm | Transimpedance | Position
-READOUTS: dict[str, type[Readout]] = {readout.kind: readout for readout in (Amdm, Transimpedance, Position)}
+Readout = Amdm | Transimpedance | Position | Velocity | Acceleration
+READOUTS: dict[str, type[Readout]] = {
+    readout.kind: readout for readout in (Amdm, Transimpedance, Position, Velocity, Acceleration)
+}
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.device import Amdm, Capacitance, Position, Readout
+from scanner.device import Amdm, Capacitance, MotionSensor, Readout
 from scanner.laws import capacitance
 from scanner.lowpass import lowpass_response
 
@@ -30,10 +30,10 @@ def capacitance_harmonics(amplitude: float, comb: Capacitance, count: int = 8) -
 def readout_response(readout: Readout, frequency: NDArray[np.float64] | float) -> NDArray[np.complex128]:
     """Return the gain of a readout at ``frequency`` [Hz], low-pass sections included, in the shape of ``frequency``.
 
-    In V/F for a capacitive readout, in V/rad for a position sensor.
+    In V/F for a capacitive readout, in V/rad for a sensor of the motion.
     """
     if isinstance(readout, Amdm):
         return readout.a_cir * lowpass_response(frequency, readout.lpf_hz)
-    if isinstance(readout, Position):
-        return readout.gain * np.ones(np.shape(frequency), dtype=np.complex128)
+    if isinstance(readout, MotionSensor):
+        return readout.gain * (2j * np.pi * np.asarray(frequency, dtype=np.complex128)) ** readout.order
     return -readout.R_s * readout.V_bias * 2j * np.pi * np.asarray(frequency)

@@ -61,6 +61,6 @@ def amdm_voltage(filtered_capacitance, a_cir, b_cir):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def position_voltage(theta, gain, offset):  # type: ignore[no-untyped-def]
-    """Position readout gain theta + offset [V]."""
-    return gain * theta + offset
+def motion_voltage(motion, gain, offset):  # type: ignore[no-untyped-def]
+    """Readout gain q + offset [V] of the motion q: the angle, its rate or its acceleration."""
+    return gain * motion + offset

@@ -12,9 +12,9 @@ from estimation.diagnosis.drive_lines import drive_lines, is_steady, strongest_l
 from estimation.diagnosis.resampling import decimate, fast_transform_length, resample_drive
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
-from scanner.device import Amdm, Axis, Device, Position, Readout, Transimpedance
+from scanner.device import Amdm, Axis, Device, MotionSensor, Readout, Transimpedance
 from scanner.errors import BadInput, DeviceInvalid
-from scanner.forward_model import DriveInput
+from scanner.forward_model import REFERENCE_ORDERS, DriveInput
 from scanner.integrator.nodes import to_nodes
 from scanner.interpolation import interpolate_cubic
 from scanner.lowpass import lowpass_response
@@ -49,7 +49,7 @@ class Output:
 
     Attributes:
         name: of the channel.
-        kind: ``"sense"`` or ``"angle"``.
+        kind: ``"sense"`` or one of ``scanner.forward_model.REFERENCE_ORDERS``.
         axes: names of the axes whose motion the channel contains.
         data: shape (n,) [V or rad].
         full: as recorded, shape (N,).
@@ -121,7 +121,8 @@ def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Ru
     channels = _output_channels(recording, device)
     if not channels:
         holds = ", ".join(recording.channels)
-        hint = f"record sense or angle channels, or add the readout to the device; it holds {holds}"
+        kinds = ", ".join(("sense", *REFERENCE_ORDERS))
+        hint = f"record one of {kinds}, or add the readout to the device; it holds {holds}"
         raise BadInput("holds no channel that the device can simulate", file=recording.path, hint=hint)
     axes = tuple(name for name in device.axes if any(name in sensed for _, sensed in channels.values()))
     drives = {name: _drive_channels(recording, device.axis(name)) for name in axes}
@@ -171,8 +172,9 @@ def _output_channels(recording: Recording, device: Device) -> dict[str, tuple[st
         channel = sense_channel(device, name)
         if channel in recording and readout_of(device, name) is not None:
             channels[channel] = ("sense", (*channels.get(channel, ("", ()))[1], name))
-        if f"angle_{name}" in recording:
-            channels[f"angle_{name}"] = ("angle", (name,))
+        for kind in REFERENCE_ORDERS:
+            if f"{kind}_{name}" in recording:
+                channels[f"{kind}_{name}"] = (kind, (name,))
     return channels
 
 
@@ -250,7 +252,7 @@ def _output(channel: Channel, axes: tuple[str, ...], device: Device, step: float
     band = min(0.35 / interval, max(BAND_HARMONICS * fastest, 1.5 * drive))
     edge = FILTER_EDGE_SAMPLES if decimation > 1 else 2
     guard = (max(edge, ceil(1.0 / (fastest * interval))), edge)
-    kind = "angle" if channel.name.startswith("angle") else "sense"
+    kind = channel.name.partition("_")[0]
     readout = readout_of(device, axes[0])
     noise = readout.noise_sd if kind == "sense" and readout is not None else None
     bins = fast_transform_length(int(band * data.size * interval)) + 1
@@ -275,7 +277,8 @@ def _scales(device: Device, name: str, inputs: DriveInput, outputs: tuple[Output
     follows_drive = follows and rate < resonance  # as a stage does far below its resonance
     if not (0.5 < rate / resonance < 2.0 or follows_drive):
         rate = resonance
-    measured = next((o.data for o in outputs if o.name == f"angle_{name}"), None)
+    references = {o.kind: o.data for o in outputs if o.axes == (name,) and o.kind != "sense"}
+    measured = next((references[k] / float(rate) ** n for k, n in REFERENCE_ORDERS.items() if k in references), None)
     return NaturalScales(
         amplitude=_amplitude(axis, readout, rate, sensed.data, measured),
         rate=float(rate),
@@ -292,8 +295,8 @@ def _amplitude(axis: Axis, readout: Readout | None, rate: float, signal: Array, 
     """Approximate peak amplitude of the motion [rad], from the angle or else through the law of the readout."""
     if measured is not None:
         return float(np.percentile(np.abs(measured - np.median(measured)), 99))
-    if isinstance(readout, Position):
-        return float(np.percentile(np.abs(signal - np.median(signal)), 99) / abs(readout.gain))
+    if isinstance(readout, MotionSensor):
+        return float(np.percentile(np.abs(signal - np.median(signal)), 99) / abs(readout.gain) / rate**readout.order)
     capacitance = axis.require_capacitance()
     amplitudes = capacitance.theta0 * np.geomspace(0.02, 2.0, 60)
     phase = 2 * np.pi * np.arange(128) / 128

@@ -12,12 +12,12 @@ import numpy as np
 
 from estimation.diagnosis.data import Output, Run, readout_of
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, Device, Readout
+from scanner.device import Amdm, Axis, Device, MotionSensor, Readout
 from scanner.forward_model import (
     ActiveTerm,
     AxisTrajectory,
     DriveInput,
-    angle_signal,
+    reference_signal,
     sense_signal,
     simulate_axis,
     simulate_batch,
@@ -174,7 +174,7 @@ class Model:
                         ParameterSpec("hidden", each.key, str(i), r) for i in range(len(each.term.hidden_state_scales))
                     ]
             for output in run.outputs:
-                if output.kind == "angle":
+                if output.kind != "sense":
                     free.append(ParameterSpec("gain", output.name, "gain", r))
                 free += [ParameterSpec("additive", output.name, name, r) for name in self.additive_terms(output)]
         return free
@@ -182,7 +182,7 @@ class Model:
     def additive_terms(self, output: Output) -> dict[str, Array]:
         """Waveforms that may add to a channel whatever the motion, each shape (n,): an unstated offset, and hum."""
         found = {}
-        if output.kind == "angle" or not isinstance(readout_of(self.device, output.axes[0]), Amdm):
+        if output.kind != "sense" or not isinstance(readout_of(self.device, output.axes[0]), Amdm):
             found["offset"] = np.full(output.data.size, OFFSET_RELATIVE_SD * output.data.std())
         if output.kind == "sense":
             noise = output.noise_sd or 0.0
@@ -271,7 +271,7 @@ class Model:
                 at, shapes = self._pre_saturation_basis.get((r, output.name), _EMPTY_BASIS)
                 signals.append(sense_signal(readout, seen, x[at] @ shapes[:, : seen[0].angle.size] if at else 0.0))
             else:
-                signals.append(angle_signal(seen[0]))
+                signals.append(reference_signal(seen[0], output.kind))
         return signals
 
     def trajectories(self, run: Run, r: int, axes: dict[str, Axis], added: dict[str, tuple[ActiveTerm, ...]], x: Array,
@@ -402,9 +402,9 @@ def nominal_parameters(device: Device, axis: str) -> list[tuple[str, float | tup
 def _readout_keys(readout: Readout | None) -> tuple[str, ...]:
     if readout is None:
         return ()
-    return {"amdm": ("a_cir", "b_cir", "lpf_hz"), "transimpedance": ("R_s",), "position": ("gain", "offset")}[
-        readout.kind
-    ]
+    if isinstance(readout, MotionSensor):
+        return "gain", "offset"
+    return ("a_cir", "b_cir", "lpf_hz") if isinstance(readout, Amdm) else ("R_s",)
 
 
 def _motion_terms(added: Iterable[ActiveTerm]) -> tuple[ActiveTerm, ...]:

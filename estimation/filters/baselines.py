@@ -9,7 +9,14 @@ import numpy as np
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
 from estimation.initial import fit_initial_motion
 from estimation.reference import PhaseReference, absolute_reference, dominant_frequency
-from estimation.signals import intensity_clock, is_capacitive, phase_reference, sense_channels
+from estimation.signals import (
+    NOISE_SAMPLES,
+    intensity_clock,
+    is_capacitive,
+    phase_reference,
+    sense_channels,
+    white_noise_sd,
+)
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
 from scanner.device import Axis, Device, Position
@@ -20,10 +27,6 @@ from scanner.recording import Recording
 
 CONSTANT_POINTS = 200
 """Points of the slow clock of a constant motion: only a chirped drive's frequency changes along it."""
-
-WHITE_NOISE_DIFFERENCE_ORDER = 6
-"""Order of the differences by which a sensor's noise is measured: sixth differences suppress an oversampled motion
-completely, and of white noise they have sqrt(924) times the standard deviation."""
 
 
 def estimate_constant(recording: Recording, device: Device) -> Motion:
@@ -122,8 +125,7 @@ def axis_motion_from_angle(
         )
     amplitude = np.abs(phasors)
     if noise_sd is None:
-        differences = np.diff(angle[: 1 << 18], n=WHITE_NOISE_DIFFERENCE_ORDER)
-        noise_sd = float(np.median(np.abs(differences)) / 0.6745 / np.sqrt(924.0))
+        noise_sd = white_noise_sd(angle[:NOISE_SAMPLES])
     phase = unwrap_phase(np.angle(phasors) - reference.phase(time))
     return AxisMotion(
         time=time,

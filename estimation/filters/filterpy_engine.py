@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from estimation.filters.inputs import FilterInput
-from estimation.filters.model import FilterModel, axis_capacitance, axis_step
+from estimation.filters.model import MOTION_ORDER, FilterModel, axis_capacitance, axis_step
 from estimation.filters.run import process_noise_covariances
 from scanner.arrays import Array
 
@@ -60,7 +60,7 @@ def predict_measurement(model: FilterModel, x: Array) -> Array:
     elif model.kind == "transimpedance":
         sensed = axis_capacitance(x[0], *model.parameters[0])[1] * x[1]
     else:
-        sensed = x[0]
+        sensed = x[MOTION_ORDER[model.kind]]
     return np.array([model.gain * sensed + model.offset])
 
 
@@ -76,7 +76,7 @@ def measurement_jacobian(model: FilterModel, x: Array) -> Array:
         _, slope, curvature = axis_capacitance(x[0], *model.parameters[0])
         H[0, :2] = model.gain * curvature * x[1], model.gain * slope
     else:
-        H[0, 0] = model.gain
+        H[0, MOTION_ORDER[model.kind]] = model.gain
     return H
 
 

@@ -30,7 +30,7 @@ from estimation.filters.codegen import (
     sum_source,
     symmetric_entry,
 )
-from estimation.filters.model import AXIS_PARAMETERS, FilterModel
+from estimation.filters.model import AXIS_PARAMETERS, MOTION_ORDER, FilterModel
 
 LARGE = "1e150"
 """A product of innovation variances that exceeds this is divided by it, so that it does not overflow."""
@@ -185,7 +185,8 @@ def _ekf(axes: int, kind: str, sections: int) -> str:
         predicted, H = "gain * c0_d * x1 + offset", {0: "H0", 1: "H1"}
         lines += ["H0 = gain * c0_dd * x1", "H1 = gain * c0_d"]
     else:
-        predicted, H = "gain * x0 + offset", {0: "gain"}
+        order = MOTION_ORDER[kind]
+        predicted, H = f"gain * x{order} + offset", {order: "gain"}
     lines += [f"h{i} = {sum_source(product_source(symmetric_entry('p', i, j), H[j]) for j in H)}" for i in range(n)]
     lines.append(f"hph = {sum_source(product_source(H[j], f'h{j}') for j in H)}")
     joseph = [
@@ -252,7 +253,7 @@ def _ukf(axes: int, kind: str, sections: int) -> str:
         elif kind == "transimpedance":
             measured[point] = f"gain * {at('d0', moved(1, point))} * {at('t1', moved(1, point))} + offset"
         else:
-            measured[point] = f"gain * {at('t0', moved(1, point))} + offset"
+            measured[point] = f"gain * {at(f't{MOTION_ORDER[kind]}', moved(1, point))} + offset"
     used = points if kappa else points[1:]
 
     def state(i: int, point: tuple[int, int]) -> str:

@@ -17,7 +17,7 @@ from numba import njit
 
 from estimation.filters.fast_capacitance import gaussian_capacitance
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, Capacitance, Device, Position, Readout
+from scanner.device import Acceleration, Amdm, Axis, Capacitance, Device, MotionSensor, Position, Readout, Velocity
 from scanner.errors import DeviceInvalid
 from scanner.laws import electrostatic_torque
 from scanner.lowpass import section_coefficients
@@ -29,6 +29,9 @@ AXIS_PARAMETERS = (
 """Parameters of one axis, in the order in which ``axis_capacitance`` and ``axis_step`` take them: the free motion over
 a sample, exp([[0, 1], [-k/J, -b/J]] Ts); Ts / (2 J) [s / (kg m2)]; 1 for an electrostatic drive, 0 for a linear one;
 torque per volt of a linear drive [N m/V]; the capacitance [F, F, 1/rad, rad]."""
+
+MOTION_ORDER = {Position.kind: Position.order, Velocity.kind: Velocity.order}
+"""Which of an axis's states (theta, omega) a sensor of the motion measures, by the kind of the readout."""
 
 SECTION_ERROR_RATIO = 1e-6
 """Standard deviation of a low-pass section's error in one sample, relative to C0: its input is taken as linear between
@@ -86,12 +89,12 @@ class FilterModel:
 
     Attributes:
         axes: names, in the order of the state.
-        kind: of the readout: ``"amdm"``, ``"transimpedance"`` or ``"position"``.
+        kind: of the readout: ``"amdm"``, ``"transimpedance"``, ``"position"`` or ``"velocity"``.
         step: sampling interval [s].
         parameters: ``AXIS_PARAMETERS`` of each axis, shape (axes, 11).
         sections: (e, p, q) of each low-pass section, shape (sections, 3).
-        gain, offset: of the readout: a_cir [V/F] and b_cir [V]; -R_s V_bias [ohm V] and 0; or gain [V/rad] and
-            offset [V].
+        gain, offset: of the readout: a_cir [V/F] and b_cir [V]; -R_s V_bias [ohm V] and 0; or gain [V/rad, V s/rad]
+            and offset [V].
         noise_var: of the measurement [V^2].
         section_noise: variance that each section gains a step [F^2], see ``SECTION_ERROR_RATIO``.
     """
@@ -132,7 +135,11 @@ def filter_model(
         case Amdm():
             sections = np.array([section_coefficients(cutoff, step) for cutoff in readout.lpf_hz]).reshape(-1, 3)
             gain, nominal_offset = readout.a_cir, readout.b_cir
-        case Position():
+        case Acceleration():
+            hint = "choose the tracker"
+            what = "an acceleration readout is not a function of the filter's state"
+            raise DeviceInvalid(what, file=device.source, channel="readout", hint=hint)
+        case MotionSensor():
             sections, gain, nominal_offset = np.empty((0, 3)), readout.gain, readout.offset
         case _:
             sections, gain, nominal_offset = np.empty((0, 3)), -readout.R_s * readout.V_bias, 0.0
@@ -159,7 +166,7 @@ def axis_parameters(axis: Axis, step: float, readout: Readout) -> list[float]:
 
     mechanics, drive = axis.require_mechanics(), axis.require_drive()
     free_motion = expm(np.array([[0.0, 1.0], [-mechanics.k / mechanics.J, -mechanics.b / mechanics.J]]) * step)
-    if drive.kind == "electrostatic" or not isinstance(readout, Position):
+    if drive.kind == "electrostatic" or not isinstance(readout, MotionSensor):
         capacitance = axis.require_capacitance()
         shape = [capacitance.C0, capacitance.Cb, 1.0 / capacitance.theta0, capacitance.theta_th]
     else:

@@ -21,7 +21,7 @@ from estimation.reference import drive_reference
 from scanner.arrays import Array
 from scanner.channel import check_signal
 from scanner.clock import on_clock
-from scanner.device import DEFAULT_TOLERANCE, Amdm, Axis, Device, Position
+from scanner.device import DEFAULT_TOLERANCE, Amdm, Axis, Device, MotionSensor
 from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
@@ -135,7 +135,7 @@ class _AxisIdentification:
                 angle, values[f"drive_{self.name}"], reference.frequency_at(time), clock.rate
             )
         sense = values.get(f"sense_{self.name}")
-        if sense is not None and not isinstance(self.axis.require_readout(), Position):
+        if sense is not None and not isinstance(self.axis.require_readout(), MotionSensor):
             found = fit_capacitance_profile(self.axis, angle, sense, clock.rate, frequency).values
             self.values = combine_values([self.values, found])
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from estimation.least_squares import fit_linear
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, Capacitance, Mechanics, Position, Transimpedance
+from scanner.device import Amdm, Axis, Capacitance, Mechanics, MotionSensor, Transimpedance
 from scanner.errors import BadInput
 from scanner.integrator.trajectories import integrate
 from scanner.laws import capacitance, capacitance_slope, electrostatic_torque
@@ -286,8 +286,8 @@ def fit_capacitance_profile(
     from scipy.signal import savgol_filter
 
     comb, readout = axis.require_capacitance(), axis.require_readout()
-    if isinstance(readout, Position):
-        raise BadInput("a position readout does not see the capacitance", channel=f"sense_{axis.name}")
+    if isinstance(readout, MotionSensor):
+        raise BadInput(f"a {readout.kind} readout does not measure the capacitance", channel=f"sense_{axis.name}")
     window = max(7, 2 * round(rate / frequency / 24) + 1)
     theta = savgol_filter(angle, window, min(4, window - 2))
     omega = savgol_filter(angle, window, min(4, window - 2), deriv=1, delta=1 / rate)

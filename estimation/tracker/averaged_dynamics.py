@@ -23,7 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from estimation.filters.fast_capacitance import gaussian_capacitance
-from scanner.device import Axis, Position, Readout
+from scanner.device import Axis, MotionSensor, Readout
 
 POINTS_PER_CYCLE = 32
 """Points at which a cycle is evaluated. Fourier coefficients are free of aliasing for harmonics below the 16th."""
@@ -54,7 +54,7 @@ class AxisParameters(NamedTuple):
         torque_per_volt: of a linear drive [N m/V], 0 for an electrostatic one.
         drive_order: harmonic of the reference that is the drive's fundamental: 2 where psi is half the drive's phase
             (parametric drive), else 1.
-        is_position: whether the readout measures the angle itself.
+        is_position: whether the readout follows the angle or one of its derivatives.
     """
 
     J: float
@@ -77,7 +77,7 @@ def axis_parameters(axis: Axis, readout: Readout) -> AxisParameters:
         DeviceInvalid: a needed value is missing.
     """
     mechanics, drive = axis.require_mechanics(), axis.require_drive()
-    electrostatic, is_position = drive.kind == "electrostatic", isinstance(readout, Position)
+    electrostatic, is_position = drive.kind == "electrostatic", isinstance(readout, MotionSensor)
     comb = (0.0, 0.0, 1.0, 0.0)
     if electrostatic or not is_position:
         law = axis.require_capacitance()
@@ -102,7 +102,7 @@ class CycleAverage(NamedTuple):
         by_phase, by_log: derivatives of r by phi and by ln A [1/s].
         by_stiffness, by_damping: derivatives of r by relative changes of k and b [1/s].
         motion_harmonics: h_n in theta = A sin u + sum of Re(h_n exp(i n u)), shape (MAX_MOTION_HARMONIC + 1,) [rad].
-        readout_harmonics: the same for the capacitance [F] or, of a position readout, the angle [rad], shape
+        readout_harmonics: the same for the capacitance [F] or, of a sensor of the motion, the angle [rad], shape
             (MAX_READOUT_HARMONIC + 1,).
         readout_by_log: derivative of readout_harmonics by ln A.
         mean_curvature: second derivative of the readout's mean by ln A.

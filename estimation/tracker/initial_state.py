@@ -15,7 +15,7 @@ from estimation.tracker.observations import BlockObservations
 from estimation.tracker.process_noise import INITIAL_DENSITIES
 from estimation.tracker.state_space import AXIS_STATES, LOG_AMPLITUDE, MIN_AMPLITUDE_THETA0, PHASE
 from scanner.arrays import Array
-from scanner.device import Amdm, Device, Position
+from scanner.device import Amdm, Device, MotionSensor
 
 RELATIVE_STIFFNESS_SD = 0.003
 """Change of stiffness since the calibration, beside its tolerance: that of silicon for 50 K (-60 ppm/K)."""
@@ -26,8 +26,8 @@ RELATIVE_DAMPING_SD = 0.05
 STIFFNESS_RATE_SD_PER_S = 0.3
 """Rate of the relative stiffness at the beginning [1/s]: 0.3 % within 10 ms, a fast warming-up."""
 
-RELATIVE_POSITION_GAIN_SD = 1e-4
-"""Gain of a position readout: small, because its angle is the reference for the amplitude."""
+RELATIVE_SENSOR_GAIN_SD = 1e-4
+"""Gain of a sensor of the motion: small, because its signal is the reference for the amplitude."""
 
 OFFSET_SD_V = 1.0
 """Offset of the readout [V]: unknown on the scale of the signals."""
@@ -47,8 +47,8 @@ def initial_estimate(observations: BlockObservations, device: Device) -> StateEs
     for a, name in enumerate(observations.sense.axes):
         at = a * AXIS_STATES
         x[at + LOG_AMPLITUDE] = np.log(MIN_AMPLITUDE_THETA0 * observations.parameters[a].theta0)
-        if isinstance(readout, Position):
-            gain = RELATIVE_POSITION_GAIN_SD
+        if isinstance(readout, MotionSensor):
+            gain = RELATIVE_SENSOR_GAIN_SD
         else:
             factor = "a_cir" if isinstance(readout, Amdm) else "R_s"
             gain = np.hypot(device.tolerance(name, factor), device.tolerance(name, "C0"))
@@ -60,7 +60,7 @@ def initial_estimate(observations: BlockObservations, device: Device) -> StateEs
             np.hypot(device.tolerance(name, "b"), RELATIVE_DAMPING_SD),
             gain,
         ])  # fmt: skip
-    x[-1] = readout.b_cir if isinstance(readout, Amdm) else readout.offset if isinstance(readout, Position) else 0.0
+    x[-1] = readout.b_cir if isinstance(readout, Amdm) else readout.offset if isinstance(readout, MotionSensor) else 0.0
     variance[-1] = OFFSET_SD_V**2
     acquired = np.array([_detect_motion(signal, a, x) for a in range(len(observations.parameters))])
     return StateEstimate(x, np.diag(variance), acquired)
@@ -105,7 +105,7 @@ def resolve_signs(observations: BlockObservations, start: StateEstimate) -> tupl
     """
     axes = len(observations.parameters)
     if not is_capacitive(observations.sense.readout):
-        return start, ["known: position readout"] * axes
+        return start, [f"known: {observations.sense.readout.kind} readout"] * axes
     if not (observations.signal.lines[:, 1] % 2).any():
         return start, ["ambiguous"] * axes
     signal = select_blocks(observations.signal, 0, SIGN_TEST_BLOCKS)

@@ -59,8 +59,8 @@ AMPLITUDE_TABLE_SIZE = 400
 MAX_AMPLITUDE_THETA0 = 1.6
 """Largest amplitude of the table in units of theta0; the second line of a Gaussian comb has its maximum before it."""
 
-POSITION_HARMONICS = 3
-"""Harmonics used of a position readout: the fundamental, and the next two, which a nonlinear suspension adds."""
+MOTION_SENSOR_HARMONICS = 3
+"""Harmonics used of a sensor of the motion: the fundamental, and the next two, which a nonlinear suspension adds."""
 
 MODEL_ERROR_RATIO = 3e-3
 """Standard deviation of the model error within a block, over the signal's rms: bounds the assumed noise from below."""
@@ -260,7 +260,7 @@ def _usable_lines(axes: Sequence[Axis], sense: SenseChannel, w: Array, rate: flo
             even = axis.require_capacitance().theta_th == 0.0
             orders = range(2 if even else 1, MAX_READOUT_HARMONIC + 1, 2 if even else 1)
         else:
-            orders = range(1, POSITION_HARMONICS + 1)
+            orders = range(1, MOTION_SENSOR_HARMONICS + 1)
         found += [(i, n) for n in orders if n * w[:, i].max() < 2 * np.pi * MAX_LINE_RATE_RATIO * rate]
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 

@@ -12,6 +12,7 @@ A mapping (TOML) states for each channel the variable, its unit and its clock; i
     start = 0.0                     # s
     scale = 1.0                     # channel = scale * variable + offset
     offset = 0.0
+    row = 0                         # of a matrix whose rows are signals
 
     [device.x.readout]              # the device as in a device file, below [device]
     ...
@@ -28,7 +29,7 @@ from types import MappingProxyType
 from typing import Any
 
 from recon.io.readers import read
-from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock
+from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock, matrix_row
 from scanner.channel import Channel, make_channel
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -38,7 +39,7 @@ from scanner.recording import Recording
 
 TEXT_KEYS = ("format", "name", "notes", "acquired")
 MAPPING_KEYS = (*TEXT_KEYS, "channels", "device")
-CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "offset")
+CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "offset", "row")
 
 Plan = Mapping[str, Any]
 """Content of a mapping file."""
@@ -195,10 +196,13 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
         if value is None:
             because = f", and the file states none{f' ({variable.note})' if variable.note else ''}"
             raise bad(f"says no {key} of variable {spec['variable']!r}{because}", f"add {key} = ...; {holds}")
+    raw = flatten_row(variable.raw)
+    if "row" in spec:
+        if raw.ndim != 2 or spec["row"] not in range(raw.shape[0]):
+            raise bad(f"there is no row {spec['row']!r} of {spec['variable']!r}", f"count from 0; {holds}")
+        raw = matrix_row(raw, spec["row"])
     file = f"{source} by {plan_source}"
-    return make_channel(
-        name, flatten_row(variable.raw), unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file
-    )
+    return make_channel(name, raw, unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file)
 
 
 def _clock(times: Variable, name: str, bad: Any) -> tuple[float, float]:

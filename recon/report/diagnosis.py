@@ -33,7 +33,7 @@ EXCLUDED_NEG2_LOG_EVIDENCE, UNLIKELY_NEG2_LOG_EVIDENCE = 10.0, 6.0
 MAX_SHOWN_DIFFERENCE = 1000.0
 """Differences in -2 log evidence above this are shown as "more than 1000": the number has no further meaning."""
 
-UNITS = {"sense": "V", "angle": "rad"}
+UNITS = {"sense": "V", "angle": "rad", "velocity": "rad/s", "acceleration": "rad/s²"}
 """Unit of a channel by its kind."""
 
 

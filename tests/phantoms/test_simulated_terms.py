@@ -45,7 +45,7 @@ def stated(device: Device, term: Term, axis: str = "x") -> Device:
 
 
 def recorded(device: Device) -> dict[str, np.ndarray]:
-    plan = Plan(DRIVES, DURATION, RATE, angles=True)
+    plan = Plan(DRIVES, DURATION, RATE, references=("angle",))
     recording, truth = simulate(device, plan, SCENE, start=START)
     channels = {name: channel.read() for name, channel in recording.channels.items() if "drive" not in name}
     return channels | {f"truth_{axis}": truth[f"angle_{axis}"][0] for axis in "xy"}

@@ -12,6 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scanner.device import (
+    READOUTS,
+    Acceleration,
     Amdm,
     Axis,
     Capacitance,
@@ -21,6 +23,7 @@ from scanner.device import (
     Position,
     Scan,
     Transimpedance,
+    Velocity,
 )
 from scanner.errors import BadInput, DeviceInvalid
 
@@ -62,7 +65,7 @@ numbers = st.dictionaries(words, finite, max_size=3)
 readouts = st.one_of(
     st.builds(Amdm, nonzero, finite, st.lists(positive, max_size=3).map(tuple), not_negative, bits),
     st.builds(Transimpedance, positive, nonzero, not_negative, bits),
-    st.builds(Position, nonzero, not_negative, finite, bits),
+    *(st.builds(sensor, nonzero, not_negative, finite, bits) for sensor in (Position, Velocity, Acceleration)),
 )
 drives = st.just(Drive("electrostatic")) | st.builds(Drive, st.just("linear"), nonzero)
 extras = st.dictionaries(
@@ -164,8 +167,8 @@ def test_tolerance_defaults_to_the_shared_one_and_then_to_two_percent() -> None:
             "x.drive.torque_per_volt: is missing; a linear drive needs it [N m / V]",
         ),
         (('kind = "electrostatic"', ""), "x.drive.kind: is missing; [x.drive] needs kind"),
-        (('"amdm"', '"a"'), "x.readout.kind: 'a' is unknown; known kinds: amdm, transimpedance, position"),
-        (('kind = "amdm"', ""), "x.readout.kind: is missing; known kinds: amdm, transimpedance, position"),
+        (('"amdm"', '"a"'), f"x.readout.kind: 'a' is unknown; known kinds: {', '.join(READOUTS)}"),
+        (('kind = "amdm"', ""), f"x.readout.kind: is missing; known kinds: {', '.join(READOUTS)}"),
         (("[40800.0, 41100.0]", "40800.0"), "x.readout.lpf_hz: is 40800.0 and must be a list of numbers"),
         (("41100.0]", "-1]"), "x.readout.lpf_hz: is -1 and must be a number greater than 0"),
         (("noise_var = 1.92e-4", "noise_var = -1"), "x.readout.noise_var: is -1 and must be a number, 0 or greater"),

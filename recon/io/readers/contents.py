@@ -83,6 +83,11 @@ def flatten_row(raw: SampleSource) -> SampleSource:
     return LazySamples(raw.shape[1:], raw.dtype, lambda first, stop: raw[0:1][0, first:stop])
 
 
+def matrix_row(raw: SampleSource, row: int) -> SampleSource:
+    """Row of a matrix of shape (signals, n), as samples of shape (n,) that are read when they are sliced."""
+    return LazySamples(raw.shape[1:], raw.dtype, lambda first, stop: raw[row : row + 1][0, first:stop])
+
+
 def normalise_unit(unit: str) -> str | None:
     """A unit as a recording spells it; an unknown unit unchanged; None for an empty text."""
     return UNIT_SPELLINGS.get(unit.strip().lower(), unit.strip()) or None

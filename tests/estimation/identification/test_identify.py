@@ -202,7 +202,7 @@ def calibration(folder) -> list:
     )
     paths = []
     for f in (31450.0, 31530.0):
-        plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.01, RATE, settle=0.04, angles=True)
+        plan = Plan({"x": Sine(f, 30.0, 30.0)}, 0.01, RATE, settle=0.04, references=("angle",))
         recording, _ = simulate(true, plan, seed=int(f), nominal=DRIVEN)
         paths.append(folder / f"{f:.0f}.h5")
         recording.write(paths[-1])

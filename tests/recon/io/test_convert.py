@@ -328,3 +328,14 @@ def test_an_instruments_file_gives_the_same_picture_as_the_recording(tmp_path: P
     assert main([*mapped, *common, str(tmp_path / "theirs")]) == 0
     from_recording, from_mapping = (tifffile.imread(tmp_path / name / "image.tif") for name in ("ours", "theirs"))
     np.testing.assert_array_equal(from_recording, from_mapping)
+
+
+def test_a_row_of_a_matrix_is_a_channel(tmp_path: Path) -> None:
+    rows = np.arange(30.0).reshape(3, 10)
+    np.savez(tmp_path / "a.npz", rows=rows)
+    spec = {"variable": "rows", "unit": "V", "sample_rate": 10.0, "row": 1}
+    with convert(tmp_path / "a.npz", {"channels": {"sense_x": spec}}) as made:
+        assert np.array_equal(made["sense_x"].read(2, 5), rows[1, 2:5])
+    for row in (3, -1, "first"):
+        with pytest.raises(BadInput, match=f"no row {row!r} of 'rows'; count from 0"):
+            convert(tmp_path / "a.npz", {"channels": {"sense_x": spec | {"row": row}}})
