@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from scanner.errors import BadInput, ChannelMissing
 from scanner.lock_in import block_length, block_phasors, unwrap_phase
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
+
+MIN_BLOCKS = 2
+"""Blocks that a motion's slow clock has at least."""
 
 CONSTANT_POINTS = 200
 """Points of the slow clock of a constant motion: only a chirped drive's frequency changes along it."""
@@ -71,7 +75,7 @@ def estimate_from_sensor(recording: Recording, device: Device) -> Motion:
         channel, scale, zero, noise_sd = find_position_signal(recording, axis, name)
         check_signal(channel)
         angle = (channel.read() - zero) / scale
-        reference = reference_from_drive_or_signal(recording, device, name, channel)
+        reference = reference_of_any_waveform(recording, device, name, channel)
         axes[name] = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
     return Motion(axes, "sensor", {})
 
@@ -100,6 +104,20 @@ def reference_from_drive_or_signal(recording: Recording, device: Device, name: s
     return absolute_reference(dominant_frequency(channel, *band), channel.start, channel.end)
 
 
+def reference_of_any_waveform(recording: Recording, device: Device, name: str, channel: Channel) -> PhaseReference:
+    """The phase reference of one axis whose motion may be slow or no sine: a spiral, a raster, a step.
+
+    It is that of :func:`reference_from_drive_or_signal`, else the strongest line of the position signal, else a
+    frequency that makes the whole recording ``MIN_BLOCKS`` blocks of the slow clock. The angle does not depend on it.
+    """
+    lowest = MIN_BLOCKS * (BLOCK_CYCLES + 1.0) * channel.sample_rate / channel.size
+    with suppress(BadInput):
+        return reference_from_drive_or_signal(recording, device, name, channel)
+    with suppress(BadInput):
+        return absolute_reference(max(dominant_frequency(channel), lowest), channel.start, channel.end)
+    return absolute_reference(lowest, channel.start, channel.end)
+
+
 def axis_motion_from_angle(
     angle: Array, channel: Channel, reference: PhaseReference, noise_sd: float | None, clock: tuple[float, float, int]
 ) -> AxisMotion:
@@ -116,7 +134,7 @@ def axis_motion_from_angle(
     rate = channel.sample_rate
     block = block_length(reference.frequency, rate, BLOCK_CYCLES)
     time, phasors = block_phasors(angle, rate, channel.start, reference.frequency, block)
-    if time.size < 2:
+    if time.size < MIN_BLOCKS:
         raise BadInput(
             f"is too short to tell its phase: {2 * block} samples are needed",
             file=channel.file,

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from estimation.estimate import estimate
 from estimation.estimators import estimators, register, registered
 from recon.cli import main
 from scanner import terms
-from scanner.device import Device
+from scanner.device import Axis, Device, Drive, Mechanics, Position
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
@@ -110,3 +111,32 @@ def test_the_catalogue_loads_no_library_that_the_estimators_compute_with() -> No
         "assert not {'scipy.signal', 'filterpy', 'estimation.filters.run', 'estimation.tracker'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
+
+
+def slow_scan(waveform: str, driven: bool) -> tuple[Recording, dict[str, np.ndarray]]:
+    """A stage of 800 Hz resonance that is moved far below it, and its angles [rad]."""
+    time = np.arange(40_000) / 20e3
+    radius, turn = 0.05 * time / time[-1], 2 * np.pi * 20.0 * time
+    angles = {"x": radius * np.cos(turn), "y": radius * np.sin(turn)}
+    if waveform == "raster":
+        angles = {"x": 0.05 * (2.0 * np.abs(2.0 * (20.0 * time % 1.0) - 1.0) - 1.0), "y": 0.05 * (time - 1.0)}
+    rng = np.random.default_rng(3)
+    mechanics = Mechanics(1e-9, 1e-9 * 2 * np.pi * 800.0 / 20.0, 1e-9 * (2 * np.pi * 800.0) ** 2)
+    axis = Axis(mechanics, drive=Drive("linear", 1e-6), readout=Position(10.0, 1e-3, 0.1))
+    channels = {}
+    for name, angle in angles.items():
+        channels[f"sense_{name}"] = (10.0 * angle + 0.1 + rng.normal(0.0, 1e-3, time.size), "V", 20e3, 0.0)
+        if driven:
+            channels[f"drive_{name}"] = (100.0 * angle, "V", 20e3, 0.0)
+    device = Device("stage", {name: replace(axis, name=name) for name in angles})
+    return Recording.from_arrays(channels, device), angles
+
+
+@pytest.mark.parametrize("driven", [True, False])
+@pytest.mark.parametrize("waveform", ["spiral", "raster"])
+def test_sensor_takes_position_samples_as_they_are_whatever_the_waveform(waveform: str, driven: bool) -> None:
+    recording, angles = slow_scan(waveform, driven)
+    motion = estimate(recording, method="sensor")
+    for name, angle in angles.items():
+        assert np.abs(motion.axes[name].angle.read() - angle).max() < 6e-4  # six times the noise
+        assert motion.axes[name].sign == f"known: sense_{name}"
