@@ -25,6 +25,7 @@ COMMANDS = {
     "identify": "find a device's constants from recordings at rest, ringing down and driven",
     "predict": "play a recording's drive through a device and compare",
     "diagnose": "locate, name and model what the nominal device leaves out",
+    "bidirectional": "measure and correct the line phase of a resonant raster film",
     "design": "find drive frequencies for a wanted field, resolution, frame rate and fill",
     "blur-study": "compare phantoms, scans, drifts, noise, estimators, resolutions and p in one table",
     "new-device": "write a commented device file for a kind of scanner",

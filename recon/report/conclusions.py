@@ -184,6 +184,20 @@ def conclude_many(summary: Mapping[str, Any]) -> str:
     return text
 
 
+def conclude_bidirectional(summary: Mapping[str, Any]) -> str:
+    """How far the lines of the two directions lay apart, and what the correction leaves."""
+    shift, rms = summary["shift_px"], summary["rows_rms"]
+    phase = summary["phase_deg"]
+    text = f"The lines of the two directions lay {shift['median']:+.3f} ± {shift['sd']:.3f} pixels apart"
+    if summary["frames"] > 1:
+        text += f" (between {shift['min']:+.3f} and {shift['max']:+.3f} over {summary['frames']} frames)"
+    text += "; the lag is the same in all columns" if phase is None else f", a phase error of {_degrees(abs(phase))}"
+    return (
+        f"{text}. Lines differed from their neighbours by {rms['recorded']:.3g} rms and differ by "
+        f"{rms['corrected']:.3g} in corrected.tif."
+    )
+
+
 def _degrees(value: float) -> str:
     return f"{value:.2g}°" if value < 1.0 else f"{value:.2f}°"
 

@@ -1,0 +1,262 @@
+"""Line phase of every frame of a film, and the film corrected by it, frame by frame."""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from recon.imaging.film_phase import MAX_SHIFT_SD_PX, FilmModel, fit_film, frame_phase, smooth_phases
+from recon.imaging.line_phase import BLOCKS_ACROSS
+from recon.imaging.line_shift import correct_frame, to_dtype
+from recon.io.film import Film, write_film
+from recon.io.output import finite
+from scanner.arrays import Array
+from scanner.errors import BadInput
+
+SAMPLED_FRAMES = 16
+"""Frames, spread over the film, that determine what all frames share."""
+
+MIN_SIDE_PX = 2 * BLOCKS_ACROSS
+"""Least number of lines and columns: two in each of the blocks whose scatter gives the standard error."""
+
+
+@dataclass(frozen=True)
+class CorrectedFilm:
+    """Line phase of a film and the account of its correction.
+
+    Attributes:
+        film: as recorded.
+        model: what the frames share.
+        shift, sd: of each frame after smoothing over time [px], shape (frames,).
+        measured, measured_sd: of each frame by itself [px]; (nan, inf) where it determines none.
+        before, after: picture of one frame as recorded and corrected, summed over channels, shape (rows, columns).
+        rows_rms: root mean square of the lines less the mean of their neighbours in the sampled frames: as recorded,
+            corrected, and corrected by the same shift in all columns.
+        counts: totals of the film, of the corrected film, and of what lay beyond the border.
+        clipped: pixels that did not fit into the film's type.
+        means: the pixels hold means, and no totals are kept.
+        seconds: computing time.
+    """
+
+    film: Film
+    model: FilmModel
+    shift: Array
+    sd: Array
+    measured: Array
+    measured_sd: Array
+    before: Array
+    after: Array
+    rows_rms: tuple[float, float, float]
+    counts: tuple[float, float, float]
+    clipped: int
+    means: bool
+    seconds: float
+
+    @property
+    def undetermined(self) -> int:
+        """Number of frames that do not determine their own phase."""
+        return int(np.count_nonzero(~np.isfinite(self.measured)))
+
+    def write_phases(self, path: Path) -> None:
+        """Write phase.csv: a line a frame."""
+        columns = (self.shift, self.sd, self.measured, self.measured_sd)
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["frame", "shift_px", "sd_px", "measured_px", "measured_sd_px"])
+            for k, values in enumerate(zip(*columns, strict=True)):
+                writer.writerow([k, *(f"{value:.5f}" if np.isfinite(value) else "" for value in values)])
+
+    def summary(self) -> dict[str, Any]:
+        """Content of summary.json."""
+        fill = self.model.fill
+        per_degree = np.degrees(fill / self.film.shape[-1]) if fill else None
+        rows, columns = self.film.shape[-2:]
+        content = {
+            "frames": self.film.frames,
+            "channels": self.film.channels,
+            "lines": rows,
+            "columns": columns,
+            "shift_px": {
+                "median": np.median(self.shift),
+                "min": self.shift.min(),
+                "max": self.shift.max(),
+                "sd": np.median(self.sd),
+            },
+            "phase_deg": None if per_degree is None else np.median(self.shift) * per_degree,
+            "lag": "follows the speed of a sinusoidal sweep" if fill else "the same in all columns",
+            "fill_fraction": {"value": fill, "sd": self.model.fill_sd} if fill else None,
+            "rows_rms": dict(zip(("recorded", "corrected", "one_shift_for_all_columns"), self.rows_rms, strict=True)),
+            "values": "means" if self.means else "counts",
+            "counts": None
+            if self.means
+            else dict(zip(("recorded", "corrected", "beyond_border"), self.counts, strict=True)),
+            "undetermined": self.undetermined,
+            "notes": self._notes(),
+            "seconds": self.seconds,
+        }
+        summary: dict[str, Any] = finite(content)
+        return summary
+
+    def _notes(self) -> list[str]:
+        notes, rows = [], self.film.shape[-2]
+        border = int(np.ceil(np.abs(self.shift).max() / 2))
+        if border:
+            data = "NaN or 0" if self.means else "part of the counts"
+            notes.append(
+                f"up to {border} columns at either border were recorded in one direction only ({data} in there)"
+            )
+        if rows % 2:
+            notes.append(
+                f"the number of lines, {rows}, is odd: if frames begin in alternate directions, the shift alternates "
+                "in sign; each frame is corrected by its own"
+            )
+        if self.undetermined:
+            notes.append(
+                f"{self.undetermined} of {self.film.frames} frames do not determine their own phase to "
+                f"{MAX_SHIFT_SD_PX} pixels; they are corrected by that of the frames around them"
+            )
+        if self.clipped:
+            notes.append(
+                f"{self.clipped} pixels of the corrected film did not fit into {self.film.dtype} and are clipped"
+            )
+        return notes
+
+
+def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = False) -> CorrectedFilm:
+    """Measure the line phase of every frame, write the corrected film, and return the account.
+
+    One frame is in memory at a time, besides ``SAMPLED_FRAMES`` at the beginning. The file is read three times.
+
+    Args:
+        film: to correct.
+        output: path of the corrected film (TIFF).
+        means: the pixels hold means over their time, not counts.
+        quiet: show no progress.
+
+    Raises:
+        BadInput: the frames are too small, damaged, or do not determine a line phase.
+    """
+    began = time.perf_counter()
+    rows, columns = film.shape[-2:]
+    if min(rows, columns) < MIN_SIDE_PX:
+        what = f"has frames of {rows} lines of {columns} pixels"
+        raise BadInput(what, file=film.path, hint=f"at least {MIN_SIDE_PX} of each are needed")
+    sampled = np.unique(np.linspace(0, film.frames - 1, min(film.frames, SAMPLED_FRAMES)).round().astype(int))
+    samples = [_as_channels(frame) for frame in film.read(sampled)]
+    try:
+        model = fit_film(samples)
+    except BadInput as error:
+        error.file = film.path
+        raise
+    measured, measured_sd = _measure(film, model, quiet)
+    shift, sd = _smooth(measured, measured_sd, rows)
+    account = _Account()
+    with tqdm(
+        total=film.frames, desc="correct", unit="frame", file=sys.stderr, leave=False, disable=quiet or None
+    ) as bar:
+        write_film(output, film, _corrected_planes(film, shift, model.fill**2, means, account, bar))
+    middle = len(sampled) // 2
+    before: Array = np.asarray(np.sum(samples[middle], axis=0, dtype=np.float64))
+    return CorrectedFilm(
+        film=film,
+        model=model,
+        shift=shift,
+        sd=sd,
+        measured=measured,
+        measured_sd=measured_sd,
+        before=before,
+        after=correct_frame(before, shift[sampled[middle]], model.fill**2, means)[0],
+        rows_rms=_rows_rms(samples, shift[sampled], model.fill**2, means),
+        counts=(account.recorded, account.corrected, account.beyond),
+        clipped=account.clipped,
+        means=means,
+        seconds=time.perf_counter() - began,
+    )
+
+
+@dataclass
+class _Account:
+    """Totals that are added up while the film is written."""
+
+    recorded: float = 0.0
+    corrected: float = 0.0
+    beyond: float = 0.0
+    clipped: int = 0
+
+
+def _as_channels(frame: NDArray[Any]) -> list[NDArray[np.float32]]:
+    return [np.ascontiguousarray(plane, np.float32) for plane in frame]
+
+
+def _measure(film: Film, model: FilmModel, quiet: bool) -> tuple[Array, Array]:
+    """Line phase of each frame by itself and its standard error [px], shape (frames,)."""
+    value, sd, before = np.full(film.frames, np.nan), np.full(film.frames, np.inf), model.typical
+    frames = tqdm(
+        film.read(range(film.frames)),
+        "measure",
+        film.frames,
+        unit="frame",
+        file=sys.stderr,
+        leave=False,
+        disable=quiet or None,
+    )
+    for k, frame in enumerate(frames):
+        phase = frame_phase(_as_channels(frame), model, before)
+        value[k], sd[k] = phase
+        if np.isfinite(phase.shift):
+            before = phase.shift
+    return value, sd
+
+
+def _smooth(value: Array, sd: Array, rows: int) -> tuple[Array, Array]:
+    """Smooth over time; frames of an odd number of lines may alternate in direction, and are smoothed apart."""
+    if not np.isfinite(value).any():
+        raise BadInput("no frame determines a line phase")
+    if rows % 2 == 0 or len(value) < 4 or not all(np.isfinite(value[k::2]).any() for k in (0, 1)):
+        return smooth_phases(value, sd)
+    smooth, smooth_sd = np.empty_like(value), np.empty_like(sd)
+    for k in (0, 1):
+        smooth[k::2], smooth_sd[k::2] = smooth_phases(value[k::2], sd[k::2])
+    return smooth, smooth_sd
+
+
+def _corrected_planes(
+    film: Film, shift: Array, fill_squared: float, means: bool, account: _Account, bar: Any
+) -> Iterator[NDArray[Any]]:
+    """Yield the corrected planes in the film's order and type, and add up their totals."""
+    for frame, distance in zip(film.read(range(film.frames)), shift, strict=True):
+        for plane in frame:
+            corrected, beyond = correct_frame(plane, distance, fill_squared, means)
+            written, clipped = to_dtype(corrected, film.dtype, means)
+            account.recorded += float(plane.sum(dtype=np.float64))
+            account.corrected += float(np.nansum(written, dtype=np.float64))
+            account.beyond += beyond
+            account.clipped += clipped
+            yield written
+        bar.update()
+
+
+def _rows_rms(
+    samples: list[list[NDArray[np.float32]]], shift: Array, fill_squared: float, means: bool
+) -> tuple[float, float, float]:
+    """Lines less the mean of their neighbours, rms: recorded, corrected, corrected by one shift for all columns."""
+    border = int(np.ceil(np.abs(shift).max() / 2)) + 1
+    squares: tuple[list[float], ...] = ([], [], [])
+    for frame, distance in zip(samples, shift, strict=True):
+        for plane in frame:
+            versions: list[NDArray[Any]] = [plane]
+            versions += [correct_frame(plane, distance, each, means)[0] for each in (fill_squared, 0.0)]
+            for own, picture in zip(squares, versions, strict=True):
+                inner = picture[:, border:-border]
+                own.append(float(np.mean(np.square(inner[1:-1] - (inner[:-2] + inner[2:]) / 2))))
+    recorded, corrected, constant = (float(np.sqrt(np.mean(each))) for each in squares)
+    return recorded, corrected, constant

@@ -1,0 +1,225 @@
+"""Line phase of a resonant raster frame: how far the lines of the two directions lie apart.
+
+Even lines run forward and odd lines backward, and the instrument has reversed the odd ones. A phase error d of the scan
+moves what lies at x, counted from the middle of a sweep of half width A, by d sqrt(A² - x²) in forward lines and by as
+much the other way in backward ones. With u = 2x/W for a frame of W columns the lines lie
+
+    shift · sqrt(1 - fill² u²)
+
+apart: ``shift`` is 2 d A [px], and ``fill`` = W/(2A) is the fraction of the sweep's width that the columns cover.
+Pixels at equal distances in time show the same shift everywhere, which is ``fill`` = 0.
+
+With f the picture, R its lines moved back by the assumed shift and D_i = (-1)^i (R_i - (R_(i-1) + R_(i+1))/2),
+
+    D = remaining shift · sqrt(1 - fill² u²) ∂f/∂x + tilt · 2u ∂f/∂y + noise.
+
+The second term is the slow axis, which moves on during a line. Both are solved for by Gauss-Newton with the gradient of
+the smoothed picture as instrument: its noise has no correlation with that of D, because its kernel along x is odd.
+The alternating sign leaves only detail at the Nyquist frequency of the lines as an error of the picture itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.arrays import Array
+
+SMOOTHING_SDS_PX = (0.8, 1.6, 3.2)
+"""Standard deviations of the Gaussian that smooths the picture: fine detail in bright films, coarse in dim ones."""
+
+MAX_SHIFT_FRACTION = 0.125
+"""Largest shift that is searched for, as a fraction of the width: that of a phase error of 7°."""
+
+BLOCKS_ACROSS = 8
+"""Blocks along each side of the frame whose scores are treated as independent for the standard error."""
+
+MAX_ITERATIONS = 12
+"""Gauss-Newton steps; three to five are needed from the nearest whole pixel on."""
+
+CONVERGED_PX = 1e-3
+"""Step at which the iteration ends: a twentieth of the accuracy that a bright frame allows."""
+
+MAX_FILL_SQUARED = 0.98
+"""Bound on fill²: at 1 the lag has an infinite slope at the border."""
+
+
+class LinePhase(NamedTuple):
+    """Distance between the lines of the two directions at the middle of the sweep, and its standard error [px].
+
+    (nan, inf) where the frame does not determine it.
+    """
+
+    shift: float
+    sd: float
+
+
+UNDETERMINED = LinePhase(math.nan, math.inf)
+
+
+class ShiftEquations(NamedTuple):
+    """Normal equations of a frame for the remaining shift, the tilt and fill², at an assumed shift.
+
+    Attributes:
+        score: of each block, shape (BLOCKS_ACROSS², 3).
+        slope: change of the score with the parameters, of each block, shape (BLOCKS_ACROSS², 3, 3).
+        column_score, column_slope: of the remaining shift, by band of lines and column, shape (BLOCKS_ACROSS, columns).
+    """
+
+    score: Array
+    slope: Array
+    column_score: Array
+    column_slope: Array
+
+
+def lag_at(u: Array, fill_squared: float) -> Array:
+    """Shift at the places ``u`` relative to the middle of the sweep; u is -1 and 1 at the borders of the frame."""
+    return np.sqrt(np.maximum(1.0 - fill_squared * np.square(u), 0.0))
+
+
+def column_places(columns: int) -> Array:
+    """Places u of the columns' middles, shape (columns,)."""
+    return (2.0 * np.arange(columns) - (columns - 1)) / columns
+
+
+def moved_lines(frame: NDArray[np.float32], shift: float, fill_squared: float) -> NDArray[np.float32]:
+    """The lines read where they show the same place, shape of ``frame``: for estimation, by cubic interpolation."""
+    columns = frame.shape[1]
+    half = 0.5 * shift * lag_at(column_places(columns), fill_squared)
+    moved = np.empty_like(frame)
+    for first, sign in ((0, -1.0), (1, 1.0)):
+        _interpolate_lines(frame[first::2], np.arange(columns) + sign * half, moved[first::2])
+    return moved
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolate_lines(lines, places, out):  # type: ignore[no-untyped-def]
+    """Cubic convolution (Keys 1981) of all lines at the same places; beyond the border the last pixel is repeated."""
+    columns = lines.shape[1]
+    for j in range(columns):
+        at = min(max(places[j], 0.0), columns - 1.0)
+        low = min(int(at), columns - 2)
+        t = at - low
+        before, after = max(low - 1, 0), min(low + 2, columns - 1)
+        w0, w1 = ((-0.5 * t + 1.0) * t - 0.5) * t, (1.5 * t - 2.5) * t * t + 1.0
+        w2, w3 = ((-1.5 * t + 2.0) * t + 0.5) * t, (0.5 * t - 0.5) * t * t
+        for i in range(lines.shape[0]):
+            line = lines[i]
+            out[i, j] = w0 * line[before] + w1 * line[low] + w2 * line[low + 1] + w3 * line[after]
+
+
+def search_shift(frame: NDArray[Any]) -> float:
+    """The whole number of pixels between the directions at which lines and their neighbours correlate most."""
+    rows, columns = frame.shape
+    lines = frame - frame.mean(axis=1, keepdims=True)
+    neighbours = (lines[:-2] + lines[2:]) / 2
+    sign = np.where(np.arange(1, rows - 1) % 2 == 0, 1.0, -1.0)
+    size = 2 * columns
+    spectrum = np.fft.rfft(lines[1:-1], size) * np.conj(np.fft.rfft(neighbours, size))
+    even, odd = spectrum[sign > 0].sum(axis=0), spectrum[sign < 0].sum(axis=0)
+    correlation = np.fft.irfft(even + np.conj(odd), size)
+    reach = max(2, int(MAX_SHIFT_FRACTION * columns))
+    shifts = np.arange(-reach, reach + 1)
+    overlap = columns - np.abs(shifts)
+    return float(shifts[np.argmax(correlation[-shifts] / overlap)])
+
+
+def shift_equations(frame: NDArray[Any], shift: float, fill_squared: float, smoothing: float) -> ShiftEquations:
+    """Normal equations of a frame at an assumed shift; the model is in the module's description.
+
+    Args:
+        frame: shape (rows, columns), float32.
+        shift: assumed [px].
+        fill_squared: assumed.
+        smoothing: standard deviation of the Gaussian that smooths the picture [px].
+    """
+    rows, columns = frame.shape
+    moved = moved_lines(frame, shift, fill_squared)
+    even, odd = (_smoothed_lines(moved, parity, smoothing) for parity in (0, 1))
+    u = column_places(columns)
+    lag = lag_at(u, fill_squared)
+    by_fill = -0.5 * shift * u * u / np.maximum(lag, 0.1)
+    row_block, column_block = (np.arange(size) * BLOCKS_ACROSS // size for size in (rows, columns))
+    score, slope = np.zeros((BLOCKS_ACROSS**2, 3)), np.zeros((BLOCKS_ACROSS**2, 3, 3))
+    column_score, column_slope = np.zeros((BLOCKS_ACROSS, columns)), np.zeros((BLOCKS_ACROSS, columns))
+    _accumulate(moved, even, odd, lag, u, by_fill, row_block, column_block, score, slope, column_score, column_slope)
+    return ShiftEquations(score, slope, column_score, column_slope)
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate(moved, even, odd, lag, u, by_fill, row_block, column_block, score, slope, column_score, column_slope):  # type: ignore[no-untyped-def]
+    rows, columns = moved.shape
+    mean, independent, regressor = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(1, rows - 1):
+        sign = 1.0 if i % 2 == 0 else -1.0
+        own, other = (even, odd) if i % 2 == 0 else (odd, even)
+        for j in range(2, columns - 2):
+            difference = sign * (moved[i, j] - 0.5 * (moved[i - 1, j] + moved[i + 1, j]))
+            own_x, other_x = 0.5 * (own[i, j + 1] - own[i, j - 1]), 0.5 * (other[i, j + 1] - other[i, j - 1])
+            own_y, other_y = 0.5 * (own[i + 1, j] - own[i - 1, j]), 0.5 * (other[i + 1, j] - other[i - 1, j])
+            near, far = moved[i, j + 1] - moved[i, j - 1], moved[i, j + 2] - moved[i, j - 2]
+            raw_x = (8.0 * near - far) / 12.0
+            mean_x, mean_y = 0.5 * (own_x + other_x), 0.5 * (own_y + other_y)
+            mean[0], mean[1], mean[2] = lag[j] * mean_x, u[j] * mean_y, by_fill[j] * mean_x
+            independent[0], independent[1], independent[2] = lag[j] * other_x, u[j] * other_y, by_fill[j] * other_x
+            regressor[0], regressor[1], regressor[2] = lag[j] * raw_x, u[j] * own_y, by_fill[j] * raw_x
+            block = row_block[i] * BLOCKS_ACROSS + column_block[j]
+            for k in range(3):
+                score[block, k] += mean[k] * difference
+                for m in range(3):
+                    slope[block, k, m] += independent[k] * regressor[m]
+            column_score[row_block[i], j] += mean_x * difference
+            column_slope[row_block[i], j] += other_x * raw_x
+
+
+def estimate_line_phase(
+    channels: Sequence[NDArray[Any]], start: float, fill_squared: float, smoothing: float
+) -> LinePhase:
+    """Estimate the distance of the two directions' lines in one frame.
+
+    Args:
+        channels: pictures of the frame by detector, each of shape (rows, columns), float32.
+        start: shift that is right to about a pixel [px].
+        fill_squared: of the scan.
+        smoothing: see ``shift_equations``.
+    """
+    shift, columns = start, channels[0].shape[1]
+    for _ in range(MAX_ITERATIONS):
+        equations = [shift_equations(frame, shift, fill_squared, smoothing) for frame in channels]
+        score = np.sum([each.score[:, :2] for each in equations], axis=0)
+        slope = np.sum([each.slope[:, :2, :2] for each in equations], axis=0)
+        total = slope.sum(axis=0)
+        if not total[0, 0] > 0.0 or not total[1, 1] > 0.0 or not np.linalg.det(total) > 0.0:
+            return UNDETERMINED
+        step = np.linalg.solve(total, score.sum(axis=0))
+        shift += float(np.clip(step[0], -1.0, 1.0))
+        if abs(shift - start) > MAX_SHIFT_FRACTION * columns:
+            return UNDETERMINED
+        if abs(step[0]) < CONVERGED_PX:
+            return LinePhase(shift, float(_standard_errors(score, slope, step)[0]))
+    return UNDETERMINED
+
+
+def _standard_errors(score: Array, slope: Array, step: Array) -> Array:
+    """Standard errors from the scatter of the blocks' scores, shape (parameters,)."""
+    left = score - slope @ step
+    inverse = np.linalg.inv(slope.sum(axis=0))
+    blocks = len(score)
+    return np.sqrt(np.diag(inverse @ (left.T @ left) @ inverse.T) * blocks / (blocks - 2))
+
+
+def _smoothed_lines(lines: NDArray[np.float32], parity: int, smoothing: float) -> NDArray[np.float32]:
+    """The picture of one direction alone, smoothed and interpolated to all lines by normalised convolution."""
+    import cv2
+
+    one, weight = np.zeros_like(lines), np.zeros((len(lines), 1), np.float32)
+    one[parity::2], weight[parity::2] = lines[parity::2], 1.0
+    reach = 2 * math.ceil(4.0 * smoothing) + 1
+    border = cv2.BORDER_REFLECT_101  # keeps the parity of the lines
+    smooth = cv2.GaussianBlur(one, (reach, reach), smoothing, borderType=border)
+    return np.asarray(smooth / cv2.GaussianBlur(weight, (1, reach), smoothing, borderType=border), np.float32)
