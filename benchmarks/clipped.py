@@ -168,7 +168,7 @@ def track_clipped_segment(drifts: int, noises: int) -> dict[str, dict[str, float
 def main() -> None:
     noises = int(sys.argv[1]) if len(sys.argv) > 1 else 40
     print(
-        json.dumps({"stretch": track_clipped_segment(noises // 2, 2), "rails": track_between_rails(noises)}, indent=1)
+        json.dumps({"segment": track_clipped_segment(noises // 2, 2), "rails": track_between_rails(noises)}, indent=1)
     )
 
 

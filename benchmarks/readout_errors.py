@@ -149,7 +149,7 @@ HEADINGS = (
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown table by kind of imperfection; pairs of imperfections are a kind of their own."""
+    """Markdown table by kind of imperfection; pairs of imperfections are a separate kind."""
     lines = [HEADINGS, ("---",) * len(HEADINGS)]
     for kind in ("none", *IMPERFECTIONS, "pairs", "all"):
         chosen = [r for r in rows if kind in ("all", r["kind"]) or (kind == "pairs" and "+" in r["kind"])]

@@ -65,7 +65,7 @@ Results = dict[str, float]
 
 @dataclass(frozen=True)
 class RepeatedSamples:
-    """The samples of one period, repeated. They are copied when they are sliced; a ``Channel`` needs no more.
+    """The samples of one period, repeated. Slicing copies them; that is all that a ``Channel`` requires.
 
     Attributes:
         period: samples, shape (PERIOD_SAMPLES,).

@@ -33,8 +33,8 @@ myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
-autodoc_default_options = {"ignore-module-all": True}  # what a package passes on stands where it is defined
-napoleon_use_ivar = True  # a dataclass has its attributes once, as its docstring tells them
+autodoc_default_options = {"ignore-module-all": True}  # a re-exported name is documented where it is defined
+napoleon_use_ivar = True  # attributes of a dataclass are listed once, from its docstring
 apidoc_separate_modules = True
 apidoc_module_first = True
 apidoc_modules = [
@@ -57,7 +57,7 @@ sphinx_gallery_conf = {
 
 
 def insert_tables(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Put the generated tables into the pages that ask for them."""
+    """Insert the generated tables into the pages that contain their names."""
     from generated_tables import with_tables
 
     source[0] = with_tables(source[0])

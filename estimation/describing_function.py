@@ -33,7 +33,7 @@ DEGENERATE_FREQUENCY_RATIO = 0.05
 axis to the other's frequency is then resonant and no small addition."""
 
 MIN_DAMPING_RATIO = 0.01
-"""Smallest equivalent damping relative to the nominal one, so that a linearised device stays stable."""
+"""Smallest equivalent damping relative to the nominal one, so that a linearised device is always stable."""
 
 
 @dataclass(frozen=True)

@@ -241,7 +241,7 @@ def eliminate_backward(
 
 
 def fit_linear(basis: Array, target: Array) -> tuple[Array, Array]:
-    """Ordinary least squares, with columns scaled to one size so that farads and volts may stand side by side.
+    """Ordinary least squares, with columns scaled to unit norm so that columns of very different units are accurate.
 
     Args:
         basis: shape (n, p). target: shape (n,).

@@ -108,7 +108,7 @@ def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf,
     A few periods of ``low`` are searched first, which is fast.
 
     Raises:
-        BadInput: no line stands out there.
+        BadInput: no line exceeds the noise there.
     """
     window_samples = round(window * channel.sample_rate) if window else MAX_SPECTRUM_SAMPLES
     most = min(channel.size, MAX_SPECTRUM_SAMPLES, window_samples)
@@ -122,7 +122,7 @@ def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf,
 
 
 def _strongest(values: Array, rate: float, low: float, high: float) -> float | None:
-    """Frequency of the strongest line in (low, high) [Hz]; None where none stands out."""
+    """Frequency of the strongest line in (low, high) [Hz]; None if none exceeds the noise."""
     n = values.size
     values = np.nan_to_num(values - np.nanmean(values)) if np.isfinite(values).any() else np.zeros(n)
     padded = 1 << (2 * n - 1).bit_length()  # a power of two: a prime would take six times as long

@@ -137,7 +137,7 @@ def phase_reference(
         return reference
     if sense is None:
         raise ChannelMissing(
-            "is not in the recording and no other channel tells the motion's frequency",
+            "is not in the recording and no other channel determines the frequency of the motion",
             file=recording.path,
             channel=f"drive_{axis}",
             hint="record the drive",

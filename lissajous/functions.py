@@ -48,7 +48,8 @@ class Simulation(NamedTuple):
 
     Attributes:
         recording: what an instrument would have recorded.
-        truth: what only the simulation knows: the true angles (``angle_x``, ``angle_y``), the scene, the drift.
+        truth: the quantities that no recording contains: the true angles (``angle_x``, ``angle_y``), the scene, the
+            drift.
     """
 
     recording: Recording
@@ -219,7 +220,7 @@ def diagnose(
     """Locate, name and model what the nominal device leaves out: motion, readout and, with an intensity, optics.
 
     Args:
-        recordings: one or several of one device; several are judged together.
+        recordings: one or several of one device; several are fitted together.
         device: the nominal one, in place of that of the first recording.
         mapping: needed where the recordings are an instrument's files.
         progress: called with a line of text at every step.
@@ -287,7 +288,7 @@ def predict(
 
 @dataclass(frozen=True)
 class ScanDesign:
-    """Drive frequencies for a wanted scan.
+    """Drive frequencies for a required scan.
 
     Attributes:
         bands: by axis name the motion that the drive sustains against its frequency.
@@ -318,7 +319,7 @@ def design(
     sample_rate: float | None = 5e6,
     margin: float = 0.0005,
 ) -> ScanDesign:
-    """Find drive frequencies whose Lissajous figure fills the picture at the wanted frame rate.
+    """Find drive frequencies whose Lissajous figure fills the picture at the required frame rate.
 
     Args:
         device: whose drives have to sustain the field.
@@ -367,7 +368,7 @@ def blur_study(
 
 
 def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: MappingSource | None) -> Recording:
-    """The recording, opened where a path is given, with ``device`` in place of its own where one is given."""
+    """The recording, opened if a path is given; ``device``, if given, replaces the device of the recording."""
     from recon.io.convert import open_any
 
     if not isinstance(recording, Recording):

@@ -130,7 +130,7 @@ def run_circuit(
 def envelope_section(circuit: AmdmCircuit) -> float:
     """Return the corner of the first-order section by which the high-pass acts on the envelope [Hz].
 
-    The high-pass H(f) = j f / (f_h + j f) stands between the sidebands f_c +- f. To first order in f its unequal gains
+    The high-pass H(f) = j f / (f_h + j f) acts on the sidebands f_c +- f. To first order in f its unequal gains
     turn amplitude into phase modulation, to which a square-law detector does not respond; its unequal phases delay the
     envelope by f_h / (2 pi (f_h^2 + f_c^2)): 0.159 us, 1.8 degrees of the sense signal at 31.4 kHz.
     """

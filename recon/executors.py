@@ -81,7 +81,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _dask_cluster(address: str) -> Iterator[Executor]:
-    """A Dask cluster as an executor. Its scheduler reassigns the jobs of a worker that dies."""
+    """A Dask cluster as an executor. Its scheduler reassigns the jobs of a worker that terminates."""
     try:
         from distributed import Client
         from distributed.scheduler import KilledWorker

@@ -141,7 +141,7 @@ def _waveform(table: object, axis: str, duration: float) -> Waveform:
 def simulate_excitation(excitation: Excitation, device: Device) -> Recording:
     """Simulate the noiseless recording of a device under an excitation.
 
-    On a device with a readout per axis, some axes may stay at rest; they are not recorded.
+    If each axis of the device has its own readout, axes without an excitation are at rest and not recorded.
 
     Raises:
         BadInput: the excitation moves an axis that the device lacks, it omits an axis that shares its readout, or its

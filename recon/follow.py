@@ -41,7 +41,7 @@ from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 MIN_POLL_INTERVAL_S = 0.05
-"""Shortest time between two polls of the file. It bounds the load, and nobody notices so short a delay."""
+"""Shortest time between two polls of the file. It bounds the load; the delay is too short to be noticed."""
 
 MAX_PENDING_FRAMES = 2
 """Complete frames that may wait. One slow frame then delays the next one and drops none."""
@@ -67,7 +67,7 @@ class Snapshot(NamedTuple):
 
     Attributes:
         recording: open while the snapshot is used.
-        ended: why no more samples will come; None while they may.
+        ended: reason why the recording is complete; None while further samples may be written.
     """
 
     recording: Recording

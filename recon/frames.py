@@ -24,7 +24,8 @@ def write_scan_frames(path: Path, result: Reconstruction, options: Options) -> N
     With ``frame_time`` the last frame may be shorter than the others.
 
     Args:
-        path: of the new file, ``frames.ome.tif``; the standard deviations stand beside it in ``frames_sd.ome.tif``.
+        path: of the new file, ``frames.ome.tif``; the standard deviations are written to ``frames_sd.ome.tif`` in the
+            same folder.
         result: the reconstruction of the whole scan.
         options: ``frames`` and ``frame_time``.
 

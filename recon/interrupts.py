@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 REPEAT_INTERVAL_S = 1.0
-"""Time after which KeyboardInterrupt is raised again if the process still runs. Compiled code may swallow the first
+"""Time after which KeyboardInterrupt is raised again if the process still runs. Compiled code may discard the first
 one in a callback; a second is long enough for an ordinary clean-up."""
 
 

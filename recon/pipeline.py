@@ -47,7 +47,7 @@ picture already; the other estimators serve for comparison, as their papers desc
 
 @dataclass(frozen=True)
 class Options:
-    """What a user may ask of a reconstruction.
+    """Options of a reconstruction.
 
     Attributes:
         device: in place of the recording's own: a device, the path of its TOML file, or the name of a device that
@@ -190,7 +190,7 @@ def reconstruct(
 
     Args:
         recording: with an intensity and the channels that the estimator needs.
-        options: what the user asks for.
+        options: estimator, resolution and further choices of the user.
         truth: of a simulation, for the evaluation.
         quiet: show no progress.
 

@@ -26,7 +26,7 @@ class PreparedRecording:
 
     Attributes:
         recording: the segment in use; its intensity is corrected for the optics terms of the device.
-        uncorrected: the same segment with the intensity as it was recorded.
+        uncorrected: the same segment with the recorded intensity.
         device: the device in use.
         clock_jumps: phase jumps of the whole recording. The segment contains none of them.
         defects: clock jumps, then gaps, clipping and missing parts of the segment's channels.

@@ -1,4 +1,4 @@
-"""Scan design: drive frequencies for a wanted field, resolution, frame rate and fill.
+"""Scan design: drive frequencies for a given field, resolution, frame rate and fill factor.
 
 Motions at n_x F and n_y F, with n_x and n_y coprime, trace one figure F times a second (Hwang et al., Sci. Rep. 7,
 14075 (2017)). Over u = arcsin(theta_x / A_x) and v = arcsin(theta_y / A_y) the figure consists of straight lines that
@@ -125,7 +125,7 @@ class SustainedBand:
         low, high = low * math.sqrt(1.0 + margin), high * math.sqrt(1.0 - margin)
         if reach < half_angle or low > high:
             raise BadInput(
-                f"the drive sustains {reach:.4g} rad, the field asks for {half_angle:.4g} with a margin of {margin:g}",
+                f"the drive sustains {reach:.4g} rad, the field needs {half_angle:.4g} with a margin of {margin:g}",
                 channel=self.axis,
                 hint="give a smaller field, more volts or a smaller margin",
             )
@@ -305,7 +305,7 @@ def design(
         raise BadInput(
             f"no pair of motions within {x[0]:.2f} to {x[1]:.2f} Hz and {y[0]:.2f} to {y[1]:.2f} Hz repeats "
             f"{requirements.frame_rate:g} times a second",
-            hint="ask for a lower frame rate, a smaller field or a smaller margin",
+            hint="choose a lower frame rate, a smaller field or a smaller margin",
         )
     nearest = sorted(figures, key=lambda figure: (figure.frame_rate, figure.mesh_diameter(grid)))[
         :MAX_EVALUATED_FIGURES

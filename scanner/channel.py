@@ -249,7 +249,7 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
         what = f"reaches {max(-low, high):.3g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:
-        what = f"stays at {low:.9g} {signal.unit} throughout"
+        what = f"is constant, {low:.9g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check that it was connected")
 
 

@@ -50,7 +50,7 @@ class ScannerKind:
     Attributes:
         title: in words.
         is_parametric: comb drives, which move at half the drive's frequency.
-        x, y: typical values; a drive frequency stands only where the axis is not driven at its resonance.
+        x, y: typical values; a drive frequency is given only if the axis is not driven at its resonance.
         sensor: what the position readout is, for the comment.
         gain: of the position readout [V / rad].
         noise_sd: of the position readout [V].
@@ -251,7 +251,7 @@ def _frequencies(scanner: ScannerKind, known: Mapping[str, KnownAxis]) -> list[s
         raise BadInput("is not stated", channel=f"--drive-frequency-{missing[0]}", hint=hint)
     return [
         f'[{axis}.drive]\nkind = "{kind}"  # the mirror moves at {moves} frequency\n'
-        f"frequency = {known[axis].drive_frequency!r}  # Hz; a recorded drive channel is used in its place"
+        f"frequency = {known[axis].drive_frequency!r}  # Hz; a recorded drive channel is used instead"
         for axis in AXES
     ]
 

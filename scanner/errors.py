@@ -28,7 +28,7 @@ class BadInput(ValueError):
 
 
 def line_of(error: OSError, place: object) -> str:
-    """Return the message of a system error in one line; ``place`` stands for the file where the error names none."""
+    """Return the message of a system error in one line; ``place`` is used if the error names no file."""
     return " ".join(f"{error.filename or place}: {error.strerror or ' '.join(map(str, error.args))}".split())
 
 

@@ -28,7 +28,7 @@ def check_place(path: Path) -> None:
     if not path.parent.is_dir():
         raise BadInput("the folder to write into does not exist", file=path, hint=f"create {path.parent}")
     if path.is_dir():
-        raise BadInput("a folder stands where the file should go", file=path, hint="name a file")
+        raise BadInput("is a folder, not a file", file=path, hint="name a file")
     check_writable(path.parent)
 
 

@@ -171,7 +171,7 @@ def child(group: h5py.Group, name: str, kind: type) -> Any:
         item = group[name]
     if not isinstance(item, kind):
         what = f"is a {type(item).__name__.lower()}, not a {kind.__name__.lower()}"
-        raise BadInput(what, file=path, channel=where, hint="see the form of a recording")
+        raise BadInput(what, file=path, channel=where, hint="see docs/reference/recording.md")
     if isinstance(item, h5py.Dataset):
         with undamaged(path, where):
             _check_samples(item, path, where)

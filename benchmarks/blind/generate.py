@@ -5,7 +5,7 @@
 
 The first form makes the recordings of ``make blind``. The second makes ``--count`` recordings of every family, with all
 kinds of noise in turn; ``large`` stands for the three families of large misfit. With ``--imperfect`` an unlisted
-imperfection stands beside every effect. ``--conceal`` chooses what is concealed.
+imperfection is added to every effect. ``--conceal`` selects what is concealed.
 
 KEYS also gets ``unused/``, another recording of every scanner, and ``angles/``, the true angles of imaging scans.
 

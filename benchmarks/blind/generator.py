@@ -31,7 +31,7 @@ Rng = np.random.Generator
 EFFECTS: dict[str, Effect] = {effect.name: effect for effect in (*CATALOGUE, *OUT_OF_CATALOGUE, SINE_STIFFNESS)}
 ALL_FAMILIES = {**FAMILIES, "imaging": imaging, **LARGE_FAMILIES}
 FIXED_SIZES = {"strong-spring": 0.3}
-"""Size of the effect in families that ask for one."""
+"""Size of the effect in families whose size is not drawn."""
 MAX_DRAWS = 40
 """Draws of scenario and size before a case is refused. Sizes shrink by 0.9 of their logarithmic range at every draw, so
 40 reach the smallest size to 2 %; an effect that still ends the oscillation cannot be recorded."""
@@ -172,7 +172,7 @@ def generate_recording(case: Case) -> BlindRecording:
         noise = _noise(scenario, reference, case.noise, rng)
         imperfection = None
         if case.imperfection:
-            # From a stream of its own, so that the same seed gives the same scanner with and without imperfection.
+            # From a separate random stream: the same seed gives the same scanner with and without imperfection.
             imperfection = place_imperfection(
                 IMPERFECTIONS[case.imperfection],
                 reference,

@@ -1,7 +1,7 @@
 """Two-axis imaging scans: parametric drive, one electrode or two, drifting resonances, and an intensity channel.
 
 The scanner has the nominal constants of a published pair of mirrors on one electrode. Effects are injected into x. The
-nominal device states the resonances at the start; their drift is an effect like any other and stands in the key.
+nominal device states the resonances at the start; their drift is an effect like any other and listed in the key.
 """
 
 from __future__ import annotations

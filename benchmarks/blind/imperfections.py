@@ -1,4 +1,4 @@
-"""Imperfections that no catalogue lists. One stands beside an injected effect and takes a small share of the misfit.
+"""Imperfections that no catalogue lists. One is added to an injected effect and causes a small share of the misfit.
 
 Every imperfection has a strength; :mod:`benchmarks.blind.share` scales it to the stated share.
 """

@@ -1,8 +1,9 @@
 """Exchange moves of the selection: replace a term by one or two others that explain the same data.
 
-Where the nominal model has lost the phase of the motion, it cannot be linearised, and of two effects neither fits
-alone. A discrepancy term fits nearly any effect. Around its fit, with its own part removed, first-order scores rank
-the named terms, single and in pairs. The same exchange compares a named term with its confounders.
+If the phase error of the nominal model is large, the model cannot be linearised around it, and if two effects act,
+neither of them fits alone. A discrepancy term fits nearly any effect. Around its fit, with its contribution removed,
+first-order scores rank the named terms, single and in pairs. The same exchange compares a named term with its
+confounders.
 """
 
 from __future__ import annotations
@@ -30,18 +31,19 @@ from estimation.diagnosis.screening import (
 from scanner.arrays import Array
 
 MAX_EXCHANGE_FITS = 4
-"""Single terms, and pairs, with the largest predicted gains that are fitted in a term's place; each costs a fit."""
+"""Numbers of single terms, and of pairs, with the largest predicted gains that are fitted instead of a term. They bound
+the computing time."""
 
 MAX_EXCHANGES = 4
-"""Exchanges of one term for another before the search ends. It bounds the cost; every exchange lowers -2 log
-evidence."""
+"""Largest number of exchanges of one term for another. It bounds the computing time; every exchange lowers -2 log
+evidence, so the sequence converges in any case."""
 
 MIN_EXCHANGE_GAIN = 0.1
-"""Fall of -2 log evidence from which a term is exchanged: twice the tolerance of a fit."""
+"""Decrease of -2 log evidence from which a term is exchanged: twice the tolerance of a fit."""
 
 PAIR_ITERATIONS, EXCHANGE_ITERATIONS = 20, 8
-"""Largest numbers of iterations of a fit in the place of a discrepancy term, which starts far from the best fit, and in
-the place of a named term, where a confounder that needs more iterations will not become as good."""
+"""Largest numbers of iterations of a fit that replaces a discrepancy term, which starts far from the minimum, and of
+one that replaces a named term: a confounder that fits as well as the term has converged by then."""
 
 
 class RivalFit(NamedTuple):
@@ -66,8 +68,8 @@ class ExchangeResult:
     """A fit in which no exchange of a term lowers -2 log evidence.
 
     Attributes:
-        fit: the best.
-        rivals: the other terms that were fitted in the place of each term, by its key.
+        fit: the fit.
+        rivals: by the key of each term, the other terms that were fitted instead of it.
     """
 
     fit: Fit
@@ -77,7 +79,7 @@ class ExchangeResult:
 def fit_exchanges(
     likelihood: Likelihood, fit: Fit, removed: Sequence[Candidate], pool: Sequence[Candidate], pairs: bool = False
 ) -> list[Fit]:
-    """Fits with one term of ``pool``, or with ``pairs`` also two, in the place of ``removed``; the best first."""
+    """Fits in which one term of ``pool``, or with ``pairs`` also two, replace ``removed``; the best first."""
     present = {candidate.key for candidate in fit.model.candidates}
     new = [candidate for candidate in pool if candidate.key not in present]
     scores = [s for s in score_candidates(likelihood, fit, new, removed=removed) if np.any(s.columns)]
@@ -112,7 +114,7 @@ def fit_exchanges(
 def _are_confounders(new: Candidate, removed: Candidate) -> bool:
     """Whether a term is a known confounder of another, or of the same stage as a discrepancy term.
 
-    Such terms are always fitted: where an effect is large, a first-order score may miss them.
+    Such terms are always fitted, because a first-order score is not reliable if the effect is large.
     """
     if removed.term.effect in DISCREPANCY_TERMS:
         return new.term.stage == removed.term.stage
@@ -122,7 +124,7 @@ def _are_confounders(new: Candidate, removed: Candidate) -> bool:
 def _exchange_start(
     fit: Fit, removed: Sequence[Candidate], new: Sequence[ScoreTest], estimate: Array
 ) -> tuple[Model, Array]:
-    """The model with ``new`` in the place of ``removed``, and the start of its fit.
+    """The model in which ``new`` replaces ``removed``, and the start of its fit.
 
     All other parameters start at their fitted values: the removed effect is large, so a first-order prediction of their
     changes would not hold.
@@ -143,7 +145,7 @@ def _exchange_start(
 
 
 def rivals_of(fit: Fit, fits: Sequence[Fit]) -> RivalFits:
-    """The last terms of ``others`` as rivals of the best fit."""
+    """The last term of each of ``fits`` as a rival in ``fit``, with its differences of evidence and misfit."""
     misfit = fit.chi2 + fit.penalty
     return tuple(
         RivalFit(

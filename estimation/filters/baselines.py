@@ -136,7 +136,7 @@ def axis_motion_from_angle(
     time, phasors = block_phasors(angle, rate, channel.start, reference.frequency, block)
     if time.size < MIN_BLOCKS:
         raise BadInput(
-            f"is too short to tell its phase: {2 * block} samples are needed",
+            f"is too short to determine its phase: {2 * block} samples are needed",
             file=channel.file,
             channel=channel.name,
             hint="record for longer",
@@ -158,7 +158,7 @@ def axis_motion_from_angle(
 
 
 def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool]) -> Motion:
-    """The motion with the sign of each axis reversed where the user asks for it or an angle channel shows it.
+    """The motion with the sign of each axis reversed where the user requests it or an angle channel shows it.
 
     An even capacitance does not distinguish theta from -theta.
 

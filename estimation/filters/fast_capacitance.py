@@ -20,7 +20,7 @@ TABLE = np.exp(-np.arange(40.0 * TABLE_STEPS**2) / TABLE_STEPS**2)
 """exp(-u^2) down to 4e-18, where it no longer changes a sum with 1."""
 
 ROUNDING_CONSTANT = 1.5 * 2.0**52
-"""Adding this to a number rounds it to an integer, which then stands in the lowest bits of the sum."""
+"""Adding this to a number rounds it to an integer, which is then in the lowest bits of the sum."""
 
 ROUNDING_BITS = int(np.float64(ROUNDING_CONSTANT).view(np.int64))
 """Bits of ``ROUNDING_CONSTANT``."""

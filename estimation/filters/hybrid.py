@@ -139,7 +139,7 @@ def estimate_hybrid(recording: Recording, device: Device) -> Motion:
         (name,) = problem.model.axes if len(problem.model.axes) == 1 else ("",)
         if problem.model.kind != "transimpedance":
             raise DeviceInvalid(
-                f"is {problem.model.kind}; hyb sees crossings behind a transimpedance readout only",
+                f"is {problem.model.kind}; hyb detects crossings only with a transimpedance readout",
                 file=device.source,
                 channel=f"{name}.readout.kind".lstrip("."),
                 hint="choose ekf or ukf",

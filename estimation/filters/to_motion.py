@@ -70,7 +70,7 @@ def axis_motion_from_filter(
     time, phasors = block_phasors(filtered.theta[i], channel.sample_rate, channel.start, f, block)
     if time.size < 2:
         raise BadInput(
-            f"is too short to tell the phase of axis {name}: {2 * block} samples are needed",
+            f"is too short to determine the phase of axis {name}: {2 * block} samples are needed",
             file=channel.file,
             channel=channel.name,
             hint="record for longer",

@@ -78,8 +78,8 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
     axes, values, used, notes = dict(device.axes), {}, {}, []
     if any("sense" in recording for recording in recordings):
         notes.append(
-            "sense: of an electrode that both axes share nothing is identified, combs and readout stay nominal; "
-            "mechanics come from angle_x, angle_y"
+            "sense: the electrode is shared by both axes, so that capacitances and readout are not identified and keep "
+            "their nominal values; the mechanics are identified from angle_x, angle_y"
         )
     for name, axis in device.axes.items():
         result = _AxisIdentification(name, axis)
@@ -162,10 +162,10 @@ class _AxisIdentification:
         if several:
             self._take(axis, lambda axis: fit_mechanics(axis, self.driven))
         elif self.driven:
-            self.notes.append(f"{self.name}: one drive frequency does not tell J; record two or more")
+            self.notes.append(f"{self.name}: one drive frequency does not determine J; record two or more")
         if self.decays and not several and not any(volt for _, _, volt in self.decays):
             self.notes.append(
-                f"{self.name}: J is the nominal one; a free decay tells k/J and b/J only, driven motion J"
+                f"{self.name}: J is the nominal one; a free decay determines only k/J and b/J, driven motion also J"
             )
 
     def _take(self, axis: Axis, fit: Callable[[Axis], dict[str, IdentifiedValue]]) -> None:

@@ -85,7 +85,9 @@ def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, Iden
         BadInput: one frequency only.
     """
     if len({round(record.frequency, 3) for record in records}) < 2:
-        raise BadInput("driven records at two or more drive frequencies are needed to tell k, b and J", hint="sweep")
+        raise BadInput(
+            "driven records at two or more drive frequencies are needed to determine k, b and J", hint="sweep"
+        )
     rows, targets = [], []
     for record in records:
         w = 2 * np.pi * record.frequency
@@ -259,8 +261,8 @@ class CapacitanceProfile:
 
     Attributes:
         values: ``theta0``, ``theta_th`` [rad], ``delay`` of the sense signal against the angle [s]; ``C0`` [F] behind a
-            transimpedance readout, ``a_cir`` [V/F] and ``b_cir`` [V] behind an AMDM one, which sees C0 only times
-            a_cir.
+            transimpedance readout, ``a_cir`` [V/F] and ``b_cir`` [V] of an AMDM one, whose signal depends on C0 only
+            times a_cir.
         residual_sd: of the fit [V].
     """
 

@@ -89,7 +89,7 @@ class _Residuals:
         return np.append(fit.residual / np.sqrt(self.variances.noise), np.sqrt(fit.penalty))
 
     def jacobian(self, x: Array, _residual: Array) -> Array:
-        """Derivatives with all that a scene can imitate projected out; 0 for the penalty.
+        """Derivatives after projecting out every change that a different scene would also cause; 0 for the penalty.
 
         Source: Kaufman, "A variable projection method", BIT 15, 49 (1975).
         """

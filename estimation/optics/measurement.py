@@ -24,11 +24,12 @@ MEASURED_PARAMETERS = (
     "delay_x", "delay_y", "delay_growth_x", "delay_growth_y", "amplitude_growth_x", "amplitude_growth_y", "decay",
     "drift_x", "drift_y",
 )  # fmt: skip
-"""Parameters fitted together; m in number. Delay and lag of the intensity are not among them: the first is the common
-part of both axes' delays, the second has no linear effect of its own."""
+"""Parameters that are fitted together; m is their number. Delay and lag of the intensity are not included: the delay is
+the common part of both axes' delays, and a lag has no linear effect beside that of a delay."""
 
 FLICKER_SD = 0.01
-"""Standard deviation of the relative change of the light over the recording that detail finer than a cell imitates."""
+"""Standard deviation of the apparent relative change of the light over the recording that is caused by detail of the
+scene finer than a cell."""
 
 RESOLUTION_RATIO = 1.25
 """Ratio of noise to prior variance from which on the grid does not resolve the sample: cells then differ inside by as

@@ -108,7 +108,7 @@ def describe_effect(
     if effect.name == "sample-motion":
         speed = scan.half_swing[axis] / scan.duration
         where = (
-            f"half-periods of both directions are displaced alike along {axis}, by {100 * value / 2:.3g} % of the "
+            f"half-periods of both directions are displaced equally along {axis}, by {100 * value / 2:.3g} % of the "
             "full swing over the recording"
         )
         return _describe_term(axis, name, speed * value, (speed * low, speed * high), where)

@@ -48,7 +48,7 @@ MIN_CELLS, MAX_CELLS = 24, 200
 
 @dataclass(frozen=True, eq=False)
 class ScanSamples:
-    """The samples of a scan that its optics are judged by.
+    """The samples of a scan from which its optics are diagnosed.
 
     Attributes:
         tracks: angle of both axes at the intensity's samples, for the whole recording.
@@ -126,7 +126,7 @@ def read_delayed(track: AngleTrack, first: int, stop: int, delay: float) -> Arra
 
 
 def read_scan(tracks: Mapping[str, AngleTrack], intensity: Channel) -> ScanSamples:
-    """The samples of a recording that its optics are judged by.
+    """The samples of a recording from which its optics are diagnosed.
 
     Args:
         tracks: angle of each axis at the intensity's samples.

@@ -8,8 +8,8 @@ first-order low-pass:
 The scene f is unknown and enters linearly, so it is eliminated exactly: for given optics it solves a least-squares
 problem whose only prior is the variance of the difference between neighbouring cells (a Gauss-Markov field), which is
 measured. The residual depends on the optics alone. Gauss-Newton steps of the optics use derivatives from which all that
-a scene can imitate is projected out (variable projection, Golub & Pereyra 1973). The criterion is that two samples of
-one place at two times agree; the sharpness of the picture does not enter.
+a different scene would also cause is projected out (variable projection, Golub & Pereyra 1973). The criterion is that
+two samples of one place at two times agree; the sharpness of the picture does not enter.
 """
 
 from __future__ import annotations

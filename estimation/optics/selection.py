@@ -1,19 +1,20 @@
 """Which optics effects the intensity samples of a scan demand: samples of one place must agree at all times.
 
-No picture is known beforehand, so only consistency is judged. One fit of all parameters that the samples determine,
-with the scene unknown (``estimation.optics.fit``), gives a Gaussian likelihood of how far each axis's motion lags, how
-the light decays and how the sample drifts. Each effect is a direction among those parameters, and sets of effects are
-compared by their evidence:
+The scene is unknown, so only the consistency of the samples is tested. One fit of all parameters that the samples
+determine, with the scene unknown (``estimation.optics.fit``), gives a Gaussian likelihood of how far each axis's motion
+lags, how the light decays and how the sample drifts. Each effect is a direction among those parameters, and sets of
+effects are compared by their evidence:
 
 * no effect: the parameters lie within the estimator's phase error, the tolerance of the readout's corner frequencies
   and the errors that detail below a cell causes;
 * delayed intensity: both axes lag by one time;
 * phase error of one axis: that axis alone lags;
 * bleaching: the light decays;
-* sample motion: half-periods of both directions are displaced alike along one axis.
+* sample motion: half-periods of both directions are displaced equally along one axis.
 
 A detector's lag delays and smooths; a second fit through the detector's low-pass distinguishes it from a delay. A
-distorted field or a wrong amplitude changes all pictures alike and cannot be detected without a known target.
+distorted field or a wrong amplitude changes all pictures of a scene in the same way and cannot be detected without a
+known target.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ from scanner.terms import NaturalScales, catalogue
 VALIDATION_METRIC = "reduced chi-square of the intensity about the best picture, on blocks of time not used in the fit"
 
 MAX_EFFECTS = 4
-"""Effects reported at most; the nine parameters hold no more independent ones."""
+"""Largest number of effects reported; the nine fitted parameters do not determine more independent ones."""
 
 
 @dataclass(frozen=True)

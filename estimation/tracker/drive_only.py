@@ -104,7 +104,7 @@ def drive_only_observations(recording: Recording, device: Device, name: str) -> 
     Raises:
         ChannelMissing: the drive was not recorded. BadInput: it cannot be used. DeviceInvalid: a value is missing.
     """
-    channel = recording.require(f"drive_{name}", "without a sense signal it is the only one to tell the motion")
+    channel = recording.require(f"drive_{name}", "without a sense signal the motion is computed from it")
     reference = phase_reference(recording, device, name)
     law = axis_parameters(device.axis(name), NO_READOUT)
     time, width = _block_times(channel, reference.frequency)

@@ -51,7 +51,7 @@ JUMP_NIS = 4.0
 """Mean NIS of a block above which the motion has jumped. Noise exceeds it once in 6e4 blocks of ten projections."""
 
 REACQUIRE_NIS = 100.0
-"""Mean NIS above which phase and amplitude are acquired anew from the block instead of corrected."""
+"""Mean NIS above which phase and amplitude are acquired from the block, as at the start, instead of corrected."""
 
 MAX_REUSE_DISTANCE = 0.5
 """``state_distance`` beyond which a stored linearisation is no starting point for the iterated update."""
@@ -192,7 +192,8 @@ def _update(signal, k, x, P, linear, noise_var):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def _external_innovation(signal, k, a, x):  # type: ignore[no-untyped-def]
-    """External phase of axis ``a`` in block k minus the state's [rad], modulo pi where theta and -theta look alike."""
+    """External phase of axis ``a`` in block k minus the state's [rad], modulo pi where theta and -theta give the same
+    signal."""
     period = 2.0 * np.pi / signal.main_order
     innovation = signal.external_phase[k, a] - x[a * AXIS_STATES + PHASE]
     return innovation - period * np.round(innovation / period)
@@ -231,7 +232,7 @@ def _update_iterated(laws, signal, k, predicted, P_predicted, linear, noise_var)
 
 @njit(cache=True, error_model="numpy")
 def _inflate_covariance(laws, signal, k, x, P, transitions, mean_nis):  # type: ignore[no-untyped-def]
-    """Admit a jump: scale the variances of phase, ln A and stiffness by the mean NIS, or acquire the motion anew."""
+    """Admit a jump: scale the variances of phase, ln A and stiffness by the mean NIS, or acquire the motion again."""
     scale = min(mean_nis, REACQUIRE_NIS)
     for a in range(len(laws)):
         at = a * AXIS_STATES

@@ -158,7 +158,7 @@ def expected_projections(laws, signal, k, x, rates):  # type: ignore[no-untyped-
 def _whiten_jacobian(moments, whitened, values, jacobian, lines, rows, residual):  # type: ignore[no-untyped-def]
     """Whiten Jacobian and residual of one block into ``rows`` and ``residual``; returns the number of valid rows.
 
-    A line depends on the states of its own axis only, so that a row is summed axis by axis over that axis's columns.
+    A line depends on the states of one axis only, so that a row is summed axis by axis over the columns of that axis.
     The mean, the first column, depends on all states.
     """
     m, n, count = whitened.size, rows.shape[1], 0

@@ -26,7 +26,7 @@ SIMD_WIDTH = 8
 """The state vector's length is a multiple of it: rows of matrices then fill vector registers, which halves the time."""
 
 MIN_AMPLITUDE_THETA0 = 1e-3
-"""Least amplitude, in units of theta0: ln A stays finite, and a smaller motion is far below any readout's noise."""
+"""Smallest amplitude, in units of theta0: keeps ln A finite; a smaller motion is far below the noise of any readout."""
 
 MAX_SD = (10.0, 3.0)
 """Standard deviations of phase [rad] and ln A that mean "unknown": they bound unstable dynamics without data."""
@@ -38,7 +38,7 @@ RATE_TERMS = 5
 """The rate r of an axis and its derivatives by phase, ln A, stiffness and damping, see ``fill_rates``."""
 
 RELINEARISE_DISTANCE = 2e-3
-"""``state_distance`` [rad, 1] above which a block is linearised anew: second-order terms are then below 1e-5."""
+"""``state_distance`` [rad, 1] above which a block is linearised again: second-order terms are then below 1e-5."""
 
 SUBSTEP_TOLERANCE_RAD = 1e-5
 """Error of linearised rates over a substep [rad]: a fifth of the least phase error at 40 dB, 0.003 degrees."""

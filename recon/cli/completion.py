@@ -9,7 +9,9 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-ALONE = {"reconstruct-from-recording": "reconstruct"}  # commands that stand alone, and what they are short for
+ALONE = {
+    "reconstruct-from-recording": "reconstruct"
+}  # separate commands, and the subcommand that each is equivalent to
 
 Options = Sequence[argparse.Action]
 

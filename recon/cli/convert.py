@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             f"--{option}", action="append", default=[], metavar=f"[NAME=]{option.upper()}",
             help=f"{text} of all channels, or of one, where the file does not state it",
         )  # fmt: skip
-    parser.add_argument("--format", help="the file's format, where neither its beginning nor its name tells")
+    parser.add_argument("--format", help="format, if it follows neither from the file's beginning nor from its name")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the recording to write (.h5)")
 
 
@@ -30,11 +30,13 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.io.convert import convert_file
     from scanner.errors import BadInput
 
-    said = [f"--{name}" for name in ("channel", "format", *OPTIONS) if getattr(args, name)]
+    given = [f"--{name}" for name in ("channel", "format", *OPTIONS) if getattr(args, name)]
     if args.mapping is None:
         return convert_file(args.file, plan_of(args), args.output)
-    if said:
-        raise BadInput(f"stands beside {said[0]}", channel="--mapping", hint="say it all in one of the two")
+    if given:
+        raise BadInput(
+            f"is given together with {given[0]}", channel="--mapping", hint="state everything in one of them"
+        )
     return convert_file(args.file, args.mapping, args.output)
 
 
@@ -51,10 +53,10 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
     for text in args.channel:
         name, given, variable = text.partition("=")
         if not (name and given and variable) or name in channels:
-            raise BadInput(f"{text!r} names no channel and variable of its own", channel="--channel", hint=hint)
+            raise BadInput(f"{text!r} is not NAME=VARIABLE, or repeats a channel", channel="--channel", hint=hint)
         channels[name] = {"variable": variable}
     if not channels:
-        raise BadInput("nothing says which variable is which channel", file=args.file, hint=f"say so, {hint}")
+        raise BadInput("no option assigns variables to channels", file=args.file, hint=f"assign them, {hint}")
     for option, (key, kind) in OPTIONS.items():
         for text in getattr(args, option):
             name, given, value = text.rpartition("=")

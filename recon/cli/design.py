@@ -1,4 +1,4 @@
-"""``lissajous design``: drive frequencies for a wanted field, resolution, frame rate and fill."""
+"""``lissajous design``: drive frequencies for a given field, resolution, frame rate and fill factor."""
 
 from __future__ import annotations
 
@@ -160,9 +160,7 @@ def _design_notes(best: ScanCandidate, requirements: ScanRequirements) -> list[s
             f"{y:.2g}° in that of y, lies the worst, and a drifting resonance moves through both"
         )
     if reached == "no":
-        notes.append(
-            f"no pair reaches a fill of {requirements.fill:.1%}: ask for a lower frame rate or for fewer pixels"
-        )
+        notes.append(f"no pair reaches a fill of {requirements.fill:.1%}: choose a lower frame rate or fewer pixels")
     needed = best.figure.path_rate(requirements.grid) / 2.0
     if requirements.sample_rate is not None and requirements.sample_rate < needed:
         notes.append(

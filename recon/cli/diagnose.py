@@ -46,7 +46,7 @@ def diagnose_files(
     """Diagnose recordings of one device; write diagnosis.json, device.toml and report.html; return the diagnosis.
 
     Args:
-        paths: recordings of one device, which are judged together.
+        paths: recordings of one device, which are fitted together.
         output: folder.
         device: file of the nominal device; None takes that of the first recording.
         mapping: makes recordings of instruments' files, see :func:`recon.io.convert.open_any`.

@@ -10,7 +10,7 @@ from typing import Any
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="a recording, or an instrument's file")
     one = parser.add_mutually_exclusive_group()
-    one.add_argument("--format", help="the file's format, where neither its beginning nor its name tells")
+    one.add_argument("--format", help="format, if it follows neither from the file's beginning nor from its name")
     one.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: list the recording that it makes of the file")
 
 

@@ -4,11 +4,11 @@ A sample whose true angle is A sin(α + d), but which was mapped to A sin α, ap
 in forward half-periods (cos α > 0) and ahead of it in backward ones. The two directions so show one place 2 m d pixels
 apart at the centre of a line, and less towards its ends. The estimate is the d of both axes for which all samples of
 one place agree in the least-squares sense. The sharpness of a picture is not used, and no truth is needed. An error of
-the amplitude moves both directions alike and does not change d.
+the amplitude displaces both directions equally and does not change d.
 
 The model of a sample is I = f(u + d c) + noise: the unknown picture f at the true position, where the mapped position u
-and its change with the phase, c = A cos α, are known. f is eliminated by smoothing intensities and positions alike
-(Robinson 1988, "Root-N-consistent semiparametric regression"): with the normalised convolution S,
+and its change with the phase, c = A cos α, are known. f is eliminated by smoothing intensities and positions in the
+same way (Robinson 1988, "Root-N-consistent semiparametric regression"): with the normalised convolution S,
 
     I - S[I] = ∇f · ((u - S[u]) + d (c - S[c])) + noise,
 

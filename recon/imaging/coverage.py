@@ -1,4 +1,4 @@
-"""Coverage: the fill factor of a scan over time, the time that a wanted fill takes, and the largest gap."""
+"""Coverage of a scan: fill factor over time, the time after which a given fill factor is reached, and the largest gap."""
 
 from __future__ import annotations
 

@@ -18,7 +18,8 @@ from recon.imaging.picture import MAX_PIXELS, Grid, Picture
 from scanner.errors import BadInput
 
 BLOCK_SAMPLES = 256
-"""Samples whose pixel indices are found before their values are added: their arrays stay in the first-level cache."""
+"""Samples whose pixel indices are computed before their values are added: their arrays fit into the first-level
+cache."""
 
 FRACTION_BITS = 18
 """Bits of an int32 for the fraction of a position in pixels. The other bits hold the whole part and the sign."""

@@ -2,8 +2,8 @@
 
 Grid the intensity with the current motion, measure the remaining phase error in each time slice
 (``bidirectional_phase``: least squares over all samples of one place), give phase plus error to the smoother as
-measurements, and repeat. Each round measures anew about a better motion, so no measurement counts twice. The derivation
-is in docs/explanation/image_phase.md.
+measurements, and repeat. Each round replaces all measurements by those around the improved motion, so no measurement
+counts twice. The derivation is in docs/explanation/image_phase.md.
 """
 
 from __future__ import annotations

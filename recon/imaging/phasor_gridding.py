@@ -75,7 +75,7 @@ def _fill_table(turn, re, im, table):  # type: ignore[no-untyped-def]
 def _rotation_offset(turn, tabulated, re, im, table):  # type: ignore[no-untyped-def]
     """Difference [rad] of a rotation from ``tabulated``, shape (1,), for which ``table`` was filled.
 
-    If it exceeds ``MAX_ROTATION_OFFSET_RAD``, the table is filled anew.
+    If it exceeds ``MAX_ROTATION_OFFSET_RAD``, the table is recomputed.
     """
     offset = (turn * tabulated[0].conjugate()).imag
     if abs(offset) < MAX_ROTATION_OFFSET_RAD:

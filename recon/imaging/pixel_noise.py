@@ -1,4 +1,4 @@
-"""The standard deviation of every pixel of a picture of means, from the scatter of its own samples.
+"""The standard deviation of every pixel of a picture of means, from the scatter of the samples in it.
 
 The variance of a sample is modelled as a + b · intensity, read noise and photon noise. Both are measured from pairs of
 samples that fell into one pixel in different passes of the beam. The scene is the same for both, so half of the squared

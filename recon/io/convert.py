@@ -148,7 +148,7 @@ def _recording(contents: Contents, source: Path, plan: Plan, plan_source: object
 def _origin(spec: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
     """Which variable a channel comes from, and which source states its unit and clock."""
     stated = {key: getattr(contents.variables[spec["variable"]], key) for key in ("unit", "sample_rate", "start")}
-    by = {key: "file" if value is not None else "nobody: 0" for key, value in stated.items()}
+    by = {key: "file" if value is not None else "default: 0" for key, value in stated.items()}
     by |= {key: "mapping" for key in stated if key in spec}
     by |= {key: f"variable {spec['time']}" for key in ("sample_rate", "start") if "time" in spec}
     scaled = "scale" in spec or "offset" in spec

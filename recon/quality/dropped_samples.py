@@ -46,7 +46,7 @@ MIN_CORRELATION_MARGIN = 0.1
 """Smallest margin of that correlation above those at other lags: a periodic target correlates at several."""
 
 MIN_LAG_SEPARATION_SAMPLES = 8
-"""Distance from which on a lag counts as another one: neighbouring lags see the same pixels."""
+"""Distance from which two lags count as different: samples at neighbouring lags fall into the same pixels."""
 
 LOCATION_CHI2 = 12.0
 """Excess of the squared residuals over their minimum, in noise variances, up to which a place of the loss is possible
@@ -119,7 +119,7 @@ def slices_aligned(phase_errors: Sequence[PhaseError], motion: Motion) -> NDArra
 
 
 def register_slices_separately(motion: Motion, intensity: Channel, grid: Grid, slices: int) -> list[PhaseError]:
-    """Measure the phase errors of equal slices, each in a picture of its own.
+    """Measure the phase errors of equal slices, each in a separate picture.
 
     In a picture shared by all slices, a late slice disturbs the others.
     """

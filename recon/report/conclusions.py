@@ -38,7 +38,7 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
     if verdict != "sharp":
         text += " Run lissajous diagnose on this recording to find what the device file lacks."
     if summary["fill"] < SUFFICIENT_FILL:
-        text += f" Only {summary['fill']:.0%} of the pixels were visited: record longer or ask for fewer pixels."
+        text += f" Only {summary['fill']:.0%} of the pixels were visited: record longer or choose fewer pixels."
     return text
 
 
@@ -143,7 +143,7 @@ def conclude_design(summary: Mapping[str, Any]) -> str:
         "between the axes."
     )
     if best["fill_reached"] == "no":
-        text += f" The wanted {fill:.1%} is not reached: ask for fewer pixels or a lower frame rate."
+        text += f" The required {fill:.1%} is not reached: choose fewer pixels or a lower frame rate."
     return text
 
 

@@ -149,7 +149,8 @@ def _blur_section(errors: Mapping[str, PhaseError]) -> Section:
     text = (
         f"A phase error δφ displaces the centre of a line by m δφ pixels, with m = {PICTURE_HALF_WIDTH_PX} in a "
         f"picture of {2 * PICTURE_HALF_WIDTH_PX} pixels. Nominal: the motion that the fitted nominal device predicts "
-        "from the drive alone, against the improved device. Improved: 95 % limit of its own uncertainty."
+        "from the drive alone, against the improved device. Improved: 95 % limit of the uncertainty of the improved "
+        "device's phase."
     )
     table = Table(["rms blur (pixels)", "nominal device", "improved device"], rows)
     return Section(heading, text, table, figures, least="24rem")
@@ -213,7 +214,7 @@ def _optics_section(table: Mapping[str, Any]) -> Section:
     text = (
         f"{table['recording']}: samples of one place at different times and in different directions must agree. The "
         "table shows how many standard deviations an effect of typical size would have. A distorted field or a wrong "
-        "amplitude changes every picture alike: they need a known target, and this recording cannot tell them."
+        "amplitude changes all pictures of a scene in the same way. It can only be detected with a known target."
     )
     return Section("Optics: detectability", text, Table(["effect", "σ", "in this recording"], rows))
 
@@ -227,7 +228,7 @@ def _nominal_values(diagnosis: Diagnosis) -> Section:
 def _detectability(effects: Sequence[Detectability]) -> Section:
     text = (
         "For every effect of typical size: how many standard deviations it would have in these recordings, and how "
-        f"many of them its nearest confounder cannot imitate. From {DISCRIMINATION_SIGMA:g} σ on it is identified "
+        f"many of them remain if its nearest confounder is fitted. From {DISCRIMINATION_SIGMA:g} σ on it is identified "
         "unambiguously; below, a further measurement is needed."
     )
     return Section("What these recordings can show", text, figures=[detectability_figure(effects)], least="34rem")

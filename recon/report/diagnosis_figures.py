@@ -23,7 +23,7 @@ BEFORE, AFTER, MEASURED = "#c8553d", "#2f6fb0", "#333333"
 PAIR = ((BEFORE, "nominal device"), (AFTER, "improved device"))
 
 TIME_BINS = 120
-"""Bins of a residual over time: enough to see a drift, few enough for the noise of a bin to be small."""
+"""Bins of a residual over time: enough to resolve a drift, few enough for the noise of a bin to be small."""
 
 SPECTRUM_BINS = 400
 """Bins of a spectrum, about as many as its figure has columns."""
@@ -161,5 +161,5 @@ def detectability_figure(effects: Sequence[Detectability]) -> Figure:
         axes.set(xscale="log", xlabel="standard deviations (σ), for an effect of typical size")
         axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8)
 
-    caption = "every effect (nearest confounder in brackets): detectability, and what no confounder can imitate"
+    caption = "every effect: detectability, and the part that remains if its nearest confounder (in brackets) is fitted"
     return one_panel(draw, caption, height=1.4 + 0.22 * len(effects))

@@ -144,6 +144,6 @@ def _picture_score(result: Reconstruction) -> dict[str, Any] | None:
 
 
 def is_mirrored(result: Reconstruction) -> tuple[bool, bool]:
-    """Whether the picture shows the scene mirrored in x, in y, as far as a truth tells."""
+    """Whether the picture shows the scene mirrored in x, in y; False for an axis without a known truth."""
     x, y = (axis in result.evaluation and result.evaluation[axis].mirrored for axis in AXES)
     return x, y

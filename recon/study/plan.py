@@ -127,8 +127,8 @@ class Job:
     Attributes:
         scenario: the recording.
         variants: estimator and pixels of each reconstruction.
-        p: tolerated displacements [px]; each is a cell of its own.
-        digest: of everything that the names in a cell stand for.
+        p: tolerated displacements [px]; each gives a separate cell.
+        digest: hash of the contents of everything that a cell refers to by name.
     """
 
     scenario: Scenario

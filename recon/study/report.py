@@ -61,8 +61,8 @@ ESTIMATORS_TEXT = (
 )
 BLUR_TEXT = (
     "Top: blur by the phase error; δφ displaces a sample by m δφ cos α pixels, rms m δφ/√2 (line). Bottom: rms error "
-    "of the picture, which is measured independently, over the rms phase error of both axes. Each phantom has a marker "
-    "of its own. Dashed: the bound p/m."
+    "of the picture, which is measured independently, over the rms phase error of both axes. The marker shows the "
+    "phantom. Dashed: the bound p/m."
 )
 MAP_TEXT = "Percentage of the scan with a phase error within ±p/m: mean over phantoms, noise, seeds and axes."
 COMPARISON_TEXT = (
@@ -86,7 +86,7 @@ def _estimators(statistics: Mapping[str, Mapping[str, float | None]]) -> Table:
 def _blur_figure(study: Study, data: Columns) -> Figure:
     drawing, axes = new_figure(2, len(study.pixels), (max(5.0, 4.5 * len(study.pixels)), 6.4))
     for (above, below), pixels in zip(axes.T, study.pixels, strict=True):
-        here = (data["pixels"] == pixels) & (data["p"] == study.p[0])  # neither blur nor picture knows p
+        here = (data["pixels"] == pixels) & (data["p"] == study.p[0])  # neither blur nor picture depends on p
         law = np.geomspace(max(MIN_PHASE_ERROR_DEG, data["phase_rmse_deg"][here].min(initial=1.0)), 20.0, 50)
         above.plot(law, 0.5 * pixels * np.radians(law) / np.sqrt(2.0), color="#444", lw=0.8)
         for name, colour in zip(study.estimators, _colours(), strict=False):
@@ -162,7 +162,7 @@ def _mean_within_bound(
 def _win_table(study: Study, data: Columns) -> Table:
     """For each pair of estimators, in which part of what both did the row's has the smaller phase error."""
     errors: dict[str, dict[tuple[Any, ...], float]] = {name: {} for name in study.estimators}
-    once = (data["pixels"] == study.pixels[0]) & (data["p"] == study.p[0])  # a phase error knows neither
+    once = (data["pixels"] == study.pixels[0]) & (data["p"] == study.p[0])  # a phase error depends on neither
     scans = zip(*(data[name][once] for name in ("phantom", "design", "drift", "snr_db", "seed", "axis")), strict=True)
     names, values = data["estimator"][once], data["phase_rmse_deg"][once]
     for scan, name, value in zip(scans, names, values, strict=True):

@@ -111,11 +111,13 @@ def _explain_interruption(output: Path) -> Iterator[None]:
             ChildProcessError, errno.ECHILD, "a worker was killed (out of memory?)", output
         ) from None
     except CancelledError:
-        raise _interruption_error(ConnectionAbortedError, errno.ECONNABORTED, "the scheduler is gone", output) from None
+        raise _interruption_error(
+            ConnectionAbortedError, errno.ECONNABORTED, "the connection to the scheduler is lost", output
+        ) from None
 
 
-def _interruption_error(kind: type[OSError], number: int, why: str, output: Path) -> OSError:
-    return kind(number, f"{why}; what was done is kept, the same command goes on from there", str(output))
+def _interruption_error(kind: type[OSError], number: int, reason: str, output: Path) -> OSError:
+    return kind(number, f"{reason}; finished jobs are kept, the same command continues with the others", str(output))
 
 
 @contextmanager

@@ -1,9 +1,9 @@
 """Addresses of compiled functions: the only place that uses a private name of numba.
 
-numba's first-class functions ask for the address of a compiled function at every call through the dispatcher, which
-takes longer than a short integration. ``FunctionAddress`` asks once and then returns the stored address. numba has the
-protocol for that (``types.WrapperAddressProtocol``) in its public interface, but not the function that computes the
-address, ``numba.experimental.function_type._get_wrapper_address``. If a release of numba moves or renames it,
+numba's first-class functions look up the address of a compiled function at every call through the dispatcher, which
+takes longer than a short integration. ``FunctionAddress`` looks it up once and then returns the stored address. numba
+has the protocol for that (``types.WrapperAddressProtocol``) in its public interface, but not the function that computes
+the address, ``numba.experimental.function_type._get_wrapper_address``. If a release of numba moves or renames it,
 ``tests/scanner/test_integrator.py`` fails and says what to do.
 """
 

@@ -1,7 +1,7 @@
 """Values at the nodes of integration steps: the start, the middle and the end of every step.
 
-The Runge-Kutta method evaluates a drive at these three times. Two neighbouring steps may have different values at the
-time that they share, so that a jump between them stays sharp.
+The Runge-Kutta method evaluates a drive at these three times. Two neighbouring steps may have different values at their
+common time, so that a jump between them is represented exactly.
 """
 
 from __future__ import annotations

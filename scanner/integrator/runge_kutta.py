@@ -53,7 +53,7 @@ _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 """ln 2 in two parts. The last bits of the first are zero, so its product with an exponent is exact (Cody & Waite)."""
 
 _ROUNDER = 1.5 * 2.0**52
-"""Added to a number, it rounds it to an integer, which then stands in the lowest bits of the sum."""
+"""Adding this to a number rounds it to an integer, which is then in the lowest bits of the sum."""
 
 _ROUNDER_BITS = int(np.float64(_ROUNDER).view(np.int64))
 

@@ -115,8 +115,8 @@ def integrate_batch(
 
     Args:
         specs: of the motions. The kinds of drive and the laws of the first one hold for all.
-        voltage: drive at the start, middle and end of every step, shape (n, 3) [V]. A jump between two steps stays
-            sharp.
+        voltage: drive at the start, middle and end of every step, shape (n, 3) [V]. A jump between two
+            steps is represented exactly.
         step: length of a step [s].
         t0: time of the start [s].
         other_angle: angle of the other axis, shape (n, 3) [rad]; zero by default.

@@ -255,7 +255,7 @@ def test_failed_write_does_not_change_the_existing_file(stored: Path) -> None:
             recording.write(stored, truth={"bad": object()})
         with pytest.raises(BadInput, match="the folder to write into does not exist"):
             recording.write(stored.parent / "none" / "a.h5")
-        with pytest.raises(BadInput, match="a folder stands where the file should go"):
+        with pytest.raises(BadInput, match="is a folder, not a file"):
             recording.write(stored.parent)
     assert [entry.name for entry in stored.parent.iterdir()] == ["rec.h5"]
     assert stored.read_bytes() == before
@@ -284,7 +284,7 @@ def test_constant_signal_is_refused_unless_it_is_allowed() -> None:
     )
     with pytest.raises(BadInput) as caught:
         check_signal(recording["bias_x"])
-    assert str(caught.value) == "bias_x: stays at 10 V throughout; check that it was connected"
+    assert str(caught.value) == "bias_x: is constant, 10 V; check that it was connected"
     check_signal(recording["bias_x"], constant_ok=True)
     check_signal(recording["sense_x"])
     check_signal(recording["intensity"])

@@ -112,7 +112,7 @@ BAD_FILES = {
     ),
     "folder": (
         lambda file: file.create_group("channels/sense_y"),
-        "/channels/sense_y: is a group, not a dataset; see the form of a recording",
+        "/channels/sense_y: is a group, not a dataset; see docs/reference/recording.md",
     ),
     "no channels": (lambda file: file.pop("channels"), "holds no channels; store signals under /channels"),
     "empty channels": (

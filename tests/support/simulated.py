@@ -29,7 +29,7 @@ def own_electrodes() -> Device:
     """The imaging scanner with a readout for each axis."""
     device = devices.load("imaging")
     assert isinstance(device.readout, Amdm)
-    readout = replace(device.readout, b_cir=4.95)  # half the sum of two combs stays within the converter's range
+    readout = replace(device.readout, b_cir=4.95)  # half the sum of two combs is within the converter's range
     axes = {name: replace(axis, readout=readout) for name, axis in device.axes.items()}
     return replace(device, axes=axes, readout=None)
 

@@ -46,7 +46,7 @@ def read_journal(folder: Path) -> list[dict]:
 
 
 def assert_study_is_complete(folder: Path) -> None:
-    """Every cell of the small study stands once in the journal and once an axis in the table."""
+    """Every cell of the small study is once in the journal and once per axis in the table."""
     cells = Counter(cell_key(record["cell"]) for record in read_journal(folder))
     assert len(cells) == CELLS
     assert set(cells.values()) == {1}

@@ -58,7 +58,7 @@ def scans(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     if request.param == "measured":
         if MEASURED.is_dir():
             return MEASURED
-        warnings.warn("the measured AFM scans are not beside this checkout; synthetic ones stand in", stacklevel=1)
+        warnings.warn("the measured AFM scans are not available; synthetic ones are used", stacklevel=1)
     return synthetic(tmp_path)
 
 

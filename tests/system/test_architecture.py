@@ -96,7 +96,7 @@ def test_no_test_imports_another_test_file() -> None:
 def test_test_folders_mirror_the_packages() -> None:
     folders = {file.parent.relative_to(ROOT / "tests") for file in (ROOT / "tests").rglob("test_*.py")}
     for folder in folders:
-        assert folder.parts, "a test file stands beside the folders"
+        assert folder.parts, "a test file is not in one of the folders"
         if folder.parts[0] not in TEST_FOLDERS_BESIDE_PACKAGES:
             assert (ROOT / folder / "__init__.py").is_file(), f"tests/{folder} mirrors no package"
 

@@ -81,7 +81,7 @@ def _head(lines: Iterator[str], separator: str, path: Path) -> tuple[Head, int]:
 def _one_segment(lines: Iterable[str], path: Path) -> Iterator[str]:
     for line in lines:
         if line.startswith(END_OF_HEADER):
-            raise BadInput("holds more than one segment", file=path, hint="save each segment to a file of its own")
+            raise BadInput("holds more than one segment", file=path, hint="save each segment to a separate file")
         yield line
 
 

@@ -11,7 +11,7 @@ from scanner.errors import BadInput
 
 
 def read_wav(path: Path) -> Contents:
-    """Channels of a WAV file as stored: integers stay integers, because a WAV file does not state their unit.
+    """Channels of a WAV file as stored: integers are not scaled, because a WAV file does not state their unit.
 
     Samples of 24 bits cannot be mapped; they are read at once and multiplied by 256. A WAV file has 4 GB at most.
 

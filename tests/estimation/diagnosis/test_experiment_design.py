@@ -37,9 +37,9 @@ def test_the_squared_distance_predicts_the_evidence_gain_over_a_confounder(fitte
     likelihood, fit = fitted
     (distance,) = distances_to_rivals(likelihood, fit, CUBIC, [QUINTIC])
     rival = Model(fit.model.runs, DEVICE, [QUINTIC])
-    instead = fit_model(likelihood, rival, rival.map_parameters_from(fit.model, fit.x))
-    lead = instead.chi2 + instead.penalty - fit.chi2 - fit.penalty
-    assert abs(lead - distance**2) < 2 * Z_95 * distance + 1.0  # noise scatters the gain by twice the distance
+    rival_fit = fit_model(likelihood, rival, rival.map_parameters_from(fit.model, fit.x))
+    misfit_gap = rival_fit.chi2 + rival_fit.penalty - fit.chi2 - fit.penalty
+    assert abs(misfit_gap - distance**2) < 2 * Z_95 * distance + 1.0  # noise scatters the gain by twice the distance
     assert distance < 4.5
 
 

@@ -75,6 +75,6 @@ def test_a_readout_without_crossings_is_refused():
     turn = np.pi * f * np.arange(n) / rate
     sense = 1.0 + 0.3 * np.cos(2 * turn + 0.3)
     values = {"sense_x": (sense, "V", rate, 0.0), "drive_x": (30 + 30 * np.sin(2 * turn), "V", rate, 0.0)}
-    with pytest.raises(DeviceInvalid, match=r"x\.readout\.kind: is amdm; hyb sees crossings"):
+    with pytest.raises(DeviceInvalid, match=r"x\.readout\.kind: is amdm; hyb detects crossings"):
         estimate(Recording.from_arrays(values, device), None, "hyb")
     assert "hyb" in estimators()

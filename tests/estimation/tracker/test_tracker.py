@@ -320,5 +320,5 @@ def test_signal_without_samples_is_refused() -> None:
 
 def test_constant_signal_is_refused() -> None:
     constant = with_sense(shared_electrode()[0], np.zeros_like)
-    with pytest.raises(BadInput, match="stays at 0 V"):
+    with pytest.raises(BadInput, match="is constant, 0 V"):
         track(constant, devices.load("imaging"))

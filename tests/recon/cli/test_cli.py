@@ -209,7 +209,7 @@ BAD_RECORDINGS = {
     "no sense and no drive": (delete("sense", "drive_x"), ["sense_x", "is not in the recording"]),
     "unknown unit": (attribute("sense", "unit", "bananas"), ["sense", "bananas", "accepted units: V"]),
     "NaN": (put("intensity", slice(None), np.nan), ["intensity", "no sample that can be used"]),
-    "constant": (put("sense", slice(None), 1.5), ["sense", "stays at 1.5 V"]),
+    "constant": (put("sense", slice(None), 1.5), ["sense", "is constant, 1.5 V"]),
     "negative rate": (attribute("drive_x", "sample_rate", -5e6), ["drive_x", "sample_rate"]),
     "another version": (lambda file: file.attrs.__setitem__("version", 7), ["version 7"]),
     "another format": (lambda file: file.attrs.__setitem__("format", "notes"), ["notes"]),

@@ -74,7 +74,7 @@ def test_a_mapping_converts_a_file_to_a_recording(bench: Path) -> None:
         "channels": {
             "sense_x": {
                 "unit": "V", "sample_rate": 1000.0, "start": 0.0, "shape": (5,), "variable": "x", "overruled": {},
-                "stated_by": {"unit": "mapping", "sample_rate": "mapping", "start": "nobody: 0"},
+                "stated_by": {"unit": "mapping", "sample_rate": "mapping", "start": "default: 0"},
             },
             "intensity": {
                 "unit": "nm", "sample_rate": 500.0, "start": 0.25, "shape": (2, 2), "variable": "z", "overruled": {},
@@ -297,15 +297,15 @@ def test_arguments_replace_a_mapping(tmp_path: Path, capsys: pytest.CaptureFixtu
         ("--unit", "V"): "says no sample_rate of variable 'a'",
         ("--rate", "fast"): "--rate: 'fast' is no number",
         ("--unit", "drive_x=V"): "--unit: 'drive_x' is no channel named by --channel",
-        ("--channel", "sense_x=b"): "--channel: 'sense_x=b' names no channel and variable of its own",
-        ("--mapping", "m.toml"): "--mapping: stands beside --channel",
+        ("--channel", "sense_x=b"): "--channel: 'sense_x=b' is not NAME=VARIABLE, or repeats a channel",
+        ("--mapping", "m.toml"): "--mapping: is given together with --channel",
     }.items():
         assert main([*given, *wrong]) == 2
         message = capsys.readouterr().err
         assert words in message
         assert message.count("\n") == 1
     assert main(["convert", str(tmp_path / "a.csv"), "-o", str(out)]) == 2
-    assert "nothing says which variable is which channel" in capsys.readouterr().err
+    assert "no option assigns variables to channels" in capsys.readouterr().err
     assert not out.exists()
 
 
