@@ -217,7 +217,7 @@ def diagnose(
     mapping: MappingSource | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Diagnosis:
-    """Locate, name and model what the nominal device leaves out: motion, readout and, with an intensity, optics.
+    """Locate, name and model the effects that the nominal device omits: motion, readout and, with an intensity, optics.
 
     Args:
         recordings: one or several of one device; several are fitted together.

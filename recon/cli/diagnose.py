@@ -1,4 +1,4 @@
-"""``lissajous diagnose REC...``: locate, name and model what the nominal device leaves out.
+"""``lissajous diagnose REC...``: locate, name and model the effects that the nominal device omits.
 
 With ``--plan`` nothing is measured: the command lists which effects such recordings could show.
 """

@@ -1,4 +1,4 @@
-"""Coverage of a scan: fill factor over time, the time after which a given fill factor is reached, and the largest gap."""
+"""Coverage of a scan: fill factor over time, time after which a given fill factor is reached, and the largest gap."""
 
 from __future__ import annotations
 
