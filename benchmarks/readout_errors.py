@@ -14,7 +14,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -107,7 +106,7 @@ IMPERFECTIONS: dict[str, Imperfection] = {
 def with_sense(recording: Recording, values: Array) -> Recording:
     """The recording with other values of its shared sense channel."""
     channel = replace(recording["sense"], raw=values, gain=1.0, offset=0.0, first=0, stop=values.size)
-    return replace(recording, channels=MappingProxyType({**recording.channels, "sense": channel}))
+    return recording.with_channel(channel)
 
 
 def scan(seed: int) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def estimate_with_terms(
         if _converged(previous, corrected, bare):
             break
     if "intensity" in absorbed:
-        complete = replace(corrected, channels={**corrected.channels, "intensity": absorbed["intensity"]})
+        complete = corrected.with_channel(absorbed["intensity"])
         motion = run(complete, linearised_device(bare, functions))
     axes = {name: _with_term_motion(axis, motion, functions, name) for name, axis in motion.axes.items()}
     axes = {name: _on_recorded_reference(axis, recording, absorbed, bare, name) for name, axis in axes.items()}

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from estimation.diagnosis.diagnose import Diagnosis
     from estimation.diagnosis.predict import Predicted
     from estimation.identification.calibrate import Identification
+    from recon.imaging.intensity_drift import DriftKind
     from recon.pipeline import Reconstruction
     from recon.scan_design import ScanCandidate, SustainedBand
     from scanner.motion import Motion
@@ -177,6 +178,7 @@ def reconstruct(
     flip_y: bool = False,
     spot: float | None = None,
     sense_only: bool = False,
+    intensity_drift: DriftKind | None = None,
     mapping: MappingSource | None = None,
     truth: Mapping[str, Any] | None = None,
 ) -> Reconstruction:
@@ -191,6 +193,7 @@ def reconstruct(
         flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
         spot: standard deviation of the beam's spot [px], for the account of the blur.
         sense_only: do not correct the phase by the error that the picture shows.
+        intensity_drift: drift of the detector to remove, ``"offset"`` or ``"gain"``; None removes none.
         mapping: needed where ``recording`` is an instrument's file.
         truth: of a simulation, for ``evaluation``; a simulated file's own truth is read from the file.
 
@@ -202,7 +205,13 @@ def reconstruct(
     from recon.pipeline import reconstruct as reconstruct_recording
 
     options = Options(
-        estimator=estimator, pixels=pixels, p=p, flips={"x": flip_x, "y": flip_y}, spot=spot, sense_only=sense_only
+        estimator=estimator,
+        pixels=pixels,
+        p=p,
+        flips={"x": flip_x, "y": flip_y},
+        spot=spot,
+        sense_only=sense_only,
+        intensity_drift=intensity_drift,
     )
     known = truth_from_simulation(truth) if truth is not None else None
     if known is None and not isinstance(recording, Recording) and mapping is None:

@@ -20,6 +20,8 @@ from recon.evaluation import AxisEvaluation, Truth, evaluate_axis
 from recon.imaging import blur
 from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
 from recon.imaging.image_phase import refine_motion
+from recon.imaging.intensity_correction import correct_drift, describe_drift, measure_intensity_drift
+from recon.imaging.intensity_drift import DriftKind, IntensityDrift
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
 from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
@@ -59,6 +61,7 @@ class Options:
         fill_radius: holes up to this many pixels are filled and marked as filled; 0 fills none.
         spot: standard deviation of the beam's spot [px] for the account of the blur. A recording does not contain it.
         sense_only: keep the phase of the estimator, without the correction by the phase error that the picture shows.
+        intensity_drift: drift of the detector to remove, "offset" or "gain"; None removes none.
         frames: number of frames to write; None for none.
         frame_time: duration of a frame to write [s], instead of ``frames``.
     """
@@ -71,6 +74,7 @@ class Options:
     fill_radius: int = 0
     spot: float | None = None
     sense_only: bool = False
+    intensity_drift: DriftKind | None = None
     frames: int | None = None
     frame_time: float | None = None
 
@@ -88,6 +92,7 @@ class Reconstruction:
         phase_errors: phase error of each time slice that forward and backward half-periods show.
         readout_phase: phase error of the readout that the picture showed and that was removed, by axis; without the
             axes of which nothing determined it.
+        intensity_drift: drift that was removed, by detector; empty unless it was asked for.
         evaluation: estimate against the truth, by axis; empty without a truth.
         truth: of a simulation; None without one.
         defects: clock jumps, gaps, clipping and missing parts of the recording.
@@ -107,6 +112,7 @@ class Reconstruction:
     spot: float | None
     phase_errors: list[PhaseError]
     readout_phase: Mapping[str, ReadoutPhase]
+    intensity_drift: Sequence[IntensityDrift | None]
     evaluation: Mapping[str, AxisEvaluation]
     truth: Truth | None
     defects: list[Defect]
@@ -149,7 +155,7 @@ class EstimatedMotion:
         grid: the pixels over the device's field of view, else over the range of the motion.
         field_notes, motion_notes: what a reader has to know of the field and of the motion, a line each.
         phase_errors: of the motion, as the picture shows them; None where they were not measured.
-        readout_phase: as in ``Reconstruction``.
+        readout_phase, intensity_drift: as in ``Reconstruction``.
     """
 
     prepared: PreparedRecording
@@ -159,6 +165,7 @@ class EstimatedMotion:
     motion_notes: list[str]
     phase_errors: list[PhaseError] | None = None
     readout_phase: Mapping[str, ReadoutPhase] = field(default_factory=dict)
+    intensity_drift: Sequence[IntensityDrift | None] = ()
 
     @property
     def beam(self) -> Motion:
@@ -219,7 +226,7 @@ def _reconstruct_prepared(
         estimated = correct_readout_phase(estimated, options)
         progress.update()
         progress.set_postfix_str("gridding")
-        gridded = grid_scan(estimated)
+        gridded = grid_scan(correct_intensity_drift(estimated, options))
         progress.update()
         progress.set_postfix_str("assessment")
         result = assess(gridded, options, truth)
@@ -275,6 +282,20 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
 
 
+def correct_intensity_drift(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
+    """Remove the drift of the detectors from the intensity if it is asked for."""
+    if options.intensity_drift is None:
+        return estimated
+    prepared = estimated.prepared
+    drifts = measure_intensity_drift(estimated.beam, prepared.intensity, estimated.grid, options.intensity_drift)
+    intensity = correct_drift(prepared.intensity, drifts)
+    recording = prepared.recording.with_channel(intensity)
+    notes = [*estimated.motion_notes, *describe_drift(drifts, intensity.unit)]
+    return replace(
+        estimated, prepared=replace(prepared, recording=recording), intensity_drift=drifts, motion_notes=notes
+    )
+
+
 def grid_scan(estimated: EstimatedMotion) -> GriddedScan:
     """Grid the intensity, and mark the pixels that defects affect.
 
@@ -307,6 +328,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         spot=options.spot,
         phase_errors=estimated.phase_errors or [],
         readout_phase=estimated.readout_phase,
+        intensity_drift=estimated.intensity_drift,
         evaluation={axis: evaluate_axis(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles}
         if truth
         else {},

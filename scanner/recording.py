@@ -221,6 +221,10 @@ class Recording:
             raise BadInput(what, file=self.path, hint=f"it runs from {self.start:g} s to {self.end:g} s")
         return replace(self, channels=MappingProxyType(nonempty))
 
+    def with_channel(self, channel: Channel) -> Recording:
+        """Return the recording with a channel added, or replaced where there is one of its name."""
+        return replace(self, channels=MappingProxyType({**self.channels, channel.name: channel}))
+
     def write(self, path: str | Path, truth: Truth | None = None) -> None:
         """Write a file that :meth:`open` reads. It appears at ``path`` when it is complete.
 

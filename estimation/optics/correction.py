@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -36,7 +35,7 @@ def correct_intensity(recording: Recording, device: Device) -> Recording:
         raw=LazySamples(channel.shape, np.dtype(np.float64), corrected),
         first=0, stop=channel.size, gain=1.0, offset=0.0, start=start,
     )  # fmt: skip
-    return replace(recording, channels=MappingProxyType({**recording.channels, "intensity": intensity}))
+    return recording.with_channel(intensity)
 
 
 @dataclass(frozen=True)

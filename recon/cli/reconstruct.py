@@ -71,6 +71,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sense-only", action="store_true", help="do not correct the phase by the error that the picture shows"
     )
     parser.add_argument(
+        "--intensity-drift",
+        choices=("offset", "gain"),
+        help="remove a drift of the detector's offset (1/f noise) or gain (bleaching), found at crossings of the scan",
+    )
+    parser.add_argument(
         "--spot", type=parse_positive, metavar="PX", help="sd of the beam's spot in pixels, for the blur's account"
     )
     parser.add_argument("--seed", type=int, default=0, help="of whatever is drawn at random (nothing is, at present)")
@@ -88,12 +93,17 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         fill_radius=args.fill,
         spot=args.spot,
         sense_only=args.sense_only,
+        intensity_drift=args.intensity_drift,
         frames=args.frames,
         frame_time=args.frame_time,
     )
     if len(args.recordings) > 1 or args.scheduler or args.workers:
         return _run_many(args, options)
     live = None
+    if args.follow and args.intensity_drift:
+        from scanner.errors import BadInput
+
+        raise BadInput("needs a whole recording", channel="--intensity-drift", hint="leave out --follow")
     if args.follow:
         from recon.follow import follow_recording
 

@@ -68,6 +68,18 @@ def pixel_index(angle: NDArray[Any] | float, half_angle: float, n: int) -> NDArr
     return _pixels(angle, half_angle, n)
 
 
+def find_sample_pixels(theta_x: NDArray[Any], theta_y: NDArray[Any], grid: Grid) -> NDArray[np.int32]:
+    """Return the number of the pixel of each sample, row by row; -1 outside the field and for NaN.
+
+    Args:
+        theta_x, theta_y: mechanical angles, shape (n,) [rad].
+        grid: the pixels.
+    """
+    column = pixel_index(theta_x, grid.half_angle_x, grid.width)
+    row = pixel_index(theta_y, grid.half_angle_y, grid.height)
+    return np.where((column >= 0) & (row >= 0), row * grid.width + column, -1).astype(np.int32)
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _find_pixels_fast(x, y, values, half_x, half_y, width, height, index):  # type: ignore[no-untyped-def]
     """`_find_pixels_exact` without branches and divisions, for SIMD; False if a position is too close to an edge.

@@ -8,13 +8,13 @@ difference is the variance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from recon.imaging.gridding import pixel_index
+from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.picture import Grid, Picture
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -43,7 +43,7 @@ class SampleNoise(NamedTuple):
         return self.floor + self.slope * np.maximum(intensity - self.dark, 0.0)
 
 
-def measure_sample_noise(pixel: NDArray[np.int64], intensity: Array) -> SampleNoise | None:
+def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> SampleNoise | None:
     """Noise of a sample from pairs of samples in one pixel; None without pairs.
 
     Args:
@@ -77,9 +77,7 @@ def measure_noise(beam: Motion, intensity: Channel, grid: Grid) -> tuple[SampleN
     """
     count = min(intensity.size, MAX_NOISE_SAMPLES)
     x, y = (beam.axes[axis].angle.read(0, count) for axis in AXES)
-    column = pixel_index(x, grid.half_angle_x, grid.width)
-    row = pixel_index(y, grid.half_angle_y, grid.height)
-    pixel = np.where((column >= 0) & (row >= 0), row * grid.width + column, -1)
+    pixel = find_sample_pixels(x, y, grid)
     values = intensity.read(0, count).reshape(count, -1)
     return tuple(measure_sample_noise(pixel, detector) for detector in values.T)
 

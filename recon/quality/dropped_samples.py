@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -233,4 +232,4 @@ def restore_timing(recording: Recording, dropped: DroppedSamples) -> Recording:
     shape = channel.size + dropped.missing, *channel.shape[1:]
     raw = LazySamples(shape, np.dtype(np.float64), read)
     restored = replace(channel, raw=raw, first=0, stop=shape[0], gain=1.0, offset=0.0)
-    return replace(recording, channels=MappingProxyType({**recording.channels, "intensity": restored}))
+    return recording.with_channel(restored)

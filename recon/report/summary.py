@@ -94,6 +94,16 @@ def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEv
     return blur.blur_by_cause(float(np.mean(own.amplitude)), half, result.pixels(axis), phase, amplitude, spot)
 
 
+def intensity_drift_summary(result: Reconstruction) -> list[dict[str, Any] | None] | None:
+    """Drift that was removed, by detector; None where no removal was asked for."""
+    if not result.intensity_drift:
+        return None
+    return [
+        None if drift is None else {"kind": drift.kind, "rms": float(np.std(drift.values)), "sd": drift.sd}
+        for drift in result.intensity_drift
+    ]
+
+
 def summarise(result: Reconstruction) -> dict[str, Any]:
     """The summary: quantities by axis, and the same grouped by quantity as CONTRACT names them."""
     axes = {axis: axis_summary(result, axis) for axis in AXES}
@@ -114,6 +124,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "samples": int(result.picture.coverage.sum()),
         "outside": result.picture.outside,
         "dropped": result.unlocated_samples,
+        "intensity_drift": intensity_drift_summary(result),
         "trouble": [asdict(each) for each in result.defects],
         "affected": float(np.mean(result.affected)),
         "seconds": result.seconds,

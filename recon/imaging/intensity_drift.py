@@ -1,0 +1,298 @@
+"""Slow changes of the detector's offset or gain, solved through the self-crossings of the scan.
+
+The model of sample i in pixel p and block k of consecutive samples is
+
+    d_i = s_p + h_p b_k + white noise,
+
+with h_p = 1 for an offset (1/f noise of a detector, stray light) and h_p proportional to s_p for a gain (bleaching,
+laser power). The scene s is free, so only samples that visit a pixel at different times determine b. The prior of b is
+a Gaussian process whose power spectral density A/f + B/f² (flicker noise and random walk) is estimated from the same
+recording. Eliminating s leaves linear equations in b that conjugate gradients solve (Keihänen, Kurki-Suonio and
+Poutanen 2005, doi:10.1111/j.1365-2966.2005.09055.x, there for maps of the microwave background).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+from scipy.optimize import nnls
+from scipy.sparse.linalg import LinearOperator, cg
+
+from scanner.arrays import Array
+
+DriftKind = Literal["offset", "gain"]
+
+BLOCK_S = 3e-6
+"""Length of a block [s]: blocks resolve drift up to 170 kHz. Faster drift lies below the noise of a sample."""
+
+WINDOW_SAMPLES = 1 << 22
+"""Samples solved together. It bounds the memory; later windows use the scene of the earlier ones."""
+
+MIN_BLOCKS = 64
+"""Shortest recording that is solved: six octaves determine the three coefficients of the spectrum."""
+
+MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
+"""Median of the power of Gaussian noise over its mean. Medians leave out lines of the scene in the residual."""
+
+TRANSMISSION_DRAWS = 8
+"""Simulated recordings of white noise: they determine the lowest octave, of one frequency, to a third."""
+
+SPECTRUM_ROUNDS = 5
+"""Fits of the spectrum, each weighted by the model of the previous one: weights then change by less than 1 %."""
+
+GAIN_ROUNDS = 3
+"""Linearisations of the product of scene and gain: each reduces the error of a gain change g to about its square."""
+
+MAX_CG_STEPS = 200
+"""Limit of the steps of conjugate gradients. Ten are usual; more are needed where few pixels cross."""
+
+CG_TOLERANCE = 1e-3
+"""Relative residual at which conjugate gradients end: a thousandth of the drift, far below its standard deviation."""
+
+
+class SceneSums(NamedTuple):
+    """Sum ``total`` of corrected samples and their ``number`` by pixel, each of shape (pixels,)."""
+
+    total: Array
+    number: Array
+
+    @property
+    def mean(self) -> Array:
+        """Mean of each pixel, shape (pixels,); 0 where there is no sample."""
+        return self.total / np.maximum(self.number, 1.0)
+
+    def add(self, pixel: NDArray[np.int32], values: Array) -> SceneSums:
+        """Return the sums with further samples, both of shape (n,)."""
+        return SceneSums(
+            self.total + np.bincount(pixel, values, self.total.size),
+            self.number + np.bincount(pixel, minlength=self.number.size),
+        )
+
+
+class DriftModel(NamedTuple):
+    """What is known of a drift before it is solved.
+
+    Attributes:
+        kind: offset or gain.
+        block: samples in a block.
+        rate: blocks by second [Hz].
+        free: degrees of freedom of the samples that the means of the pixels leave, as a fraction.
+        level: what a gain multiplies on average: root mean square of the scene; 1 for an offset.
+        white, flicker, walk: two-sided power spectral density [unit²/Hz] of the noise in the means of blocks, and
+            coefficients of that of the drift times ``level``, ``flicker / f + walk / f²``.
+    """
+
+    kind: DriftKind
+    block: int
+    rate: float
+    free: float
+    level: float
+    white: float = 0.0
+    flicker: float = 0.0
+    walk: float = 0.0
+
+    def sensitivity(self, scene: SceneSums) -> Array:
+        """Change of a sample of each pixel with the drift, 0 in the pixel of samples that are left out."""
+        change = np.ones(scene.number.size) if self.kind == "offset" else scene.mean / self.level
+        change[-1] = 0.0
+        return change
+
+    def remove(self, intensity: Array, drift: Array) -> Array:
+        """Return samples of whole blocks, shape (n,), without a drift, shape (blocks,)."""
+        repeated = np.repeat(drift, self.block)
+        return intensity - repeated if self.kind == "offset" else intensity / (1.0 + repeated / self.level)
+
+    def precision(self, frequency: Array) -> Array:
+        """Inverse of the prior's power at frequencies from 0 on [Hz]; 0 at 0, because the mean is free."""
+        power = (self.flicker / frequency[1:] + self.walk / frequency[1:] ** 2) * self.rate
+        return np.concatenate([[0.0], 1.0 / power])
+
+
+@dataclass(frozen=True)
+class IntensityDrift:
+    """Estimated drift of a detector.
+
+    Attributes:
+        kind: offset in the intensity's unit, or relative gain.
+        block: samples in a block.
+        values: drift of each block, shape (blocks,); its mean is 0.
+        sd: standard deviation of a value.
+    """
+
+    kind: DriftKind
+    block: int
+    values: Array
+    sd: float
+
+    def correct(self, intensity: Array, first: int = 0) -> Array:
+        """Return samples without the drift, shape (n,).
+
+        Args:
+            intensity: shape (n,).
+            first: number of the first of these samples in the recording.
+        """
+        drift = self.values[(first + np.arange(intensity.size)) // self.block]
+        return intensity - drift if self.kind == "offset" else intensity / (1.0 + drift)
+
+
+def estimate_intensity_drift(
+    pixel: NDArray[np.int32], intensity: Array, pixels: int, sample_rate: float, kind: DriftKind
+) -> IntensityDrift | None:
+    """Estimate the drift of a detector; None where too few pixels were visited twice.
+
+    Args:
+        pixel: number of the pixel of each sample, negative where it belongs to none, shape (n,).
+        intensity: shape (n,); samples that are not finite are left out.
+        pixels: number of pixels of the picture.
+        sample_rate: [Hz].
+        kind: what drifts.
+    """
+    block = max(1, round(BLOCK_S * sample_rate))
+    missing = -pixel.size % block
+    used = (pixel >= 0) & np.isfinite(intensity)
+    pixel = np.pad(np.where(used, pixel, pixels), (0, missing), constant_values=pixels)  # one more pixel for the rest
+    intensity = np.pad(np.where(used, intensity, 0.0), (0, missing))
+    window = WINDOW_SAMPLES // block * block
+    nothing = SceneSums(np.zeros(pixels + 1), np.zeros(pixels + 1))
+    model = fit_drift_model(pixel[:window], intensity[:window], nothing, sample_rate / block, block, kind)
+    if model is None:
+        return None
+    if model.flicker == model.walk == 0.0:
+        return IntensityDrift(kind, block, np.zeros(pixel.size // block), 0.0)
+    scene, parts = nothing, []
+    for first in range(0, pixel.size, window):
+        part = pixel[first : first + window], intensity[first : first + window]
+        drift = _solve_window(*part, scene, model)
+        scene = scene.add(part[0], model.remove(part[1], drift))
+        parts.append(drift)
+    values = np.concatenate(parts) / model.level
+    return IntensityDrift(kind, block, values - values.mean(), drift_sd(model, window // block) / model.level)
+
+
+def fit_drift_model(
+    pixel: NDArray[np.int32], intensity: Array, nothing: SceneSums, rate: float, block: int, kind: DriftKind
+) -> DriftModel | None:
+    """Fit the spectrum of the drift to the residual of the mean picture; None without degrees of freedom.
+
+    The mean picture takes some of the power out of the residual; simulated white noise on the same path shows how much.
+    The median density of each octave is fitted by non-negative least squares on the relative deviation.
+
+    Args:
+        pixel: as for :func:`estimate_intensity_drift`, but the last pixel where a sample belongs to none.
+        intensity: shape (n,), n a multiple of ``block``.
+        nothing: sums without samples.
+        rate, block, kind: as in :class:`DriftModel`.
+    """
+    scene = nothing.add(pixel, intensity)
+    samples = scene.number[:-1].sum()
+    free = 1.0 - np.count_nonzero(scene.number[:-1]) / max(samples, 1.0)
+    if not free > 0.0 or pixel.size < MIN_BLOCKS * block:
+        return None
+    level = 1.0 if kind == "offset" else float(np.sqrt(scene.number[:-1] @ scene.mean[:-1] ** 2 / samples))
+    model = DriftModel(kind, block, rate, free, level)
+    sensitivity = model.sensitivity(scene)
+    frequency = rfftfreq(pixel.size // block, 1.0 / rate)[1:]
+    octave = np.floor(np.log2(frequency / frequency[0])).astype(int)
+    number = np.bincount(octave)
+
+    def residual_power(values: Array) -> Array:
+        """Power of the residual of samples at each frequency above 0, relative to that of white noise of variance 1."""
+        residual = _score(pixel, values, nothing.add(pixel, values), sensitivity, block)
+        return np.abs(rfft(residual)[1:]) ** 2 / (block * samples)
+
+    random = np.random.default_rng(0)
+    white_noise = (residual_power(random.standard_normal(pixel.size)) for _ in range(TRANSMISSION_DRAWS))
+    transmission = np.mean([np.bincount(octave, power) / number for power in white_noise], axis=0)
+    power = residual_power(intensity)
+    median = np.array([np.median(power[octave == k]) for k in range(number.size)]) / MEDIAN_OF_EXPONENTIAL
+    density = median / transmission / (rate * block)
+    middle = np.bincount(octave, frequency) / number
+    terms = np.column_stack([np.ones_like(middle), 1.0 / middle, 1.0 / middle**2])
+    expected, scale = np.full_like(density, density.mean()), terms.max(axis=0)
+    for _ in range(SPECTRUM_ROUNDS):
+        weight = np.sqrt(number) / expected
+        coefficients = nnls(terms / scale * weight[:, None], density * weight)[0] / scale
+        expected = terms @ coefficients
+    return model._replace(white=coefficients[0], flicker=coefficients[1], walk=coefficients[2])
+
+
+def drift_sd(model: DriftModel, blocks: int) -> float:
+    """Standard deviation of the drift of a block, in the intensity's unit, for noise that is the same in all blocks."""
+    precision = model.precision(rfftfreq(blocks, 1.0 / model.rate))[1:]
+    return float(np.sqrt(np.mean(1.0 / (model.free / (model.white * model.rate) + precision))))
+
+
+def _solve_window(pixel: NDArray[np.int32], intensity: Array, earlier: SceneSums, model: DriftModel) -> Array:
+    """Drift of the blocks of a window in the intensity's unit, with the scene of earlier windows known."""
+    drift = np.zeros(pixel.size // model.block)
+    for _ in range(1 if model.kind == "offset" else GAIN_ROUNDS):
+        corrected = model.remove(intensity, drift)
+        sensitivity = model.sensitivity(earlier.add(pixel, corrected))
+        linear = corrected + sensitivity[pixel] * np.repeat(drift, model.block)
+        drift = _solve_linear(pixel, linear, earlier, sensitivity, model)
+    return drift
+
+
+def _solve_linear(
+    pixel: NDArray[np.int32], intensity: Array, earlier: SceneSums, sensitivity: Array, model: DriftModel
+) -> Array:
+    """Posterior mean of a drift whose effect is proportional to the given sensitivity of each pixel."""
+    blocks = pixel.size // model.block
+    size = next_fast_len(2 * blocks, real=True)  # the prior is periodic: the second half separates end and beginning
+    scene = earlier.add(pixel, intensity)
+    count = np.maximum(scene.number, 1.0)
+    information = _sum_blocks(sensitivity**2, pixel, model.block)
+    sample_variance = model.white * model.rate * model.block
+    precision = model.precision(rfftfreq(size, 1.0 / model.rate)) * sample_variance
+
+    def apply(drift: Array) -> Array:
+        mean = sensitivity * _sum_pixels(drift[:blocks], pixel, model.block, count.size) / count
+        result = irfft(rfft(drift) * precision, size)
+        result[:blocks] += information * drift[:blocks] - _sum_blocks(sensitivity * mean, pixel, model.block)
+        return result
+
+    def precondition(residual: Array) -> Array:
+        return irfft(rfft(residual) / (model.block + precision), size)
+
+    score = np.zeros(size)
+    score[:blocks] = _score(pixel, intensity, scene, sensitivity, model.block)
+    shape = (size, size)
+    solution, _ = cg(
+        LinearOperator(shape, matvec=apply, dtype=float),
+        score,
+        rtol=CG_TOLERANCE,
+        maxiter=MAX_CG_STEPS,
+        M=LinearOperator(shape, matvec=precondition, dtype=float),
+    )
+    return np.asarray(solution[:blocks])
+
+
+def _score(pixel: NDArray[np.int32], intensity: Array, scene: SceneSums, sensitivity: Array, block: int) -> Array:
+    """Sum over each block of sensitivity times residual, shape (blocks,)."""
+    weighted = sensitivity[pixel] * (intensity - scene.mean[pixel])
+    return np.asarray(weighted.reshape(-1, block).sum(axis=1))
+
+
+@njit(cache=True)
+def _sum_blocks(picture, pixel, block):  # type: ignore[no-untyped-def]
+    """Sum over each block of the values of its pixels, shape (blocks,)."""
+    sums = np.zeros(pixel.size // block)
+    for k in range(sums.size):
+        for i in range(k * block, (k + 1) * block):
+            sums[k] += picture[pixel[i]]
+    return sums
+
+
+@njit(cache=True)
+def _sum_pixels(drift, pixel, block, pixels):  # type: ignore[no-untyped-def]
+    """Sum over the samples of each pixel of the drift of their blocks, shape (pixels,)."""
+    sums = np.zeros(pixels)
+    for k in range(drift.size):
+        for i in range(k * block, (k + 1) * block):
+            sums[pixel[i]] += drift[k]
+    return sums

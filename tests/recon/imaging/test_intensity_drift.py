@@ -1,0 +1,136 @@
+"""The drift of a detector, solved through crossings of a scan with a known answer."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.cli import main
+from recon.imaging.intensity_drift import SceneSums, estimate_intensity_drift, fit_drift_model
+from tests.support.simulated import imaging
+
+RATE, PIXELS, NOISE_SD = 5e6, 200, 0.1
+
+
+def crossing_scan(duration: float, pixels: int = PIXELS) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of a scan at 4100 and 5378 Hz, and the value of a scene with detail at each sample."""
+    time = np.arange(round(duration * RATE)) / RATE
+    column, row = (
+        np.clip(((np.sin(2 * np.pi * f * time) + 1) / 2 * pixels).astype(int), 0, pixels - 1) for f in (4100.3, 5377.7)
+    )
+    pixel = (row * pixels + column).astype(np.int32)
+    scene = np.random.default_rng(0).uniform(0.2, 1.0, pixels**2)
+    return pixel, scene[pixel]
+
+
+def flicker(samples: int, knee: float, rng: np.random.Generator) -> np.ndarray:
+    """Noise of the density of white noise of sd 1 times knee/f."""
+    frequency = np.fft.rfftfreq(2 * samples, 1 / RATE)
+    factor = np.zeros_like(frequency)
+    factor[1:] = np.sqrt(knee / frequency[1:])
+    return np.fft.irfft(np.fft.rfft(rng.standard_normal(2 * samples)) * factor)[:samples]
+
+
+def block_means(values: np.ndarray, block: int) -> np.ndarray:
+    whole = values.size // block * block
+    return values[:whole].reshape(-1, block).mean(axis=1)
+
+
+def mean_error(pixel: np.ndarray, values: np.ndarray, clean: np.ndarray) -> float:
+    """Root-mean-square error of the mean picture, without its mean."""
+    counts = np.bincount(pixel)
+    error = np.bincount(pixel, values - clean)[counts > 0] / counts[counts > 0]
+    return float(np.std(error))
+
+
+def test_flicker_noise_at_ten_times_the_slow_axis_costs_at_most_5_percent() -> None:
+    """In a scan as long and as fine as the demo's."""
+    pixel, clean = crossing_scan(0.06, 400)
+    rng = np.random.default_rng(1)
+    white = clean + NOISE_SD * rng.standard_normal(clean.size)
+    drift = NOISE_SD * flicker(clean.size, 41e3, rng)
+    found = estimate_intensity_drift(pixel, white + drift, 400**2, RATE, "offset")
+    assert found is not None
+    before, after, best = (mean_error(pixel, v, clean) for v in (white + drift, found.correct(white + drift), white))
+    assert after <= 1.05 * best < before
+    error = found.values[: clean.size // found.block] - block_means(drift - drift.mean(), found.block)
+    assert 0.88 <= np.mean(np.abs(error - error.mean()) < 1.96 * found.sd) <= 0.99
+
+
+def test_bleaching_is_a_gain() -> None:
+    pixel, clean = crossing_scan(0.02)
+    gain = np.exp(-np.linspace(0.0, 0.7, clean.size))
+    noise = NOISE_SD * np.random.default_rng(2).standard_normal(clean.size)
+    found = estimate_intensity_drift(pixel, clean * gain + noise, PIXELS**2, RATE, "gain")
+    assert found is not None
+    corrected, best = found.correct(clean * gain + noise) / gain.mean(), clean + noise / gain
+    assert mean_error(pixel, corrected, clean) <= 1.02 * mean_error(pixel, best, clean)
+
+
+def test_a_steady_detector_stays_as_it_is() -> None:
+    pixel, clean = crossing_scan(0.02)
+    values = clean + NOISE_SD * np.random.default_rng(3).standard_normal(clean.size)
+    found = estimate_intensity_drift(pixel, values, PIXELS**2, RATE, "offset")
+    assert found is not None
+    assert mean_error(pixel, found.correct(values), clean) <= 1.002 * mean_error(pixel, values, clean)
+
+
+def test_windows_join(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording solved in parts has one offset, because later parts use the scene of the earlier ones."""
+    pixel, clean = crossing_scan(0.03)
+    drift = np.linspace(0.0, 0.5, clean.size)
+    values = clean + drift + NOISE_SD * np.random.default_rng(4).standard_normal(clean.size)
+    monkeypatch.setattr("recon.imaging.intensity_drift.WINDOW_SAMPLES", clean.size // 3)
+    found = estimate_intensity_drift(pixel, values, PIXELS**2, RATE, "offset")
+    assert found is not None
+    np.testing.assert_allclose(
+        found.values[: clean.size // found.block], block_means(drift - drift.mean(), found.block), atol=0.05
+    )
+
+
+def test_samples_outside_and_without_a_value_are_left_out() -> None:
+    pixel, clean = crossing_scan(0.02)
+    rng = np.random.default_rng(5)
+    values = clean + np.linspace(0.0, 0.5, clean.size) + NOISE_SD * rng.standard_normal(clean.size)
+    values[1000:2000] = np.nan
+    pixel[5000:6000] = -1
+    found = estimate_intensity_drift(pixel, values, PIXELS**2, RATE, "offset")
+    assert found is not None
+    assert np.isfinite(found.values).all()
+    assert np.ptp(found.values) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["offset", "gain"])
+def test_the_command_removes_a_drift_and_states_it(kind: str, tmp_path: Path) -> None:
+    recording = imaging()[0]
+    intensity = recording["intensity"]
+    recording.with_channel(replace(intensity, raw=intensity.read() * np.linspace(1.0, 0.6, intensity.size))).write(
+        tmp_path / "scan.h5"
+    )
+    out = tmp_path / "out"
+    assert main(["reconstruct", str(tmp_path / "scan.h5"), "-o", str(out), "--intensity-drift", kind]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    (drift,) = summary["intensity_drift"]
+    assert drift["kind"] == kind
+    assert drift["rms"] > 5 * drift["sd"] > 0
+    assert any(f"{kind} drift" in note for note in summary["notes"])
+
+
+def test_without_crossings_nothing_is_estimated() -> None:
+    pixel = np.arange(PIXELS**2, dtype=np.int32)
+    assert estimate_intensity_drift(pixel, np.ones(pixel.size), PIXELS**2, RATE, "offset") is None
+
+
+def test_the_spectrum_of_flicker_noise_is_measured() -> None:
+    """Within a third: the mean picture takes some of the drift below the scan's frequencies."""
+    pixel, clean = crossing_scan(0.03)
+    rng = np.random.default_rng(6)
+    values = clean + NOISE_SD * (rng.standard_normal(clean.size) + flicker(clean.size, 41e3, rng))
+    nothing = SceneSums(np.zeros(PIXELS**2 + 1), np.zeros(PIXELS**2 + 1))
+    model = fit_drift_model(pixel, values, nothing, RATE / 15, 15, "offset")
+    assert model is not None
+    assert model.white == pytest.approx(NOISE_SD**2 / RATE, rel=0.1)
+    assert model.flicker == pytest.approx(41e3 * NOISE_SD**2 / RATE, rel=0.33)
