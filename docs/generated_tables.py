@@ -15,6 +15,7 @@ from dataclasses import MISSING, fields
 from estimation.estimators import estimators
 from recon.cli import COMMANDS, add_command
 from scanner.device import READOUTS, Capacitance, Drive, Mechanics, Scan
+from scanner.geometry import Geometry
 from scanner.terms import STAGES, Term, catalogue
 
 DEVICE_TABLES: dict[str, type] = {
@@ -23,6 +24,7 @@ DEVICE_TABLES: dict[str, type] = {
     "[x.drive], [y.drive]": Drive,
     **{f'[x.readout], [y.readout] or [readout], kind = "{kind}"': readout for kind, readout in READOUTS.items()},
     "[scan]": Scan,
+    "[geometry]": Geometry,
 }
 """Heading of a table of the device file -> the dataclass whose fields are its keys."""
 

@@ -158,7 +158,8 @@ def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = Fa
         error.file = film.path
         raise
     measured, measured_sd = _measure(film, model, quiet)
-    shift, sd = _smooth(measured, measured_sd, rows)
+    shift, sd = _smooth(measured, measured_sd, rows, model.detail_sd)
+    sd = np.hypot(sd, model.fill_error)
     account = _Account()
     with tqdm(
         total=film.frames, desc="correct", unit="frame", file=sys.stderr, leave=False, disable=quiet or None
@@ -217,15 +218,15 @@ def _measure(film: Film, model: FilmModel, quiet: bool) -> tuple[Array, Array]:
     return value, sd
 
 
-def _smooth(value: Array, sd: Array, rows: int) -> tuple[Array, Array]:
+def _smooth(value: Array, sd: Array, rows: int, shared_sd: float) -> tuple[Array, Array]:
     """Smooth over time; frames of an odd number of lines may alternate in direction, and are smoothed apart."""
     if not np.isfinite(value).any():
         raise BadInput("no frame determines a line phase")
     if rows % 2 == 0 or len(value) < 4 or not all(np.isfinite(value[k::2]).any() for k in (0, 1)):
-        return smooth_phases(value, sd)
+        return smooth_phases(value, sd, shared_sd)
     smooth, smooth_sd = np.empty_like(value), np.empty_like(sd)
     for k in (0, 1):
-        smooth[k::2], smooth_sd[k::2] = smooth_phases(value[k::2], sd[k::2])
+        smooth[k::2], smooth_sd[k::2] = smooth_phases(value[k::2], sd[k::2], shared_sd)
     return smooth, smooth_sd
 
 

@@ -18,6 +18,7 @@ from scanner import device_toml
 from scanner.device_toml import CAN_BE_OFF, FINITE, NONZERO, NOT_NEGATIVE, POSITIVE, WHOLE
 from scanner.errors import DeviceInvalid
 from scanner.files import parse_toml, read_toml
+from scanner.geometry import Geometry
 
 AXES = ("x", "y")
 DEFAULT_TOLERANCE = 0.02
@@ -350,6 +351,7 @@ class Device:
         axes: ``"x"``, ``"y"`` or both.
         readout: the one readout that senses ``C_x + C_y`` where all combs share an electrode, else None.
         scan: field of view, None where the file states none.
+        geometry: path of the beam over the mirror, for point clouds; None where the file states none.
         shared_tolerance: stated relative uncertainties of the shared readout.
         extra: unknown keys, nested as in the file.
         source: where the device came from, for messages.
@@ -359,6 +361,7 @@ class Device:
     axes: Mapping[str, Axis]
     readout: Readout | None = None
     scan: Scan | None = None
+    geometry: Geometry | None = None
     shared_tolerance: Mapping[str, float] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
     source: str | None = field(default=None, compare=False)
@@ -416,6 +419,7 @@ class Device:
             axes=axes,
             readout=_readout(rest),
             scan=rest.take_as(Scan, "scan"),
+            geometry=rest.take_as(Geometry, "geometry"),
             shared_tolerance=_tolerance(rest),
             extra=rest.take_rest(),
             source=source,
@@ -430,7 +434,7 @@ class Device:
             body |= {"tolerance": dict(axis.tolerance)} if axis.tolerance else {}
             body |= {"terms": {effect: dict(values) for effect, values in axis.terms.items()}} if axis.terms else {}
             table[name] = device_toml.merged(body, axis.extra)
-        for key, value in (("readout", self.readout), ("scan", self.scan)):
+        for key, value in (("readout", self.readout), ("scan", self.scan), ("geometry", self.geometry)):
             if value is not None:
                 table[key] = device_toml.to_table(value)
         if self.shared_tolerance:

@@ -25,6 +25,7 @@ COMMANDS = {
     "identify": "identify the constants of a device from recordings at rest, of a free decay and driven",
     "predict": "predict a recording from its drive with a device, and compare",
     "diagnose": "locate, name and model effects that the nominal device omits",
+    "point-cloud": "turn angles and ranges of a LiDAR into points in space",
     "bidirectional": "measure and correct the line phase of a resonant raster film",
     "design": "find drive frequencies for a given field, resolution, frame rate and fill factor",
     "blur-study": "simulate and compare phantoms, scans, drifts, noise, estimators, resolutions and p in one table",

@@ -20,6 +20,7 @@ from recon.imaging.line_phase import (
     lag_at,
     search_shift,
     shift_equations,
+    standard_errors,
 )
 from scanner.arrays import Array
 from scanner.errors import BadInput
@@ -36,6 +37,9 @@ MAX_FILL_ITERATIONS = 20
 Frame = Sequence[NDArray[np.float32]]
 """Pictures of one frame by detector, each of shape (rows, columns)."""
 
+
+MIN_NOISE_FRACTION = 0.1
+"""Least part of a squared standard error that is taken as noise; guards against a chance estimate of the rest."""
 
 COLUMN_GROUPS = 16
 """Groups of columns whose lag is measured separately, for the figure that compares it with the law."""
@@ -61,6 +65,8 @@ class FilmModel:
         fill: fraction of the sweep's width that the columns cover; 0 if the shift is the same in all columns.
         fill_sd: its standard error; nan if the film does not determine it.
         typical: median shift of the sampled frames [px].
+        detail_sd: error of the shift by the specimen's own detail, which frames of one specimen share [px].
+        fill_error: error of the shift by that of the fill, which all frames share [px].
         lag: measured lag in groups of columns.
     """
 
@@ -68,6 +74,8 @@ class FilmModel:
     fill: float
     fill_sd: float
     typical: float
+    detail_sd: float
+    fill_error: float
     lag: ColumnLag
 
 
@@ -106,48 +114,52 @@ def fit_film(frames: Sequence[Frame]) -> FilmModel:
         hint = "sum frames or channels, or take a film of a specimen with structure along the lines"
         raise BadInput("the frames have too little structure or too much noise to determine a line phase", hint=hint)
     used = [(frame, shift) for frame, shift in zip(frames, shifts, strict=True) if np.isfinite(shift)]
-    fill_squared, sd = _fit_fill(used, smoothing)
+    fill_squared, sd, coupling = _fit_fill(used, smoothing)
     typical, sd_of_fill = float(np.nanmedian(shifts)), np.nan
     if fill_squared > 1.96 * sd:
         sd_of_fill = sd / (2.0 * np.sqrt(fill_squared))
     else:
         fill_squared = 0.0
-    lag = _measure_lag(frames, fill_squared, smoothing, typical)
-    return FilmModel(smoothing, float(np.sqrt(fill_squared)), float(sd_of_fill), typical, lag)
+    lag, detail_sd = _measure_lag(frames, fill_squared, smoothing, typical)
+    return FilmModel(
+        smoothing=smoothing,
+        fill=float(np.sqrt(fill_squared)),
+        fill_sd=float(sd_of_fill),
+        typical=typical,
+        detail_sd=detail_sd,
+        fill_error=abs(coupling) * min(sd, MAX_FILL_SQUARED / 2),
+        lag=lag,
+    )
 
 
-def smooth_phases(value: Array, sd: Array) -> tuple[Array, Array]:
+def smooth_phases(value: Array, sd: Array, shared_sd: float = 0.0) -> tuple[Array, Array]:
     """Smooth the shifts of successive frames as a random walk observed with noise; bridge undetermined frames.
 
-    The walk's step and a factor on the stated standard errors are estimated by maximum likelihood. Where the frames
-    scatter less than their errors state, the rest is an error that all frames of one specimen share: it is added to the
-    result in full, because no averaging reduces it.
+    The walk's step is estimated by maximum likelihood.
 
     Args:
         value: shift of each frame [px], shape (n,); nan where undetermined.
         sd: standard errors [px], shape (n,).
+        shared_sd: part of them that all frames share, which no averaging reduces [px].
 
     Returns:
         Shift and standard deviation of each frame [px], shape (n,).
     """
     known = np.isfinite(value)
-    typical = float(np.median(sd[known])) ** 2
-    grid = np.meshgrid(typical * np.logspace(-6.0, 3.0, 37), np.linspace(0.1, 2.0, 20))
-    step, factor = (each.ravel() for each in grid)
-    noise = np.where(known, np.square(sd), np.inf)
+    noise = np.where(known, np.maximum(np.square(sd) - shared_sd**2, MIN_NOISE_FRACTION * np.square(sd)), np.inf)
+    typical = float(np.median(noise[known]))
+    step = typical * np.logspace(-6.0, 3.0, 73)
     first = int(np.argmax(known))
-    mean, variance = np.full(step.size, value[first]), np.full(step.size, 1e6 * typical)
-    cost = np.square(np.log(factor) / 0.5)  # the stated errors are right to about 50 % of their variance
-    for v, r in zip(value[first:], noise[first:], strict=True):
+    mean, variance, cost = np.full(step.size, value[first]), np.full(step.size, noise[first]), np.zeros(step.size)
+    for v, r in zip(value[first + 1 :], noise[first + 1 :], strict=True):
         variance = variance + step
         if np.isfinite(v):
-            total = variance + factor * r
+            total = variance + r
             cost += np.square(v - mean) / total + np.log(total)
             gain = variance / total
             mean, variance = mean + gain * (v - mean), (1.0 - gain) * variance
-    best = int(np.argmin(cost))
-    smooth, left = _smooth_walk(np.where(known, value, 0.0), factor[best] * noise, step[best])
-    return smooth, np.sqrt(left + max(0.0, 1.0 - factor[best]) * typical)
+    smooth, left = _smooth_walk(np.where(known, value, 0.0), noise, float(step[np.argmin(cost)]))
+    return smooth, np.sqrt(left + shared_sd**2)
 
 
 def _smooth_walk(value: Array, noise: Array, step: float) -> tuple[Array, Array]:
@@ -177,11 +189,14 @@ def _common_shift(frames: Sequence[Frame]) -> float:
     return float(np.median([search_shift(np.sum(frame, axis=0)) for frame in frames]))
 
 
-def _fit_fill(used: Sequence[tuple[Frame, float]], smoothing: float) -> tuple[float, float]:
-    """fill² and its standard error from frames and their shifts; shift and tilt of each frame are eliminated."""
+def _fit_fill(used: Sequence[tuple[Frame, float]], smoothing: float) -> tuple[float, float, float]:
+    """fill², its standard error, and the change of the mean shift with it [px].
+
+    Shift and tilt of each frame are eliminated.
+    """
     fill_squared, shifts = 0.0, [shift for _, shift in used]
     for _ in range(MAX_FILL_ITERATIONS):
-        score, slope = 0.0, 0.0
+        score, slope, coupling = 0.0, 0.0, 0.0
         for index, (frame, _) in enumerate(used):
             equations = [shift_equations(each, shifts[index], fill_squared, smoothing) for each in frame]
             blocks = np.sum([each.score for each in equations], axis=0)
@@ -189,37 +204,56 @@ def _fit_fill(used: Sequence[tuple[Frame, float]], smoothing: float) -> tuple[fl
             total = slopes.sum(axis=0)
             known = np.linalg.solve(total[:2, :2], blocks.sum(axis=0)[:2])
             shifts[index] += float(np.clip(known[0], -1.0, 1.0))
+            coupling += total[0, 2] / total[0, 0] / len(used)
             projection = total[2, :2] @ np.linalg.inv(total[:2, :2])
             left = blocks - slopes[:, :, :2] @ known
             score = score + left[:, 2] - left[:, :2] @ projection
             slope += total[2, 2] - projection @ total[:2, 2]
         if not slope > 0.0:
-            return 0.0, np.inf
+            return 0.0, np.inf, coupling
         old, fill_squared = fill_squared, float(np.clip(fill_squared + np.sum(score) / slope, 0.0, MAX_FILL_SQUARED))
         if abs(fill_squared - old) < 1e-4:
             break
     score = np.asarray(score) - np.mean(score)
-    return fill_squared, float(np.sqrt(np.sum(np.square(score)))) / slope
+    return fill_squared, float(np.sqrt(np.sum(np.square(score)))) / slope, coupling
 
 
-def _measure_lag(frames: Sequence[Frame], fill_squared: float, smoothing: float, typical: float) -> ColumnLag:
-    """Lag in groups of columns: the law, and what is left to it in the frames corrected by it."""
+def _measure_lag(
+    frames: Sequence[Frame], fill_squared: float, smoothing: float, typical: float
+) -> tuple[ColumnLag, float]:
+    """Lag in groups of columns, the law and what is left to it, and the error by the specimen's own detail [px].
+
+    Scores of a block are added up over the frames. What their noise is averages out; what the specimen's detail adds to
+    them is the same in each frame of one specimen.
+    """
     columns = frames[0][0].shape[1]
     group = np.arange(columns) * COLUMN_GROUPS // columns
     first = np.searchsorted(group, np.arange(COLUMN_GROUPS))
     score, slope = np.zeros((2, BLOCKS_ACROSS, COLUMN_GROUPS))
+    block_score, block_slope = np.zeros((BLOCKS_ACROSS**2, 2)), np.zeros((BLOCKS_ACROSS**2, 2, 2))
+    variances = []
     for frame in frames:
         phase = estimate_line_phase(frame, typical, fill_squared, smoothing)
         if phase.sd < MAX_SHIFT_SD_PX:
+            variances.append(phase.sd**2)
             for each in frame:
                 equations = shift_equations(each, phase.shift, fill_squared, smoothing)
                 score += phase.shift * np.add.reduceat(equations.column_score, first, axis=1)
                 slope += phase.shift**2 * np.add.reduceat(equations.column_slope, first, axis=1)
+                block_score += equations.score[:, :2]
+                block_slope += equations.slope[:, :2, :2]
     total = np.where(slope.sum(axis=0) > 0.0, slope.sum(axis=0), np.nan)
     left = score.sum(axis=0) / total
     scatter = np.sum(np.square(score - slope * left), axis=0) * BLOCKS_ACROSS / (BLOCKS_ACROSS - 1)
     place = np.add.reduceat(column_places(columns), first) / np.bincount(group)
-    return ColumnLag(place, lag_at(place, fill_squared) + left, np.sqrt(scatter) / total)
+    lag = ColumnLag(place, lag_at(place, fill_squared) + left, np.sqrt(scatter) / total)
+    if len(variances) < 2:
+        return lag, 0.0
+    step = np.linalg.solve(block_slope.sum(axis=0), block_score.sum(axis=0))
+    pooled = float(standard_errors(block_score, block_slope, step)[0]) ** 2
+    count = len(variances)
+    detail = (pooled - np.mean(variances) / count) * count / (count - 1)
+    return lag, float(np.sqrt(np.clip(detail, 0.0, np.mean(variances))))
 
 
 def _check_reversed(frames: Sequence[Frame]) -> None:

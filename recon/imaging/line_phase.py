@@ -147,18 +147,22 @@ def shift_equations(frame: NDArray[Any], shift: float, fill_squared: float, smoo
     row_block, column_block = (np.arange(size) * BLOCKS_ACROSS // size for size in (rows, columns))
     score, slope = np.zeros((BLOCKS_ACROSS**2, 3)), np.zeros((BLOCKS_ACROSS**2, 3, 3))
     column_score, column_slope = np.zeros((BLOCKS_ACROSS, columns)), np.zeros((BLOCKS_ACROSS, columns))
-    _accumulate(moved, even, odd, lag, u, by_fill, row_block, column_block, score, slope, column_score, column_slope)
+    border = math.ceil(abs(shift) / 2) + 2  # columns that one direction did not record, and those of the difference
+    places = lag, u, by_fill, row_block, column_block
+    _accumulate(moved, even, odd, border, *places, score, slope, column_score, column_slope)
     return ShiftEquations(score, slope, column_score, column_slope)
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(moved, even, odd, lag, u, by_fill, row_block, column_block, score, slope, column_score, column_slope):  # type: ignore[no-untyped-def]
+def _accumulate(  # type: ignore[no-untyped-def]
+    moved, even, odd, border, lag, u, by_fill, row_block, column_block, score, slope, column_score, column_slope
+):
     rows, columns = moved.shape
     mean, independent, regressor = np.empty(3), np.empty(3), np.empty(3)
     for i in range(1, rows - 1):
         sign = 1.0 if i % 2 == 0 else -1.0
         own, other = (even, odd) if i % 2 == 0 else (odd, even)
-        for j in range(2, columns - 2):
+        for j in range(border, columns - border):
             difference = sign * (moved[i, j] - 0.5 * (moved[i - 1, j] + moved[i + 1, j]))
             own_x, other_x = 0.5 * (own[i, j + 1] - own[i, j - 1]), 0.5 * (other[i, j + 1] - other[i, j - 1])
             own_y, other_y = 0.5 * (own[i + 1, j] - own[i - 1, j]), 0.5 * (other[i + 1, j] - other[i - 1, j])
@@ -201,12 +205,12 @@ def estimate_line_phase(
         if abs(shift - start) > MAX_SHIFT_FRACTION * columns:
             return UNDETERMINED
         if abs(step[0]) < CONVERGED_PX:
-            return LinePhase(shift, float(_standard_errors(score, slope, step)[0]))
+            return LinePhase(shift, float(standard_errors(score, slope, step)[0]))
     return UNDETERMINED
 
 
-def _standard_errors(score: Array, slope: Array, step: Array) -> Array:
-    """Standard errors from the scatter of the blocks' scores, shape (parameters,)."""
+def standard_errors(score: Array, slope: Array, step: Array) -> Array:
+    """Standard errors from the scatter of the blocks' scores, shape (parameters,) [of ``step``]."""
     left = score - slope @ step
     inverse = np.linalg.inv(slope.sum(axis=0))
     blocks = len(score)

@@ -198,6 +198,16 @@ def conclude_bidirectional(summary: Mapping[str, Any]) -> str:
     )
 
 
+def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
+    """How many points there are, how far they reach and how uncertain they are."""
+    reach = max(abs(edge) for edge in summary["extent_m"]["z"])
+    sd = max(summary["sd_m"].values())
+    return (
+        f"{summary['points']} points from {summary['shots']} shots, up to {reach:.3g} m away, with a standard "
+        f"deviation of at most {1e3 * sd:.2g} mm (rms of an axis). Use {file}."
+    )
+
+
 def _degrees(value: float) -> str:
     return f"{value:.2g}°" if value < 1.0 else f"{value:.2f}°"
 

@@ -125,8 +125,9 @@ def test_smoothing_bridges_frames_without_a_phase_and_follows_the_rest() -> None
 
 def test_an_error_that_all_frames_share_is_not_averaged_away() -> None:
     value = 1.0 + np.random.default_rng(4).normal(0.0, 0.01, 200)
-    _, sd = smooth_phases(value, np.full(200, 0.05))
-    assert 0.03 < sd.max() < 0.06
+    _, sd = smooth_phases(value, np.full(200, 0.05), shared_sd=0.04)
+    assert sd.min() > 0.04
+    assert sd.max() < 0.06
 
 
 def test_channels_of_a_frame_share_one_phase(frames: np.ndarray, tmp_path: Path) -> None:
