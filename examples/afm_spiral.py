@@ -2,9 +2,9 @@
 
     python examples/afm_spiral.py DATA OUT
 
-DATA holds spiral_20hz.mat and raster_20hz.mat. The spiral is gridded once where the sensors say that the stage was and
-once where it was told to be; the grating is measured in both pictures and in the raster scan's.
-1 rad stands for 1 um throughout, see afm_spiral.toml.
+DATA contains spiral_20hz.mat and raster_20hz.mat. The spiral is gridded twice: with the position of the sensors and
+with the commanded position. The grating is measured in both pictures and in that of the raster scan. 1 rad of the files
+means 1 um, see afm_spiral.toml.
 """
 
 from __future__ import annotations
@@ -55,35 +55,35 @@ class Spiral:
 
 
 def fit_spiral(time: Array, path: Array, turns_per_second: float) -> Spiral:
-    """The spiral, in either sense of rotation, that lies closest to a measured path (2, n), in least squares.
+    """The spiral, in either sense of rotation, that fits a measured path, shape (2, n), in least squares.
 
-    That is the kindest guess at what was commanded: centre, size and direction are right on average.
+    It serves as the commanded path, with the smallest possible errors of centre, size and direction.
     """
     fits = []
     for rate in (turns_per_second, -turns_per_second):
         angle = 2 * np.pi * rate * time
-        one, none, c, s = np.ones_like(time), np.zeros_like(time), time * np.cos(angle), time * np.sin(angle)
+        ones, zeros, c, s = np.ones_like(time), np.zeros_like(time), time * np.cos(angle), time * np.sin(angle)
         # linear in the centre and in growth * (cos, sin) of the phase
-        design = np.concatenate([np.stack([one, none, c, -s], 1), np.stack([none, one, s, c], 1)])
+        design = np.concatenate([np.stack([ones, zeros, c, -s], 1), np.stack([zeros, ones, s, c], 1)])
         (cx, cy, a, b), misfit, *_ = np.linalg.lstsq(design, path.reshape(-1), rcond=None)
         fits.append((misfit.item(), Spiral(rate, np.array([cx, cy]), np.hypot(a, b), np.arctan2(b, a))))
     return min(fits, key=lambda fit: fit[0])[1]
 
 
 def commanded(recording: Recording) -> Recording:
-    """The recording as a lab without sensors has it: the commanded spiral stands in the position channels' place."""
+    """The recording of a stage without sensors: the commanded spiral replaces the position channels."""
     x, y, height = (recording[name] for name in ("sense_x", "sense_y", "intensity"))
-    told_x, told_y = fit_spiral(x.time(), np.array([x.read(), y.read()]), TURNS_PER_SECOND).at(x.time())
+    commanded_x, commanded_y = fit_spiral(x.time(), np.array([x.read(), y.read()]), TURNS_PER_SECOND).at(x.time())
     channels = {
-        "sense_x": (told_x, x.unit, x.sample_rate, x.start),
-        "sense_y": (told_y, y.unit, y.sample_rate, y.start),
+        "sense_x": (commanded_x, x.unit, x.sample_rate, x.start),
+        "sense_y": (commanded_y, y.unit, y.sample_rate, y.start),
         "intensity": (height.read(), height.unit, height.sample_rate, height.start),
     }
     return Recording.from_arrays(channels, recording.device, f"{recording.name}-commanded")
 
 
 def spiral_picture(recording: Recording, device: Device) -> tuple[Picture, Array]:
-    """Height [nm] over the device's field, and the path it was taken on, shape (2, n) [um]."""
+    """Height [nm] over the field of the device, and the path of the samples, shape (2, n) [um]."""
     scan = device.require_scan()
     axes = estimate(recording, device).axes
     path = np.array([axes[name].angle.values for name in ("x", "y")])
@@ -92,15 +92,15 @@ def spiral_picture(recording: Recording, device: Device) -> tuple[Picture, Array
 
 
 def raster_picture(file: Path) -> Picture:
-    """Height [nm] in the raster scan. Its lines were cut out of a longer record: it has no clock to convert."""
+    """Height [nm] in the raster scan. Its lines are parts of a longer record, so that it has no continuous clock."""
     variables = read(file).variables
     raw = {name: variables[name].raw[:] for name in ("x", "y", "z")}
     x, y = ((raw[name] - (raw[name].min() + raw[name].max()) / 2) / V_PER_UM for name in ("x", "y"))
     return map_samples(x, y, NM_PER_V * raw["z"], Grid(PIXELS, PIXELS, x.max(), y.max()))
 
 
-def told(name: str, picture: Picture, grating: Grating) -> str:
-    """One line of the table."""
+def table_row(name: str, picture: Picture, grating: Grating) -> str:
+    """One row of the printed table: pitch by FFT and by fit, and bend of the lines."""
     by_fft, field = 1 / np.hypot(*fft_wave(picture)), 2 * picture.grid.half_angle_x
     return (
         f"{name:10} {by_fft:8.3f} ± {by_fft**2 / field / 2:5.3f} {grating.pitch:10.3f} ± {grating.pitch_sd:5.3f}"
@@ -109,7 +109,7 @@ def told(name: str, picture: Picture, grating: Grating) -> str:
 
 
 def draw(pictures: dict[str, Picture], gratings: dict[str, Grating], output: Path) -> None:
-    """The pictures side by side, and how far the grating's lines lie from straight ones."""
+    """Draw the pictures, and the deviation of the grating's lines from straight ones."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -120,12 +120,12 @@ def draw(pictures: dict[str, Picture], gratings: dict[str, Grating], output: Pat
     for panel, (name, picture) in zip(panels, pictures.items(), strict=False):
         grid = picture.grid
         extent = (-grid.half_angle_x, grid.half_angle_x, -grid.half_angle_y, grid.half_angle_y)
-        panel.set_facecolor("lightsteelblue")  # where the scan never came
+        panel.set_facecolor("lightsteelblue")  # pixels without samples
         low, high = np.nanpercentile(picture.image, [1, 98.5])
         panel.imshow(picture.image, cmap="gray", vmin=low, vmax=high, origin="lower", extent=extent)
         panel.set(title=f"{name}: pitch {gratings[name].pitch:.3f} µm", xlabel="x (µm)", ylabel="y (µm)")
-        panels[3].plot(gratings[name].along, 1e3 * gratings[name].stray, "o-", label=name)
-    panels[3].set(title="Stray of the lines", xlabel="along the lines (µm)", ylabel="off straight (nm)")
+        panels[3].plot(gratings[name].along, 1e3 * gratings[name].deviation, "o-", label=name)
+    panels[3].set(title="Deviation of the lines", xlabel="along the lines (µm)", ylabel="from a straight line (nm)")
     panels[3].legend()
     figure.savefig(output, dpi=160)
     plt.close(figure)
@@ -137,22 +137,22 @@ def main(data: Path, output: Path) -> None:
     convert_file(data / "spiral_20hz.mat", MAPPING, output / "afm_spiral.h5")
     with Recording.open(output / "afm_spiral.h5") as measured:
         device = measured.device
-        without = commanded(measured)
-        without.write(output / "afm_spiral_commanded.h5")
+        commanded_recording = commanded(measured)
+        commanded_recording.write(output / "afm_spiral_commanded.h5")
         sensors, path = spiral_picture(measured, device)
-    blind, told_path = spiral_picture(without, device)
-    pictures = {"sensors": sensors, "commanded": blind, "raster": raster_picture(data / "raster_20hz.mat")}
+    commanded_picture, commanded_path = spiral_picture(commanded_recording, device)
+    pictures = {"sensors": sensors, "commanded": commanded_picture, "raster": raster_picture(data / "raster_20hz.mat")}
     gratings = {name: fit_grating(picture) for name, picture in pictures.items()}
 
-    print("The grating's pitch; the FFT's ± is half a cycle more or less over the field, the fit's one sd")
+    print("Pitch of the grating. By FFT: ± half a cycle over the field. By fit: ± one standard deviation")
     print("               by FFT (µm)        by fit (µm)            by fit (V)     bend (nm)")
     for name, picture in pictures.items():
-        print(told(name, picture, gratings[name]))
-    off = told_path - path
-    rms, worst = np.sqrt(np.mean(off**2, axis=1)), np.hypot(*off).max()
+        print(table_row(name, picture, gratings[name]))
+    difference = commanded_path - path
+    rms, largest = np.sqrt(np.mean(difference**2, axis=1)), np.hypot(*difference).max()
     print(
         f"Commanded against measured position: rms {1e3 * rms[0]:.0f} nm in x ({1e3 * rms[0] * V_PER_UM:.2f} mV), "
-        f"{1e3 * rms[1]:.0f} nm in y ({1e3 * rms[1] * V_PER_UM:.2f} mV), at most {1e3 * worst:.0f} nm"
+        f"{1e3 * rms[1]:.0f} nm in y ({1e3 * rms[1] * V_PER_UM:.2f} mV), at most {1e3 * largest:.0f} nm"
     )
     draw(pictures, gratings, output / "afm_spiral.png")
     print(f"Pictures: {output / 'afm_spiral.png'}")

@@ -1,9 +1,9 @@
-"""A measured free decay: how a beam's frequency and damping depend on its amplitude, and which laws say so.
+"""A measured free decay of a beam: dependence of frequency and damping on the amplitude, and the laws that explain it.
 
     python examples/beam_decay.py DATA OUT
 
-DATA holds the .lvm file. The linear beam is diagnosed over four seconds of decay. One block of 0.2 s in five is kept
-from the fit; there the instantaneous frequency of the model is held against the measured one.
+DATA contains the .lvm file. Four seconds of the decay are diagnosed against a linear beam. One block of 0.2 s in five
+is held out of the fit; there the instantaneous frequency of the model is compared with the measured one.
 """
 
 from __future__ import annotations
@@ -22,47 +22,48 @@ from scanner.arrays import Array
 from scanner.recording import Recording
 
 MAPPING = Path(__file__).with_suffix(".toml")
-FROM, TO = 12.4, 16.4
-"""The shaker is off and its last push has passed; at the end the beam still moves ten times the noise [s]."""
+START_S, STOP_S = 12.4, 16.4
+"""Part of the recording that is diagnosed [s]: after the shaker's last transient, and until the amplitude is ten times
+the noise."""
 
-CENTRE = 37.5
-CYCLES = 4
-"""Cycles seen at once by the demodulation, under a Hann window."""
+CENTRE_HZ = 37.5
+WINDOW_CYCLES = 4
+"""Length of the Hann window of the demodulation, in cycles of ``CENTRE_HZ``."""
 
 
 def slow_motion(signal: Array, rate: float) -> tuple[Array, Array, Array]:
     """Amplitude, frequency [Hz] and decay rate [1/s] of a slowly changing oscillation (n,), each of its shape."""
     time = np.arange(signal.size) / rate
-    window = np.hanning(int(CYCLES * rate / CENTRE))
-    turning = signal * np.exp(-2j * np.pi * CENTRE * time)
-    phasor = 2 * np.convolve(turning, window / window.sum(), "same")
+    window = np.hanning(int(WINDOW_CYCLES * rate / CENTRE_HZ))
+    demodulated = signal * np.exp(-2j * np.pi * CENTRE_HZ * time)
+    phasor = 2 * np.convolve(demodulated, window / window.sum(), "same")
     logarithm = np.log(np.abs(phasor)) + 1j * np.unwrap(np.angle(phasor))
     slope = np.gradient(logarithm, 1 / rate)
-    return np.abs(phasor), CENTRE + slope.imag / (2 * np.pi), -slope.real
+    return np.abs(phasor), CENTRE_HZ + slope.imag / (2 * np.pi), -slope.real
 
 
-def held_out(size: int, rate: float) -> NDArray[np.bool_]:
-    """Samples of the blocks that no fit saw, without those whose window reaches into the neighbours, shape (n,)."""
+def held_out_samples(size: int, rate: float) -> NDArray[np.bool_]:
+    """Samples of the held-out blocks whose demodulation window lies within the block, shape (n,)."""
     block = np.floor(np.arange(size) / size * TIME_BLOCKS).astype(int)
-    inside = (block % VALIDATION_BLOCK_INTERVAL) == VALIDATION_BLOCK_INTERVAL // 2
-    reach = int(CYCLES * rate / CENTRE / 2)
-    return np.asarray(np.convolve(inside, np.ones(2 * reach + 1), "same") > 2 * reach)
+    held_out = (block % VALIDATION_BLOCK_INTERVAL) == VALIDATION_BLOCK_INTERVAL // 2
+    half_window = int(WINDOW_CYCLES * rate / CENTRE_HZ / 2)
+    return np.asarray(np.convolve(held_out, np.ones(2 * half_window + 1), "same") > 2 * half_window)
 
 
 def simulated(fit: Fit) -> Array:
-    """What a fit shows in the channel, shape (n,) [V]."""
+    """The simulated channel of a fit, shape (n,) [V]."""
     return fit.model.outputs(fit.x)[0][0]
 
 
 def draw(measured: Array, steps: dict[str, Fit], rate: float, output: Path) -> None:
-    """Frequency and decay rate against amplitude, measured and by each device."""
+    """Draw frequency and decay rate over amplitude, measured and of each model."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, panels = plt.subplots(1, 2, figsize=(13, 4.8), layout="constrained")
-    ends = slice(int(2 * CYCLES * rate / CENTRE), -int(2 * CYCLES * rate / CENTRE))
+    ends = slice(int(2 * WINDOW_CYCLES * rate / CENTRE_HZ), -int(2 * WINDOW_CYCLES * rate / CENTRE_HZ))
     for name, signal in {"measured": measured, **{name: simulated(fit) for name, fit in steps.items()}}.items():
         amplitude, frequency, decay = slow_motion(signal - signal.mean(), rate)
         style = "k." if name == "measured" else "-"
@@ -82,24 +83,28 @@ def main(data: Path, output: Path) -> None:
     """Convert, diagnose, compare the slow motion, draw."""
     output.mkdir(parents=True, exist_ok=True)
     convert_file(next(data.glob("*.lvm")), MAPPING, output / "beam_decay.h5")
-    with Recording.open(output / "beam_decay.h5") as whole:
-        found = diagnose([whole.slice(FROM, TO)], progress=lambda text: print(f"  ... {text}", flush=True))
-    (output / "device.toml").write_text(found.device.to_toml(), encoding="utf-8")
-    print(f"Found in the decay from {FROM} s to {TO} s")
-    print(findings_text(found))
-    assert found.search is not None
-    channel = found.search.likelihood.runs[0].outputs[0]
+    with Recording.open(output / "beam_decay.h5") as recording:
+        diagnosis = diagnose(
+            [recording.slice(START_S, STOP_S)], progress=lambda text: print(f"  ... {text}", flush=True)
+        )
+    (output / "device.toml").write_text(diagnosis.device.to_toml(), encoding="utf-8")
+    print(f"Found in the decay from {START_S} s to {STOP_S} s")
+    print(findings_text(diagnosis))
+    assert diagnosis.search is not None
+    channel = diagnosis.search.likelihood.runs[0].outputs[0]
     rate = 1 / channel.step
-    unseen = held_out(channel.data.size, rate)
+    held_out = held_out_samples(channel.data.size, rate)
     _, frequency, decay = slow_motion(channel.data - channel.data.mean(), rate)
-    print(f"Not used in the fit: {unseen.sum()} samples. Frequency off, rms (Hz); decay rate off, rms (1/s)")
-    print(f"  {'constant':22} {frequency[unseen].std():7.3f} {decay[unseen].std():7.3f}")
-    steps = nested_fits(found)
+    print(f"Not used in the fit: {held_out.sum()} samples. Rms error of the frequency (Hz) and of the decay rate (1/s)")
+    print(f"  {'constant':22} {frequency[held_out].std():7.3f} {decay[held_out].std():7.3f}")
+    steps = nested_fits(diagnosis)
     for name, fit in steps.items():
         signal = simulated(fit)
-        _, told_frequency, told_decay = slow_motion(signal - signal.mean(), rate)
-        off = [np.sqrt(np.mean((a - b)[unseen] ** 2)) for a, b in ((frequency, told_frequency), (decay, told_decay))]
-        print(f"  {name if name == 'linear' else '+ ' + name:22} {off[0]:7.3f} {off[1]:7.3f}")
+        _, model_frequency, model_decay = slow_motion(signal - signal.mean(), rate)
+        errors = [
+            np.sqrt(np.mean((a - b)[held_out] ** 2)) for a, b in ((frequency, model_frequency), (decay, model_decay))
+        ]
+        print(f"  {name if name == 'linear' else '+ ' + name:22} {errors[0]:7.3f} {errors[1]:7.3f}")
     draw(channel.data, steps, rate, output / "beam_decay.png")
     print(f"Picture: {output / 'beam_decay.png'}")
 

@@ -1,4 +1,4 @@
-"""What each effect of a diagnosis contributes: fits with none, one, two, ... of the effects that were found."""
+"""Contribution of each effect of a diagnosis: fits with none, one, two, ... of its effects."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from estimation.diagnosis.fit import Fit
 from estimation.diagnosis.selection import refit_without
 
 
-def nested_fits(found: Diagnosis) -> dict[str, Fit]:
+def nested_fits(diagnosis: Diagnosis) -> dict[str, Fit]:
     """Fits from the nominal device to the complete one, by the effect that each adds, largest contribution first."""
-    assert found.search is not None
-    rounds = sorted(found.search.steps, key=lambda each: each.after.neg2_log_evidence - each.before.neg2_log_evidence)
-    fits = [found.search.final]
-    for each in reversed(rounds):
-        fits.append(refit_without(found.search.likelihood, fits[-1], each.candidate))
-    names = ["linear", *(each.candidate.term.effect for each in rounds)]
+    assert diagnosis.search is not None
+    steps = sorted(
+        diagnosis.search.steps, key=lambda step: step.after.neg2_log_evidence - step.before.neg2_log_evidence
+    )
+    fits = [diagnosis.search.final]
+    for step in reversed(steps):
+        fits.append(refit_without(diagnosis.search.likelihood, fits[-1], step.candidate))
+    names = ["linear", *(step.candidate.term.effect for step in steps)]
     return dict(zip(names, reversed(fits), strict=True))
 
 
-def findings_text(found: Diagnosis) -> str:
+def findings_text(diagnosis: Diagnosis) -> str:
     """The findings, one line each."""
     lines = []
-    for finding in found.findings:
+    for finding in diagnosis.findings:
         values = ", ".join(
             f"{p.name} = {p.value:.5g} [{p.ci95[0]:.5g}, {p.ci95[1]:.5g}] {p.unit}" for p in finding.parameters
         )
         law = values or (finding.curve or {}).get("formula", "")
         lines.append(f"  {finding.stage}: {finding.effect} (probability {finding.probability:.3f}): {law}")
-    return "\n".join([*lines, f"  unexplained: {found.unexplained or 'nothing'}"])
+    return "\n".join([*lines, f"  unexplained: {diagnosis.unexplained or 'nothing'}"])

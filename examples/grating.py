@@ -1,4 +1,4 @@
-"""A grating in a picture: how long is a period, how well does so small a field tell, and how straight are the lines?"""
+"""Fit of a grating to a picture: its pitch, the standard deviation of the pitch, and the straightness of the lines."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from recon.imaging.picture import Picture
 from scanner.arrays import Array
 
-SURFACE_ORDER = 3  # polynomial in x and y that stands for the sample's tilt and the height's drift
-HARMONICS = (1, 2, 3)  # enough of a rectangular profile of any duty cycle
-SLABS = 8  # across the lines, for the jackknife: about half a period each
-BANDS = 12  # along the lines, for their stray
+SURFACE_ORDER = 3  # order of the polynomial in x and y that models the tilt of the sample and the drift of the height
+HARMONICS = (1, 2, 3)  # of the profile across the lines; higher ones of a rectangular profile are below the noise
+SLABS = 8  # parts of the field across the lines, for the jackknife: about half a period each
+BANDS = 12  # parts of the field along the lines, for their deviation from straight lines
 
 
 @dataclass(frozen=True)
@@ -20,18 +20,18 @@ class Grating:
     """A grating fitted to a picture; lengths are in the unit of the picture's half angles.
 
     Attributes:
-        wave: wave vector, shape (2,): periods a unit length along x and y.
-        pitch_sd: standard deviation of the pitch, by leaving out one slab of the field after the other: the samples
-            of one slab share the position's errors, so their number must not count. With this few slabs it errs on
-            the wide side (two to three times on exact synthetic gratings).
-        along: place along the lines, shape (BANDS,).
-        stray: how far the lines lie from straight ones there, shape (BANDS,).
+        wave: wave vector, shape (2,): periods per unit length along x and y.
+        pitch_sd: standard deviation of the pitch by the jackknife over slabs of the field, because the position errors
+            of the samples of one slab are correlated. With so few slabs it is too large (by a factor of two to three on
+            exact synthetic gratings).
+        along: position along the lines, shape (BANDS,).
+        deviation: of the lines from straight lines at those positions, shape (BANDS,).
     """
 
     wave: Array
     pitch_sd: float
     along: Array
-    stray: Array
+    deviation: Array
 
     @property
     def pitch(self) -> float:
@@ -40,8 +40,8 @@ class Grating:
 
     @property
     def bend(self) -> float:
-        """Stray of the lines, rms."""
-        return float(np.sqrt(np.mean(self.stray**2)))
+        """Rms deviation of the lines from straight lines."""
+        return float(np.sqrt(np.mean(self.deviation**2)))
 
 
 def fft_wave(picture: Picture) -> Array:
@@ -50,7 +50,7 @@ def fft_wave(picture: Picture) -> Array:
     x, y, height = _pixels(picture)
     window = np.cos(np.pi / 2 * np.minimum(np.hypot(x / grid.half_angle_x, y / grid.half_angle_y), 1)) ** 2
     surface = _surface(x, y)
-    height = np.clip(height, *np.percentile(height, [1, 98]))  # dust outshines the lines
+    height = np.clip(height, *np.percentile(height, [1, 98]))  # dust is higher than the lines
     flat = np.zeros(picture.image.shape)
     flat[picture.coverage > 0] = window * (height - surface @ _solve(surface, height))
     power = np.abs(np.fft.rfft2(flat, (n, n)))
@@ -61,7 +61,7 @@ def fft_wave(picture: Picture) -> Array:
 
 
 def fit_grating(picture: Picture) -> Grating:
-    """Least squares of a smooth surface and a periodic profile over the visited pixels, dust left out."""
+    """Fit a smooth surface and a periodic profile to the visited pixels by least squares, without outliers (dust)."""
     x, y, height = _pixels(picture)
     wave, clean = fft_wave(picture), np.ones(x.size, bool)
     for _ in range(3):
@@ -72,9 +72,9 @@ def fit_grating(picture: Picture) -> Grating:
 
     across = wave @ [x, y]
     slab = np.digitize(across, np.linspace(across.min(), across.max(), SLABS + 1)[1:-1])
-    left_out = [_fit_wave(wave, *(each[slab != i] for each in (x, y, height))) for i in range(SLABS)]
+    left_out = [_fit_wave(wave, *(values[slab != i] for values in (x, y, height))) for i in range(SLABS)]
     pitches = 1 / np.hypot(*np.transpose(left_out))
-    return Grating(wave, float(np.sqrt((SLABS - 1) * np.var(pitches))), *_stray(wave, x, y, height))
+    return Grating(wave, float(np.sqrt((SLABS - 1) * np.var(pitches))), *_line_deviation(wave, x, y, height))
 
 
 def _pixels(picture: Picture) -> tuple[Array, Array, Array]:
@@ -96,12 +96,12 @@ def _profile(phase: Array) -> Array:
 
 
 def _solve(design: Array, values: Array) -> Array:
-    # the columns are scaled alike, so the normal equations are accurate enough and ten times faster
+    # all columns are of order 1, so that the normal equations are accurate enough; they are ten times faster
     return np.linalg.solve(design.T @ design, design.T @ values)
 
 
 def _misfit(wave: Array, x: Array, y: Array, height: Array) -> Array:
-    """What the best surface and profile of this wave vector leave over: all but the wave vector is linear."""
+    """Residual of the best surface and profile for this wave vector; all other parameters are linear."""
     design = np.concatenate([_surface(x, y), _profile(2 * np.pi * (wave @ [x, y]))], axis=1)
     return height - design @ _solve(design, height)
 
@@ -113,8 +113,9 @@ def _fit_wave(wave: Array, x: Array, y: Array, height: Array) -> Array:
     return least_squares(_misfit, wave, args=(x, y, height), x_scale=scale, diff_step=1e-4, ftol=1e-6).x
 
 
-def _stray(wave: Array, x: Array, y: Array, height: Array) -> tuple[Array, Array]:
-    """Place along the lines and, from the fundamental's phase there, how far they lie off; each shape (BANDS,)."""
+def _line_deviation(wave: Array, x: Array, y: Array, height: Array) -> tuple[Array, Array]:
+    """Position along the lines, and the deviation of the lines there from the phase of the fundamental; shape
+    (BANDS,)."""
     pitch = 1 / np.hypot(*wave)
     phase, surface = 2 * np.pi * (wave @ [x, y]), _surface(x, y)
     both = np.concatenate([surface, _profile(phase)], axis=1)
@@ -124,8 +125,11 @@ def _stray(wave: Array, x: Array, y: Array, height: Array) -> tuple[Array, Array
     band = np.digitize(along, edges[1:-1])
     shifts = []
     for i in range(BANDS):
-        here = phase[band == i]
-        _, c, s = _solve(np.stack([np.ones_like(here), np.cos(here), np.sin(here)], axis=1), flat[band == i])
+        phase_in_band = phase[band == i]
+        _, c, s = _solve(
+            np.stack([np.ones_like(phase_in_band), np.cos(phase_in_band), np.sin(phase_in_band)], axis=1),
+            flat[band == i],
+        )
         shifts.append(np.arctan2(s, c))
-    stray = np.unwrap(shifts) * pitch / (2 * np.pi)
-    return (edges[1:] + edges[:-1]) / 2, stray - stray.mean()
+    deviation = np.unwrap(shifts) * pitch / (2 * np.pi)
+    return (edges[1:] + edges[:-1]) / 2, deviation - deviation.mean()

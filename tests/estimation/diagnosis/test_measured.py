@@ -36,7 +36,7 @@ def diagnose_among(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-
 
 @pytest.mark.slow
 def test_the_silverbox_has_a_cubic_spring(measured_data: Path, diagnose_among) -> None:  # type: ignore[no-untyped-def]
-    from silverbox import MAPPING, multisines, off
+    from silverbox import MAPPING, multisines, simulation_error
 
     with convert(measured_data / "silverbox/multisine.npz", MAPPING) as whole:
         parts = multisines(whole)
@@ -44,17 +44,19 @@ def test_the_silverbox_has_a_cubic_spring(measured_data: Path, diagnose_among) -
         short = [part.slice(part.start, part.start + 2.5) for part in parts[2:4]]
         diagnosis = diagnose_among(short[0], "cubic-stiffness", "quintic-stiffness", "cubic-damping", "sensor-cubic")
         assert diagnosis.findings[0].effect == "cubic-stiffness"
-        linear, cubic = (np.nanstd(off(predict(short[1], d)["sense_x"])) for d in (whole.device, diagnosis.device))
+        linear, cubic = (
+            np.nanstd(simulation_error(predict(short[1], d)["sense_x"])) for d in (whole.device, diagnosis.device)
+        )
         assert cubic < 0.4e-3 < 10e-3 < linear
 
 
 @pytest.mark.slow
 def test_the_beam_has_a_cubic_spring_and_quadratic_drag(measured_data: Path, diagnose_among) -> None:  # type: ignore[no-untyped-def]
-    from beam_decay import FROM, MAPPING, held_out, simulated, slow_motion
+    from beam_decay import MAPPING, START_S, held_out_samples, simulated, slow_motion
 
     with convert(next((measured_data / "beam_decay").glob("*.lvm")), MAPPING) as whole:
         diagnosis = diagnose_among(
-            whole.slice(FROM, FROM + 3.0), "cubic-stiffness", "quadratic-drag", "coulomb-friction"
+            whole.slice(START_S, START_S + 3.0), "cubic-stiffness", "quadratic-drag", "coulomb-friction"
         )
     assert {finding.effect for finding in diagnosis.findings} == {"cubic-stiffness", "quadratic-drag"}
     weights = [finding.heldout["before"] for finding in diagnosis.findings]  # misfit without the effect
@@ -62,17 +64,17 @@ def test_the_beam_has_a_cubic_spring_and_quadratic_drag(measured_data: Path, dia
     assert weights[-1] > 10.0 * diagnosis.findings[0].heldout["after"]
     data = diagnosis.search.likelihood.runs[0].outputs[0].data
     frequency, modelled = (slow_motion(s - s.mean(), 1000.0)[1] for s in (data, simulated(diagnosis.search.final)))
-    held_out_samples = held_out(data.size, 1000.0)
-    assert (
-        np.sqrt(np.mean((frequency - modelled)[held_out_samples] ** 2)) < 0.07 < 0.3 < frequency[held_out_samples].std()
-    )
+    held_out = held_out_samples(data.size, 1000.0)
+    assert np.sqrt(np.mean((frequency - modelled)[held_out] ** 2)) < 0.07 < 0.3 < frequency[held_out].std()
 
 
 def test_hysteresis_and_drift_terms_explain_the_piezo_stage(measured_data: Path) -> None:
-    from afm_model import LAWS, by_laws, missed, recordings
+    from afm_model import LAWS, fit_laws, held_out_rms_mv, recordings
 
     recording = recordings(measured_data / "afm_spiral/spiral_20hz.mat")["x"]
-    assert missed(by_laws(recording, LAWS)) < 0.3 < 0.8 < missed(by_laws(recording, ("offset-drift",)))
+    assert (
+        held_out_rms_mv(fit_laws(recording, LAWS)) < 0.3 < 0.8 < held_out_rms_mv(fit_laws(recording, ("offset-drift",)))
+    )
 
 
 def test_a_device_without_a_drive_is_predicted_as_a_free_decay() -> None:
