@@ -15,8 +15,8 @@ def default_estimator(recording: Recording, device: Device) -> str:
     """Name of the estimator that suits the channels of a recording.
 
     Returns:
-        ``"tracker"`` with a capacitive readout or a sensor of velocity or acceleration; ``"picture"`` with the drives
-        and an intensity but neither sense nor angle channel; otherwise ``"sensor"``.
+        ``"tracker"`` with a capacitive readout or a sensor of velocity or acceleration; ``"picture"`` with an intensity
+        and the drives or their frequencies, but neither sense nor angle channel; otherwise ``"sensor"``.
     """
     followed = any(
         f"sense_{name}" in recording and axis.readout is not None and not isinstance(axis.readout, Position)
@@ -26,7 +26,10 @@ def default_estimator(recording: Recording, device: Device) -> str:
     derivative = any(f"{kind}_{axis}" in recording for axis in unmeasured for kind in ("velocity", "acceleration"))
     if "sense" in recording or followed or derivative:
         return "tracker"
-    driven = "intensity" in recording and all(f"drive_{axis}" in recording for axis in device.axes)
+    driven = "intensity" in recording and all(
+        f"drive_{name}" in recording or (axis.drive is not None and axis.drive.frequency is not None)
+        for name, axis in device.axes.items()
+    )
     measured = any(f"{kind}_{axis}" in recording for axis in device.axes for kind in ("sense", "angle"))
     return "picture" if driven and not measured else "sensor"
 

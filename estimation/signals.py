@@ -136,12 +136,15 @@ def phase_reference(
             )
         return reference
     if sense is None:
-        raise ChannelMissing(
-            "is not in the recording and no other channel determines the frequency of the motion",
-            file=recording.path,
-            channel=f"drive_{axis}",
-            hint="record the drive",
-        )
+        if stated.drive is None or stated.drive.frequency is None:
+            raise ChannelMissing(
+                "is not in the recording and no other channel determines the frequency of the motion",
+                file=recording.path,
+                channel=f"drive_{axis}",
+                hint=f"record the drive, or state its frequency in [{axis}.drive] of the device",
+            )
+        frequency = stated.drive.frequency * stated.drive.motion_per_drive
+        return absolute_reference(frequency, recording.start, recording.end)
     double = 2.0 if even else 1.0
     band = (0.8 * double * stated.resonance, 1.25 * double * stated.resonance) if stated.mechanics else (0.0, np.inf)
     window = 60.0 / stated.resonance if stated.mechanics else None

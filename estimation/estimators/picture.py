@@ -9,6 +9,10 @@ from scanner.recording import Recording
 
 
 def run(recording: Recording, device: Device) -> Motion:
+    if any(axis.mechanics is None for axis in device.axes.values()):
+        from estimation.frequency_motion import frequency_motion
+
+        return frequency_motion(recording, device)
     from estimation.tracker.drive_only import track_drive_only
 
     return track_drive_only(recording, device)
@@ -17,7 +21,7 @@ def run(recording: Recording, device: Device) -> Motion:
 ESTIMATOR = Estimator(
     name="picture",
     summary="averaged dynamics under the drive; a reconstruction measures the remaining phase errors in the picture",
-    needs="the drive of every axis; drive and mechanics of the device; an intensity for the phases",
+    needs="an intensity; drives, and drive and mechanics of the device; or drive frequencies and field alone",
     use_when="no sense signal was recorded",
     run=run,
     source="docs/explanation/image_phase.md",

@@ -20,6 +20,7 @@ from estimation.term_compensation import estimate_with_terms
 from estimation.tracker import PhaseMeasurement, track
 from estimation.tracker.drive_only import track_drive_only
 from recon.imaging.bidirectional_phase import PERIODS_PER_SLICE, PhaseError, measure_motion_phase_errors, slow_period
+from recon.imaging.frequency_phase import phases_from_picture
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -64,6 +65,8 @@ def refine_motion(
     Returns:
         The motion, and a line for each refined axis on what the picture showed.
     """
+    if motion.estimator == "picture" and any(device.axis(name).mechanics is None for name in AXES):
+        return phases_from_picture(recording, device, motion, intensity, grid, flips)
     pixels = {"x": grid.width / 2, "y": grid.height / 2}
     refined = [name for name in AXES if _rms(motion.axes[name].phase_sd) * pixels[name] > MAX_PHASE_ERROR_PX]
     smoothers = _available_smoothers(recording, device, motion.estimator) if refined else {}
