@@ -97,6 +97,7 @@ class Channel:
         first, stop: range of ``raw`` that belongs to this channel.
         gain, offset: conversion of raw samples to the unit.
         file: where the channel came from, for messages.
+        detectors: names of the columns, where they are stated.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Channel:
     gain: float = 1.0
     offset: float = 0.0
     file: str | None = None
+    detectors: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -170,6 +172,7 @@ def make_channel(
     gain: object = 1.0,
     offset: object = 0.0,
     file: str | None = None,
+    detectors: object = (),
 ) -> Channel:
     """Return a channel after checking everything stated about it, in the unit that belongs to its name.
 
@@ -181,10 +184,12 @@ def make_channel(
         start: time of the first sample [s].
         gain, offset: conversion of raw samples to ``unit``.
         file: for messages.
+        detectors: names of the columns: a sequence of texts, or one text with commas; none if empty.
 
     Raises:
         UnitUnknown: the unit is missing or cannot be converted to that of the channel.
-        BadInput: no samples, samples that are not real numbers, a wrong shape, or an impossible rate, start or gain.
+        BadInput: no samples, samples that are not real numbers, a wrong shape, an impossible rate, start or gain,
+            or names that are not one for each detector.
     """
 
     def bad(what: str, hint: str) -> BadInput:
@@ -213,7 +218,20 @@ def make_channel(
     if slope == 0:
         raise bad("gain is 0, which leaves nothing of the samples", "state value = gain * raw + offset")
     channel_unit, factor = _channel_unit(name, unit, file)
-    return Channel(name, channel_unit, rate, first_time, raw, 0, raw.shape[0], slope * factor, zero * factor, file)
+    names = _detector_names(detectors)
+    columns = raw.shape[1] if raw.ndim == 2 else 1
+    if names and (len(names) != columns or len(set(names)) != len(names) or not all(names)):
+        raise bad(f"names the detectors {', '.join(names)}", f"give {columns} different names, one for each detector")
+    gain, offset = slope * factor, zero * factor
+    return Channel(name, channel_unit, rate, first_time, raw, 0, raw.shape[0], gain, offset, file, names)
+
+
+def _detector_names(stated: object) -> tuple[str, ...]:
+    """Names from a text with commas, or from a sequence of texts or bytes."""
+    if isinstance(stated, str):
+        stated = stated.split(",")
+    names = np.asarray(stated).ravel().tolist()
+    return tuple((n.decode("utf-8", "replace") if isinstance(n, bytes) else str(n)).strip() for n in names)
 
 
 def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = False) -> None:

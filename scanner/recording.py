@@ -6,7 +6,7 @@ values of a simulation, ``/truth``, are not part of it: :func:`scanner.truth.rea
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil, isfinite
@@ -89,6 +89,7 @@ class Recording:
         channels: Mapping[str, tuple[ArrayLike, str, float] | tuple[ArrayLike, str, float, float]],
         device: Device | None = None,
         name: str | None = None,
+        detectors: Sequence[str] = (),
         **attrs: Any,
     ) -> Recording:
         """Return a recording in memory.
@@ -105,6 +106,7 @@ class Recording:
                 where it is left out. Channels may differ in sample rate, start and length.
             device: the nominal device.
             name: of the recording.
+            detectors: names of the columns of ``intensity``.
             attrs: further attributes of the recording (``notes``, ``acquired``).
 
         Raises:
@@ -122,7 +124,8 @@ class Recording:
             values, unit, sample_rate, *start = channel
             raw = _as_numbers(values, key).view()
             raw.flags.writeable = False
-            made[key] = make_channel(key, raw, unit=unit, sample_rate=sample_rate, start=start[0] if start else 0.0)
+            first, names = start[0] if start else 0.0, detectors if key == "intensity" else ()
+            made[key] = make_channel(key, raw, unit=unit, sample_rate=sample_rate, start=first, detectors=names)
         attrs = ({} if name is None else {"name": name}) | attrs
         text = None if device is None else device.to_toml()
         return cls(MappingProxyType(made), MappingProxyType(attrs), device_toml=text)
@@ -277,7 +280,7 @@ def _open_channel(group: h5py.Group, name: str, path: Path) -> Channel:
         raise BadInput("is listed and not there", file=path, channel=name, hint="copy the file again")
     stated = attributes(dataset)
     required = {key: stated.get(key) for key in ("unit", "sample_rate")}
-    optional = {key: stated[key] for key in ("start", "gain", "offset") if key in stated}
+    optional = {key: stated[key] for key in ("start", "gain", "offset", "detectors") if key in stated}
     return make_channel(name, dataset, file=str(path), **required, **optional)
 
 
@@ -304,5 +307,7 @@ def _write_channel(group: h5py.Group, channel: Channel) -> None:
         else:
             dataset[first:stop] = channel.read(first, stop)
     dataset.attrs.update({"unit": channel.unit, "sample_rate": channel.sample_rate, "start": channel.start})
+    if channel.detectors:
+        dataset.attrs["detectors"] = list(channel.detectors)
     if whole and not plain:
         dataset.attrs.update({"gain": channel.gain, "offset": channel.offset})

@@ -163,13 +163,13 @@ def reconstruct_file(
         origin = {"output": str(output), "recording": str(path)} | ({"live": live} if live else {})
         summary: dict[str, Any] = finite(summarise(result) | origin)
         summary["conclusion"] = conclude_reconstruction(summary)
-        grid = result.picture.grid
-        write_tiff(folder / "image.tif", result.picture.image, grid)
-        write_tiff(folder / "image_sd.tif", pixel_sd(result.picture, result.sample_noise), grid)
+        grid, detectors = result.picture.grid, result.picture.detectors
+        write_tiff(folder / "image.tif", result.picture.image, grid, detectors)
+        write_tiff(folder / "image_sd.tif", pixel_sd(result.picture, result.sample_noise), grid, detectors)
         write_tiff(folder / "coverage.tif", result.picture.coverage, grid)
         if options.fill_radius:
             image, mask = fill_holes(result.picture, options.fill_radius)
-            write_tiff(folder / "filled.tif", image, grid)
+            write_tiff(folder / "filled.tif", image, grid, detectors)
             write_tiff(folder / "fill.tif", mask.astype(np.uint8), grid)
         if result.defects:
             write_tiff(folder / "affected.tif", result.affected.astype(np.uint8), grid)

@@ -56,7 +56,7 @@ def grid_intensity(
             accumulate_samples(x.read(begin, end), y.read(begin, end), values, grid, sums, counts)
     counts_of_sums = counts if sums.ndim == 2 else counts[..., None]
     picture = mean_picture(intensity.gain * sums + intensity.offset * counts_of_sums, counts, grid)
-    return replace(picture, outside=samples - int(counts.sum()))
+    return replace(picture, outside=samples - int(counts.sum()), detectors=intensity.detectors)
 
 
 def find_visited_pixels(beam: Motion, ranges: SampleRanges, grid: Grid) -> NDArray[np.bool_]:

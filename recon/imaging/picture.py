@@ -78,12 +78,14 @@ class Picture:
         coverage: samples in each pixel, shape (height, width), uint32.
         grid: the pixels over the field of view.
         outside: number of samples that fell outside the field of view.
+        detectors: names of the last axis of ``image``, where the recording states them.
     """
 
     image: NDArray[np.float32]
     coverage: NDArray[np.uint32]
     grid: Grid
     outside: int = 0
+    detectors: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         grid, visited = self.grid, np.count_nonzero(self.coverage) / self.coverage.size

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
@@ -101,13 +101,14 @@ def pixel_size(grid: Grid) -> tuple[float, float, str]:
     return scale * width, scale * height, unit
 
 
-def write_tiff(path: Path, image: NDArray[Any], grid: Grid) -> None:
+def write_tiff(path: Path, image: NDArray[Any], grid: Grid, detectors: Sequence[str] = ()) -> None:
     """Write a picture as TIFF with unchanged values and the pixel size in ImageJ's form.
 
     Args:
         path: the file.
         image: shape (height, width), or (height, width, detectors); detectors become channels.
         grid: of the picture.
+        detectors: names of the channels.
     """
     import tifffile
 
@@ -116,7 +117,8 @@ def write_tiff(path: Path, image: NDArray[Any], grid: Grid) -> None:
     if image.dtype == np.uint32:  # ImageJ reads it, but tifffile refuses to write it in ImageJ's form
         form: dict[str, Any] = {"description": f"ImageJ=1.11a\nunit={unit}\n", "metadata": None}
     else:
-        form = {"imagej": True, "metadata": {"axes": axes, "unit": unit}}
+        labels = {"Labels": list(detectors)} if detectors and image.ndim == 3 else {}
+        form = {"imagej": True, "metadata": {"axes": axes, "unit": unit, **labels}}
     tifffile.imwrite(
         path, planes, photometric="minisblack", resolution=(1 / width, 1 / height), resolutionunit="NONE", **form
     )
@@ -146,6 +148,8 @@ def write_frames(path: Path, frames: Iterable[Picture], count: int, frame_time: 
             "PhysicalSizeY": height,
             "PhysicalSizeYUnit": "µm",
         }
+    if first.detectors and first.image.ndim == 3:
+        metadata["Channel"] = {"Name": list(first.detectors)}
     planes = (plane for frame in chain([first], pictures) for plane in np.atleast_3d(frame.image).transpose(2, 0, 1))
     shape, axes = (count, *first.image.shape[2:], *first.image.shape[:2]), "TCYX" if first.image.ndim == 3 else "TYX"
     tifffile.imwrite(

@@ -119,6 +119,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "angle": result.picture.grid.angle,
         **grouped,
         **axes,
+        "detectors": list(result.picture.detectors),
         "fill": fill_factor(result.picture.coverage),
         "seconds_to_fill": seconds_to_fill(result),
         "samples": int(result.picture.coverage.sum()),
