@@ -1,43 +1,109 @@
-"""The complete diagnosis of a device: motion and readout against the nominal device, then the optics."""
+"""The complete diagnosis of a device: motion and readout against the nominal device, then the picture."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from estimation.diagnosis.diagnose import Diagnosis, diagnose, nominal_device
+from estimation.diagnosis.diagnose import Diagnosis, Finding, diagnose, nominal_device
 from estimation.diagnosis.selection import Progress
 from scanner.device import Device
 from scanner.recording import Recording
+from scanner.terms import catalogue
+
+if TYPE_CHECKING:
+    from estimation.optics.readout_effects import ReferencePhase
+
+SENSED_STAGES = ("capacitance", "readout", "timing")
+"""Stages whose terms change the phase of the motion that is estimated from the sense signal."""
+
+MeasureReference = Callable[[Recording, Device], "ReferencePhase | None"]
+"""Measures the phase errors of the motion from the sense signal without the readout; None where it cannot."""
 
 
 def diagnose_with_optics(
-    recordings: Sequence[Recording], device: Device | None = None, progress: Progress = lambda text: None
+    recordings: Sequence[Recording],
+    device: Device | None = None,
+    progress: Progress = lambda text: None,
+    measure_reference: MeasureReference = lambda recording, device: None,
 ) -> Diagnosis:
-    """Diagnose drive, mechanics and readout of all recordings together, then the optics of each that has an intensity.
+    """Diagnose drive, mechanics and readout of all recordings together, then each that has an intensity by its picture.
 
-    A device that states no mechanics predicts no motion. If its recordings have an intensity, only the optics are
-    diagnosed.
+    The picture of a recording without angle channels is the reference for the phase of the readout. If it shows an
+    effect, the recordings are diagnosed again with that effect stated, because the nominal values and terms found
+    without it have adapted to it. What the picture shows then belongs to the optics.
+
+    A device that states no mechanics predicts no motion. If its recordings have an intensity, only readout and optics
+    are diagnosed.
 
     Args:
         recordings: of one device.
         device: the nominal one; None takes that of the first recording.
         progress: called with one line of text at every step.
+        measure_reference: measures the phase by the picture.
 
     Raises:
         BadInput: no device, or a recording that cannot be compared with it.
     """
     nominal = nominal_device(recordings, device)
-    with_intensity = [recording for recording in recordings if "intensity" in recording]
-    if not with_intensity or any(axis.mechanics for axis in nominal.axes.values()):
-        diagnosis = diagnose(recordings, nominal, progress)
-    else:
-        diagnosis = Diagnosis("consistent", (), None, nominal, None)
-    for recording in with_intensity:
-        if set(diagnosis.device.axes) == {"x", "y"}:
-            progress(f"optics of {recording.name}")
-            diagnosis = add_optics(diagnosis, recording)
+    diagnosis = _diagnose_motion(recordings, nominal, progress)
+    pictures = [each for each in recordings if "intensity" in each and set(nominal.axes) == {"x", "y"}]
+    findings, stated = _diagnose_readout(pictures, nominal, diagnosis, measure_reference, progress)
+    if findings:
+        again = _diagnose_motion(recordings, stated, progress)
+        open_loop = {
+            name: {**loops, "nominal": diagnosis.open_loop.get(name, loops)["nominal"]}
+            for name, loops in again.open_loop.items()
+        }
+        diagnosis = replace(again, verdict="mismatch", findings=(*findings, *again.findings), open_loop=open_loop)
+    for recording in pictures:
+        progress(f"optics of {recording.name}")
+        diagnosis = add_optics(diagnosis, recording)
     return diagnosis
+
+
+def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress: Progress) -> Diagnosis:
+    """The diagnosis without pictures; of a device without mechanics whose recordings have some, an empty one."""
+    pictures = any("intensity" in recording for recording in recordings)
+    if pictures and not any(axis.mechanics for axis in nominal.axes.values()):
+        return Diagnosis("consistent", (), None, nominal, None)
+    return diagnose(recordings, nominal, progress)
+
+
+def _diagnose_readout(
+    pictures: Sequence[Recording],
+    nominal: Device,
+    diagnosis: Diagnosis,
+    measure_reference: MeasureReference,
+    progress: Progress,
+) -> tuple[tuple[Finding, ...], Device]:
+    """Findings of the readout that the pictures show beside ``diagnosis``, and the nominal device with them."""
+    from estimation.optics.readout_selection import diagnose_readout
+
+    known = {
+        name: {
+            effect: values
+            for effect, values in axis.terms.items()
+            if effect not in nominal.axes[name].terms
+            and effect in catalogue()
+            and catalogue()[effect].stage in SENSED_STAGES
+        }
+        for name, axis in diagnosis.device.axes.items()
+    }
+    device, findings = nominal.with_terms(known), tuple[Finding, ...]()
+    for recording in pictures:
+        if not any(f"angle_{axis}" in recording for axis in nominal.axes):
+            progress(f"readout of {recording.name} against its picture")
+            reference = measure_reference(recording, device)
+            if reference is not None:
+                found, device = diagnose_readout(reference)
+                findings = (*findings, *found)
+    axes = {
+        name: replace(axis, terms={effect: axis.terms[effect] for effect in axis.terms if effect not in known[name]})
+        for name, axis in device.axes.items()
+    }
+    return findings, replace(device, axes=axes)
 
 
 def add_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:
@@ -53,13 +119,10 @@ def add_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:
     corrected = correct_intensity(recording, device)
     motion = beam_motion(estimate(corrected, device), device, corrected.start)
     optics = diagnose_optics(motion, corrected["intensity"], device)
-    axes = {
-        name: replace(axis, terms={**axis.terms, **optics.terms.get(name, {})}) for name, axis in device.axes.items()
-    }
     return replace(
         diagnosis,
         verdict="mismatch" if optics.findings else diagnosis.verdict,
         findings=(*diagnosis.findings, *optics.findings),
-        device=replace(device, axes=axes),
+        device=device.with_terms(optics.terms),
         optics=(*diagnosis.optics, {"recording": recording.name, "effects": optics.to_json()}),
     )

@@ -238,9 +238,11 @@ def diagnose(
         BadInput: no device, or a recording that cannot be compared with it.
     """
     from estimation.complete_diagnosis import diagnose_with_optics
+    from recon.reference_phase import measure_reference_phase
 
     opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
-    return diagnose_with_optics(opened, None if device is None else load_device(device), progress)
+    nominal = None if device is None else load_device(device)
+    return diagnose_with_optics(opened, nominal, progress, measure_reference_phase)
 
 
 def identify(

@@ -453,6 +453,11 @@ class Device:
         axis = self.axis(name)
         return axis if self.readout is None else replace(axis, readout=self.readout)
 
+    def with_terms(self, terms: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Device:
+        """Return the device with further terms: axis -> effect -> parameter -> value."""
+        axes = {name: replace(axis, terms={**axis.terms, **terms.get(name, {})}) for name, axis in self.axes.items()}
+        return replace(self, axes=axes)
+
     def require_scan(self) -> Scan:
         """Return the field of view; DeviceInvalid where the device states none."""
         if self.scan is None:

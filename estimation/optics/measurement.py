@@ -138,13 +138,13 @@ def nominal_covariance(
         sd |= {f"delay_{axis}": delay, f"delay_growth_{axis}": growth}
         sd |= {f"drift_{axis}": position_sd, f"amplitude_growth_{axis}": AMPLITUDE_WANDER_SD}
     covariance = np.diag([sd[name] ** 2 for name in MEASURED_PARAMETERS])
-    delays = np.array([_readout_delay_sd(device, axis, rates[axis]) for axis in AXES])
+    delays = np.array([readout_delay_sd(device, axis, rates[axis]) for axis in AXES])
     shared = device.readout is not None  # one readout, one error
     covariance[:2, :2] += np.outer(delays, delays) if shared else np.diag(delays**2)
     return covariance
 
 
-def _readout_delay_sd(device: Device, axis: str, rate: float) -> float:
+def readout_delay_sd(device: Device, axis: str, rate: float) -> float:
     """Standard deviation of the motion's delay [s] from the tolerance of the readout's corner frequencies."""
     readout = device.readout or device.axis(axis).readout
     if not isinstance(readout, Amdm):

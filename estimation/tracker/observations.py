@@ -37,11 +37,16 @@ from scanner.recording import Recording
 MIN_BLOCK_CYCLES = 2.0
 """Least length of a block in cycles of the slowest axis: its harmonics are then separable from the other axis's."""
 
+MAX_BLOCK_S = 1e-3
+"""Largest length of a block with more than MIN_BLOCK_CYCLES [s]. Drift and the turn of the phase where the amplitude
+passes near zero take some milliseconds, however long the decay; with blocks of 10 ms (Q 400 at 2 kHz) the phase was 6°
+off."""
+
 MIN_BLOCK_SAMPLES = 64
 """Least length of a block: enough for all lines of two axes."""
 
 BLOCK_DECAY_TIMES = 0.15
-"""Length of a block in units of the fastest decay time 1 / (pi f / Q), if that is longer than MIN_BLOCK_CYCLES.
+"""Length of a block in units of the fastest decay time 1 / (pi f / Q), between MIN_BLOCK_CYCLES and MAX_BLOCK_S.
 
 Longer blocks save time. With 0.2, the drift within a block adds to the phase error at 40 dB
 (docs/explanation/tracker.md).
@@ -246,10 +251,10 @@ def _clipped_blocks(projections: Projections, starts: Index, pieces: Index, sett
 
 
 def _block_length(axes: Sequence[Axis], frequencies: list[float], rate: float) -> int:
-    """Samples of a block, from MIN_BLOCK_CYCLES and BLOCK_DECAY_TIMES."""
-    width = MIN_BLOCK_CYCLES / min(frequencies)
+    """Samples of a block, from MIN_BLOCK_CYCLES, BLOCK_DECAY_TIMES and MAX_BLOCK_S."""
     decays = [axis.quality / (np.pi * axis.resonance) for axis in axes if axis.mechanics is not None]
-    return max(MIN_BLOCK_SAMPLES, round(max([width, BLOCK_DECAY_TIMES * min(decays)] if decays else [width]) * rate))
+    width = min(BLOCK_DECAY_TIMES * min(decays), MAX_BLOCK_S) if decays else 0.0
+    return max(MIN_BLOCK_SAMPLES, round(max(MIN_BLOCK_CYCLES / min(frequencies), width) * rate))
 
 
 def _usable_lines(axes: Sequence[Axis], sense: SenseChannel, w: Array, rate: float) -> Index:

@@ -62,6 +62,7 @@ def diagnose_files(
     from estimation.complete_diagnosis import diagnose_with_optics
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder
+    from recon.reference_phase import measure_reference_phase
     from recon.report.diagnosis import diagnosis_report
     from scanner import devices
 
@@ -71,7 +72,7 @@ def diagnose_files(
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = devices.find(device) if device is not None else None
         with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
-            diagnosis = diagnose_with_optics(recordings, nominal, bar.set_description_str)
+            diagnosis = diagnose_with_optics(recordings, nominal, bar.set_description_str, measure_reference_phase)
             bar.set_description_str("report")
             page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
         content = diagnosis.to_json()

@@ -292,11 +292,16 @@ def _errors_after(errors: Sequence[PhaseError], before: Motion, after: Motion) -
     """Phase errors of the motion ``after``, from those of the motion ``before`` that lies within their reach."""
     moved = []
     for error in errors:
-        values = {}
-        for name in AXES:
+        values, parts = {}, error.parts and error.parts._replace(value=error.parts.value.copy())
+        for column, name in enumerate(AXES):
             old, new = before.axes[name], after.axes[name]
-            shift = np.interp(old.angle.start + error.time, old.time, new.phase - old.phase)
             estimate: PhaseEstimate = getattr(error, name)
-            values[name] = estimate._replace(value=estimate.value - float(shift))
-        moved.append(replace(error, x=values["x"], y=values["y"], parts=None))
+
+            def shift(time: float | Array, old: AxisMotion = old, new: AxisMotion = new) -> Array:
+                return np.interp(old.angle.start + np.asarray(time), old.time, new.phase - old.phase)
+
+            values[name] = estimate._replace(value=estimate.value - float(shift(error.time)))
+            if parts is not None:
+                parts.value[:, column] -= shift(parts.time)
+        moved.append(replace(error, x=values["x"], y=values["y"], parts=parts))
     return moved

@@ -19,7 +19,7 @@ from recon.imaging.gridding import accumulate_samples
 from recon.imaging.phasor_gridding import accumulate_phasors
 from recon.imaging.picture import Grid
 from scanner import devices
-from scanner.device import Device, Drive, Position
+from scanner.device import Axis, Device, Drive, Mechanics, Position
 from scanner.drift import Drift, exponential
 from scanner.errors import BadInput
 from scanner.parametric import sine_drive, slow_flow, steady_state
@@ -258,6 +258,20 @@ def test_position_readout_and_linear_drive() -> None:
     assert result.sign == "known: position readout"
     angle = truth["angle_x"][0]
     assert np.sqrt(np.mean((result.angle.read() - angle) ** 2)) < 2e-3 * np.abs(angle).max()
+
+
+def test_a_slow_decay_does_not_hide_a_turn_of_the_phase() -> None:
+    """The amplitude falls to a tenth and grows again with the opposite phase, far faster than the decay of 67 ms."""
+    mechanics = Mechanics(J=1e-10, b=2.998e-9, k=1.579e-2)
+    axis = Axis(mechanics, name="x", drive=Drive("linear", 1e-6), readout=Position(gain=20.0, noise_sd=2e-3))
+    device = Device("high Q", {"x": axis})
+    recording, truth = simulate(
+        device, Plan({"x": Sine(2000.0, 3.22)}, 0.06, 2e5), start={"x": InitialState(0.025, 0.0)}
+    )
+    result = track(recording, device).axes["x"]
+    assert result.amplitude.min() < 0.1 * result.amplitude.max()
+    error = result.angle.read() - truth["angle_x"][0]
+    assert np.sqrt(np.mean(error**2)) < 5e-3 * result.amplitude.max()
 
 
 # --- the angle
