@@ -30,7 +30,7 @@ def terms_on_channel(device: Device, channel: str, axis: str | None = None) -> l
 
 
 def apply_terms(terms: Iterable[ActiveTerm], signal: Array, time: Array) -> Array:
-    """Return a signal (n,) after the output laws of ``terms``.
+    """Return a signal (n,) after the effects of ``terms`` on their channel.
 
     Args:
         terms: in the order in which they act.
@@ -40,8 +40,7 @@ def apply_terms(terms: Iterable[ActiveTerm], signal: Array, time: Array) -> Arra
     step = float(time[1] - time[0]) if time.size > 1 else 1.0
     context = SignalContext(time, step, None, _EMPTY, _EMPTY, _EMPTY, _EMPTY)
     for active in terms:
-        if active.term.output is not None:
-            signal = active.term.output(signal, active.values, context)
+        signal = active.term.apply(signal, active.values, context)
     return signal
 
 

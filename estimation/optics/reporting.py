@@ -9,10 +9,11 @@ import numpy as np
 
 from estimation.diagnosis.diagnose import Finding, ParameterEstimate, Rival
 from estimation.diagnosis.progressive_fit import UNIQUE_NAME_THRESHOLD
+from estimation.optics.candidates import OpticsEffect, natural_scales
 from estimation.optics.fit import UNRESOLVED_SD_CELLS, validation_error
 from estimation.optics.samples import OpticsParameters, ScanSamples
 from scanner.device import AXES
-from scanner.terms import Term, catalogue
+from scanner.terms import NaturalScales, Term, catalogue
 
 COMPARISON_SAMPLES = 60_000
 """Samples used to distinguish a delay from a lag. Each evaluation applies the detector's low-pass in every iteration of
@@ -39,23 +40,6 @@ MIN_REPORTED_PROBABILITY = 1e-4
 
 
 @dataclass(frozen=True)
-class OpticsEffect:
-    """A hypothesis about the optics: a direction in the space of the measured parameters.
-
-    Attributes:
-        name: of the effect in the catalogue, or ``"phase"`` for a phase error of one axis.
-        axis: that it is reported for.
-        direction: change of each measured parameter with a unit of the effect's amplitude.
-        size: prior standard deviation of the amplitude.
-    """
-
-    name: str
-    axis: str
-    direction: OpticsParameters
-    size: float
-
-
-@dataclass(frozen=True)
 class EffectDescription:
     """An effect of known amplitude in the terms of the catalogue; the fields are those of ``Finding``."""
 
@@ -68,14 +52,22 @@ class EffectDescription:
     where: str
 
 
+def has_permitted_sign(effect: OpticsEffect, amplitude: float) -> bool:
+    """Whether the term of an effect permits the sign of its amplitude; a phase error may have either sign."""
+    return effect.name == "phase" or catalogue()[effect.name].parameters[0].sign * amplitude >= 0.0
+
+
 def catalogue_name(effect: OpticsEffect, amplitude: float) -> str:
     """Name of the effect in the catalogue at the sign of its amplitude.
 
-    A phase error of one axis is ``"unknown"``: the intensity does not show its cause.
+    A phase error of one axis is ``"unknown"``, because the intensity does not show its cause. So is an effect whose
+    sign its term excludes. A negative delay of the intensity is a delay of the other channels.
     """
-    if effect.name == "phase" or (effect.name == "bleaching" and amplitude < 0.0):
+    if effect.name == "phase":
         return "unknown"
-    return "channel-delay" if effect.name == "intensity-delay" and amplitude < 0.0 else effect.name
+    if has_permitted_sign(effect, amplitude):
+        return effect.name
+    return "channel-delay" if effect.name == "intensity-delay" else "unknown"
 
 
 def describe_effect(
@@ -112,6 +104,8 @@ def describe_effect(
             "full swing over the recording"
         )
         return _describe_term(axis, name, speed * value, (speed * low, speed * high), where)
+    if effect.name != "intensity-delay":
+        return _describe_linearised(effect, name, value, sd, natural_scales(scan, axis, rates))
     delay, interval = (value, (low, high)) if value > 0.0 else (-value, (-high, -low))
     late = "the intensity lags behind the motion" if value > 0.0 else "the estimated motion lags behind the intensity"
     where = f"{late}: forward and backward half-periods of both axes are displaced by the same {1e6 * delay:.4g} us"
@@ -127,6 +121,23 @@ def _describe_term(
         term.parameters[0].name, value, (min(interval), max(interval)), term.parameters[0].unit
     )
     return EffectDescription(axis, term.stage, effect, term.equation, term.source, (parameter,), where)
+
+
+def _describe_linearised(
+    effect: OpticsEffect, name: str, value: float, sd: float, scales: NaturalScales
+) -> EffectDescription:
+    """Describe an effect by its term; parameters other than the first have their prior median and interval."""
+    term = catalogue()[effect.name]
+    where = f"samples of one place at different times or in different directions differ as by {effect.name}"
+    if name == "unknown":
+        where += " of the opposite sign"
+        return EffectDescription(effect.axis, "optics", name, term.equation, "samples of one place", (), where)
+    estimates = []
+    for parameter in term.parameters:
+        x, x_sd = (value / effect.size, sd / effect.size) if parameter is term.parameters[0] else (0.0, 1.0)
+        low, high = sorted(parameter.value(x + side * Z_95 * x_sd, scales) for side in (-1.0, 1.0))
+        estimates.append(ParameterEstimate(parameter.name, parameter.value(x, scales), (low, high), parameter.unit))
+    return EffectDescription(effect.axis, term.stage, name, term.equation, term.source, tuple(estimates), where)
 
 
 def discriminate_delay_from_lag(

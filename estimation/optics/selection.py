@@ -28,19 +28,15 @@ from estimation.diagnosis.diagnose import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
 from estimation.diagnosis.progressive_fit import DETECTION_THRESHOLD
 from estimation.least_squares import GaussianPosterior, eliminate_backward, gaussian_posterior
+from estimation.optics.candidates import OpticsEffect, candidate_effects
 from estimation.optics.fit import fit_optics
-from estimation.optics.measurement import (
-    MAX_PHASE_ERROR_RAD,
-    MEASURED_PARAMETERS,
-    fit_from_best_start,
-    nominal_covariance,
-)
+from estimation.optics.measurement import MEASURED_PARAMETERS, fit_from_best_start, nominal_covariance
 from estimation.optics.reporting import (
-    OpticsEffect,
     build_finding,
     catalogue_name,
     describe_effect,
     discriminate_delay_from_lag,
+    has_permitted_sign,
 )
 from estimation.optics.samples import (
     NOMINAL,
@@ -53,12 +49,17 @@ from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES, Device
 from scanner.motion import Motion
-from scanner.terms import NaturalScales, catalogue
+from scanner.terms import catalogue
 
 VALIDATION_METRIC = "reduced chi-square of the intensity about the best picture, on blocks of time not used in the fit"
 
 MAX_EFFECTS = 4
 """Largest number of effects reported; the nine fitted parameters do not determine more independent ones."""
+
+
+MIN_SQUARED_CORRELATION = 0.99
+"""Squared correlation of the signals of two effects from which they have the same direction: no sample distinguishes
+them, and only the sign that their terms permit decides."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +140,11 @@ def diagnose_optics(motion: Motion, intensity: Channel, device: Device) -> Optic
     score = fit.information @ parameters + parameters / fit.prior_sd**2
     likelihood = GaussianLikelihood(fit.information, score, nominal_covariance(motion, device, rates, scan, variances))
     candidates = candidate_effects(scan, rates)
-    selected, rivals = select_effects(likelihood, candidates)
+    selected, rivals = select_effects(likelihood, [effect for effect in candidates if effect.direction])
     selected = _validated(scan, variances, likelihood, selected)
     detectability = tuple(
         OpticsDetectability(effect.name, effect.axis, _sigma(likelihood, effect)) for effect in candidates
     )
-    detectability += tuple(OpticsDetectability("field-distortion", axis, 0.0) for axis in AXES)
     if not selected:
         return OpticsDiagnosis((), detectability, {})
     findings, terms = _report(scan, variances, likelihood, selected, rivals, rates)
@@ -187,29 +187,6 @@ def _report(
     return tuple(finding for _, finding in findings), terms
 
 
-def candidate_effects(scan: ScanSamples, rates: Mapping[str, float]) -> list[OpticsEffect]:
-    """The effects that are searched for, with the natural sizes that their terms state.
-
-    Args:
-        rates: angular frequency of each axis [rad/s].
-    """
-    known = catalogue()
-
-    def size(effect: str, axis: str) -> float:
-        scales = NaturalScales(scan.half_swing[axis], rates[axis], 1.0, 1.0, 1.0, scan.duration)
-        return known[effect].parameters[0].scale(scales)
-
-    effects = [
-        OpticsEffect("intensity-delay", "x", {"delay_x": 1.0, "delay_y": 1.0}, size("intensity-delay", "x")),
-        OpticsEffect("bleaching", "x", {"decay": 1.0}, scan.duration / size("bleaching", "x")),
-    ]
-    for axis in AXES:
-        drift = size("sample-motion", axis) * scan.duration / scan.half_swing[axis]
-        effects.append(OpticsEffect("sample-motion", axis, {f"drift_{axis}": 1.0}, drift))
-        effects.append(OpticsEffect("phase", axis, {f"delay_{axis}": 1.0}, MAX_PHASE_ERROR_RAD / rates[axis]))
-    return effects
-
-
 def select_effects(likelihood: GaussianLikelihood, candidates: list[OpticsEffect]) -> tuple[list[OpticsEffect], Rivals]:
     """Select effects stepwise by evidence: add the best, then remove those that it has made unnecessary.
 
@@ -225,6 +202,7 @@ def select_effects(likelihood: GaussianLikelihood, candidates: list[OpticsEffect
             for effect in candidates
             if effect not in selected
         ]
+        scores = _without_excluded_signs(likelihood, selected, scores)
         scores.sort(key=lambda pair: pair[0])
         if best - scores[0][0] < DETECTION_THRESHOLD:
             break
@@ -237,6 +215,28 @@ def select_effects(likelihood: GaussianLikelihood, candidates: list[OpticsEffect
             [*selected, added], likelihood.neg2_log_evidence, earlier, max_increase=DETECTION_THRESHOLD
         )
     return selected, rivals
+
+
+def _without_excluded_signs(
+    likelihood: GaussianLikelihood, selected: list[OpticsEffect], scores: list[tuple[float, OpticsEffect]]
+) -> list[tuple[float, OpticsEffect]]:
+    """The scores without effects of a sign that their term excludes, if another effect of the same direction permits
+    it."""
+
+    def permitted(effect: OpticsEffect) -> bool:
+        return has_permitted_sign(effect, float(likelihood.posterior([*selected, effect]).mean[-1]))
+
+    def same_direction(a: OpticsEffect, b: OpticsEffect) -> bool:
+        directions = np.array([_direction(a), _direction(b)])
+        gram = directions @ likelihood.information @ directions.T
+        return bool(gram[0, 1] ** 2 > MIN_SQUARED_CORRELATION * gram[0, 0] * gram[1, 1])
+
+    allowed = [effect for _, effect in scores if permitted(effect)]
+    return [
+        (score, effect)
+        for score, effect in scores
+        if effect in allowed or not any(same_direction(effect, other) for other in allowed)
+    ]
 
 
 def _validated(

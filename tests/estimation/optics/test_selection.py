@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import scanner.terms
 from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.optics.candidates import candidate_effects
 from estimation.optics.correction import beam_motion, correct_intensity
+from estimation.optics.samples import read_scan
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.targets import make_target
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from recon.report.diagnosis import diagnosis_report
 from scanner.device import Device
+from scanner.motion import SampledAngle
 from scanner.optics import beam_position, intensity_delay, intensity_gain
 from scanner.recording import Recording
+from scanner.terms.term import Parameter, Term
 
 SAMPLE_RATE_HZ, DURATION_S = 2e6, 0.012
 DRIVE_RATE_RAD_S = {"x": 2 * np.pi * 9000.0, "y": 2 * np.pi * 2130.0}
@@ -105,6 +111,51 @@ def test_a_phase_error_of_one_axis_is_not_reported_as_an_intensity_delay() -> No
     (finding,) = diagnose_with_optics([scan(phase_x=0.05)]).findings
     assert (finding.effect, finding.axis, finding.stage) == ("unknown", "x", "timing")
     assert "deg" in finding.where
+
+
+BRIGHTENING = """
+import numpy as np
+from scanner.terms.term import Parameter, Term
+
+TERM = Term(
+    "brightening", "optics", "I(t) = L e^(t/tau)",
+    (Parameter("tau", "s", lambda s: 2.0 * s.duration, kind="inverse", sign=1),), "this test",
+    channels=("intensity",), output=lambda signal, p, context: signal * np.exp(context.time / p[0]),
+)
+"""
+
+
+def test_an_optics_effect_of_a_users_file_is_a_candidate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two effects of opposite sign in the same direction, the one whose term permits the sign is named."""
+    monkeypatch.setattr(scanner.terms, "_REGISTERED", {})
+    (tmp_path / "brightening.py").write_text(BRIGHTENING, encoding="utf-8")
+    scanner.terms.register(tmp_path / "brightening.py")
+    diagnosis = diagnose_with_optics([scan("retina", fade=-0.3)])
+    (finding,) = diagnosis.findings
+    low, high = finding.parameters[0].ci95
+    assert (finding.effect, finding.axis) == ("brightening", "x")
+    assert low < DURATION_S / 0.3 < high
+    assert diagnosis.device.axis("x").terms["brightening"]["tau"] == pytest.approx(DURATION_S / 0.3, rel=0.2)
+    assert {effect["effect"] for effect in diagnosis.optics[0]["effects"]} >= {"brightening", "bleaching"}
+
+
+@pytest.mark.parametrize(
+    ("channel", "law", "direction"),
+    [
+        ("intensity", lambda y, p, c: np.interp(c.time - p[0], c.time, y), {"delay_x": 1.0, "delay_y": 1.0}),
+        ("place", lambda y, p, c: y * (1.0 + 1e4 * p[0] * c.time), {"amplitude_growth_y": 1.0}),
+        ("place", lambda y, p, c: y + p[0] * y**3, {}),
+    ],
+)
+def test_a_term_is_linearised_in_the_measured_parameters(
+    channel: str, law: object, direction: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    term = Term("law", "optics", "", (Parameter("p", "", lambda s: 1e-5),), "", channels=(channel,), output=law)  # type: ignore[arg-type]
+    monkeypatch.setattr("estimation.optics.candidates.catalogue", lambda: {"law": term})
+    samples = read_scan({axis: SampledAngle(np.sin(np.arange(5000.0)), 1e6) for axis in "xy"}, scan()["intensity"])
+    effects = candidate_effects(samples, DRIVE_RATE_RAD_S)
+    effect = next(e for e in effects if e.name == "law" and e.axis == ("x" if channel == "intensity" else "y"))
+    assert effect.direction == pytest.approx(direction, rel=1e-3)
 
 
 def test_effects_on_a_sample_without_features_are_reported_as_not_detectable() -> None:
