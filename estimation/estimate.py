@@ -15,8 +15,9 @@ def default_estimator(recording: Recording, device: Device) -> str:
     """Name of the estimator that suits the channels of a recording.
 
     Returns:
-        ``"tracker"`` with a capacitive readout or a sensor of velocity or acceleration; ``"picture"`` with an intensity
-        and the drives or their frequencies, but neither sense nor angle channel; otherwise ``"sensor"``.
+        ``"tracker"`` with a capacitive readout or a sensor of velocity or acceleration; ``"edges"`` with edges
+        and neither sense nor angle channel; ``"picture"`` with an intensity and the drives or their frequencies and
+        none of these; otherwise ``"sensor"``.
     """
     followed = any(
         f"sense_{name}" in recording and axis.readout is not None and not isinstance(axis.readout, Position)
@@ -26,6 +27,9 @@ def default_estimator(recording: Recording, device: Device) -> str:
     derivative = any(f"{kind}_{axis}" in recording for axis in unmeasured for kind in ("velocity", "acceleration"))
     if "sense" in recording or followed or derivative:
         return "tracker"
+    crossed = [name.partition("_")[2] for name in recording.edges]
+    if crossed and not any(f"{kind}_{axis}" in recording for axis in crossed for kind in ("sense", "angle")):
+        return "edges"
     driven = "intensity" in recording and all(
         f"drive_{name}" in recording or (axis.drive is not None and axis.drive.frequency is not None)
         for name, axis in device.axes.items()

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
 from scanner.device import Device
+from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput, ChannelMissing
 from scanner.files import replacing
 from scanner.hdf5 import attributes, child, new_hdf5, open_hdf5, undamaged
@@ -47,6 +48,7 @@ class Recording:
         attrs: attributes of the file (``name``, ``notes``, ``acquired``, ...).
         path: of the file, None for a recording in memory.
         device_toml: the nominal device as text, None where there is none.
+        edges: edge times of the detectors that the beam crosses (``sync_x``, ``sync_y``), by name.
     """
 
     channels: Mapping[str, Channel]
@@ -54,6 +56,7 @@ class Recording:
     path: Path | None = None
     device_toml: str | None = None
     _file: Closeable | None = None
+    edges: Mapping[str, Edges] = field(default_factory=dict)
 
     @classmethod
     def open(cls, path: str | Path, growing: bool = False) -> Recording:
@@ -76,17 +79,18 @@ class Recording:
                 group = child(file, "channels", h5py.Group)
                 if group is None or not len(group):
                     raise BadInput("holds no channels", file=path, hint="store signals under /channels")
-                channels = {name: _open_channel(group, name, path) for name in group}
+                channels = {name: _open_channel(group, name, path) for name in group if name not in EDGE_CHANNELS}
+                edges = {name: _open_edges(group, name, path) for name in group if name in EDGE_CHANNELS}
                 text = _device_text(file, path)
         except BaseException:
             file.close()
             raise
-        return cls(MappingProxyType(channels), MappingProxyType(attrs), path, text, file)
+        return cls(MappingProxyType(channels), MappingProxyType(attrs), path, text, file, MappingProxyType(edges))
 
     @classmethod
     def from_arrays(
         cls,
-        channels: Mapping[str, tuple[ArrayLike, str, float] | tuple[ArrayLike, str, float, float]],
+        channels: Mapping[str, tuple[Any, ...]],
         device: Device | None = None,
         name: str | None = None,
         detectors: Sequence[str] = (),
@@ -103,7 +107,8 @@ class Recording:
         Args:
             channels: name -> (values, unit, sample rate [Hz]) or (values, unit, sample rate [Hz], start [s]). Values
                 have the shape (n,), or (n, detectors) for ``intensity``; start is the time of the first sample, 0
-                where it is left out. Channels may differ in sample rate, start and length.
+                where it is left out. Channels may differ in sample rate, start and length. ``sync_x`` and ``sync_y``
+                are (edge times, unit, attributes), as ``(times, "s", {"event": "both-edges", "angle": 0.01})``.
             device: the nominal device.
             name: of the recording.
             detectors: names of the columns of ``intensity``.
@@ -115,8 +120,11 @@ class Recording:
         """
         if not channels:
             raise BadInput("holds no channels", hint="give at least one")
-        made = {}
+        made, edges = {}, {}
         for key, channel in channels.items():
+            if key in EDGE_CHANNELS:
+                edges[key] = _edges_from_tuple(key, channel)
+                continue
             if not isinstance(channel, tuple) or len(channel) not in (3, 4):
                 raise BadInput(
                     "is not a tuple of 3 or 4 items", channel=key, hint="give (values, unit, sample rate[, start])"
@@ -128,7 +136,7 @@ class Recording:
             made[key] = make_channel(key, raw, unit=unit, sample_rate=sample_rate, start=first, detectors=names)
         attrs = ({} if name is None else {"name": name}) | attrs
         text = None if device is None else device.to_toml()
-        return cls(MappingProxyType(made), MappingProxyType(attrs), device_toml=text)
+        return cls(MappingProxyType(made), MappingProxyType(attrs), device_toml=text, edges=MappingProxyType(edges))
 
     def __repr__(self) -> str:
         device = "no device" if self.device_toml is None else "with a device"
@@ -138,6 +146,7 @@ class Recording:
             f"at {channel.sample_rate:.9g} Hz from {channel.start:.6g} s"
             for channel in self.channels.values()
         ]
+        lines += [f"  {edges.name}: {edges.times.size} edges, {edges.event}" for edges in self.edges.values()]
         return "\n".join(lines)
 
     def __enter__(self) -> Recording:
@@ -198,13 +207,15 @@ class Recording:
 
     @property
     def start(self) -> float:
-        """Time of the first sample of any channel [s]."""
-        return min(channel.start for channel in self.channels.values())
+        """Time of the first sample of any channel [s]; of the first edge where there are edges only."""
+        starts = [channel.start for channel in self.channels.values()]
+        return min(starts or [float(edges.times[0]) for edges in self.edges.values() if edges.times.size])
 
     @property
     def end(self) -> float:
-        """Time one sample after the last sample of any channel [s]."""
-        return max(channel.end for channel in self.channels.values())
+        """Time one sample after the last sample of any channel [s]; of the last edge where there are edges only."""
+        ends = [channel.end for channel in self.channels.values()]
+        return max(ends or [float(edges.times[-1]) for edges in self.edges.values() if edges.times.size])
 
     @property
     def duration(self) -> float:
@@ -222,7 +233,8 @@ class Recording:
         if not nonempty:
             what = f"holds nothing from {t0:g} s to {t1:g} s"
             raise BadInput(what, file=self.path, hint=f"it runs from {self.start:g} s to {self.end:g} s")
-        return replace(self, channels=MappingProxyType(nonempty))
+        edges = {name: each.between(t0, t1) for name, each in self.edges.items()}
+        return replace(self, channels=MappingProxyType(nonempty), edges=MappingProxyType(edges))
 
     def with_channel(self, channel: Channel) -> Recording:
         """Return the recording with a channel added, or replaced where there is one of its name."""
@@ -242,10 +254,26 @@ class Recording:
             group = file.create_group("channels")
             for channel in self.channels.values():
                 _write_channel(group, channel)
+            for edges in self.edges.values():
+                group.create_dataset(edges.name, data=edges.times).attrs.update(edges.attributes)
             if self.device_toml is not None:
                 file.create_group("device").attrs["toml"] = self.device_toml
             if truth is not None:
                 write_truth(file.create_group("truth"), truth)
+
+
+def _edges_from_tuple(name: str, given: object) -> Edges:
+    if not isinstance(given, tuple) or len(given) != 3 or not isinstance(given[2], Mapping):
+        hint = 'give (times, "s", {"event": "both-edges"})'
+        raise BadInput("is not a tuple of times, unit and attributes", channel=name, hint=hint)
+    return make_edges(name, _as_numbers(given[0], name), {"unit": given[1], **given[2]})
+
+
+def _open_edges(group: h5py.Group, name: str, path: Path) -> Edges:
+    dataset = child(group, name, h5py.Dataset)
+    if dataset is None:
+        raise BadInput("is listed and not there", file=path, channel=name, hint="copy the file again")
+    return make_edges(name, dataset[...], attributes(dataset), str(path))
 
 
 def _as_numbers(values: ArrayLike, name: str) -> NDArray[Any]:

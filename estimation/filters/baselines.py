@@ -26,6 +26,9 @@ from scanner.lock_in import block_length, block_phasors, unwrap_phase
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 
+SIGN_SAMPLES = 100_000
+"""Samples from the start over which a motion is compared with a reference to find its sign."""
+
 MIN_BLOCKS = 2
 """Blocks that a motion's slow clock has at least."""
 
@@ -70,14 +73,16 @@ def estimate_from_sensor(recording: Recording, device: Device) -> Motion:
     Raises:
         ChannelMissing: an axis has neither. BadInput: a channel cannot be used.
     """
-    axes = {}
-    for name, axis in device.axes.items():
-        channel, scale, zero, noise_sd = find_position_signal(recording, axis, name)
-        check_signal(channel)
-        angle = (channel.read() - zero) / scale
-        reference = reference_of_any_waveform(recording, device, name, channel)
-        axes[name] = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
-    return Motion(axes, "sensor", {})
+    return Motion({name: axis_motion_from_sensor(recording, device, name) for name in device.axes}, "sensor", {})
+
+
+def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> AxisMotion:
+    """Motion of one axis; as :func:`estimate_from_sensor`."""
+    channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
+    check_signal(channel)
+    angle = (channel.read() - zero) / scale
+    reference = reference_of_any_waveform(recording, device, name, channel)
+    return axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
 
 
 def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[Channel, float, float, float | None]:
@@ -163,7 +168,7 @@ def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool
     An even capacitance does not distinguish theta from -theta.
 
     Args:
-        flips: axes that the user reverses. An angle channel decides only where the sign is ambiguous.
+        flips: axes that the user reverses. An angle channel or edges decide only where the sign is ambiguous.
     """
     from dataclasses import replace
 
@@ -172,6 +177,8 @@ def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool
         turn, sign = flips.get(name, False), axis.sign
         if sign == "ambiguous" and f"angle_{name}" in recording and not turn:
             turn, sign = _opposes(axis, recording[f"angle_{name}"]), f"known: angle_{name}"
+        elif sign == "ambiguous" and f"sync_{name}" in recording.edges and not turn:
+            turn, sign = _sign_from_edges(axis, recording, name)
         elif turn:
             sign = f"known: --flip-{name}"
         if turn:
@@ -180,9 +187,23 @@ def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool
     return replace(motion, axes=axes)
 
 
+def _sign_from_edges(axis: AxisMotion, recording: Recording, name: str) -> tuple[bool, str]:
+    """Whether the edges of an axis show the opposite of its motion, and what they say of its sign."""
+    from estimation.sync.motion import phase_from_edges
+
+    edges = recording.edges[f"sync_{name}"]
+    found = phase_from_edges(edges)
+    if found.sign == "ambiguous":
+        return False, "ambiguous"
+    time = axis.angle.start + np.arange(min(axis.angle.size, SIGN_SAMPLES)) / axis.angle.sample_rate
+    inside = (time > found.time[0]) & (time < found.time[-1])
+    phase = np.interp(time[inside], found.time, found.phase)
+    return float(np.nansum(np.sin(phase) * axis.angle.read(0, time.size)[inside])) < 0.0, found.sign
+
+
 def _opposes(axis: AxisMotion, angle: Channel) -> bool:
     """Whether the first samples of a motion are anticorrelated with a measured angle."""
-    n = min(axis.angle.size, 100_000)
+    n = min(axis.angle.size, SIGN_SAMPLES)
     time = axis.angle.start + np.arange(n) / axis.angle.sample_rate
     m = min(angle.size, int(np.ceil((time[-1] - angle.start) * angle.sample_rate)) + 1)
     measured = np.interp(time, angle.time(0, m), angle.read(0, m))

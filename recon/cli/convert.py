@@ -79,4 +79,5 @@ def format_summary(summary: dict[str, Any]) -> str:
         line += f", {own['sample_rate']:.9g} Hz ({by['sample_rate']})"
         line += f", from {own['start']:.9g} s ({by['start']}), {own['shape'][0]} samples"
         lines.append(line + "".join(f"; the file states {key} {value}" for key, value in own["overruled"].items()))
+    lines += [f"  {name}: {edges['number']} edges, {edges['event']}" for name, edges in summary["edges"].items()]
     return "\n".join(lines)

@@ -32,6 +32,7 @@ from recon.io.readers import read
 from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock, matrix_row
 from scanner.channel import Channel, make_channel
 from scanner.device import Device
+from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput
 from scanner.files import read_toml
 from scanner.hdf5 import check_ends
@@ -40,6 +41,7 @@ from scanner.recording import Recording
 TEXT_KEYS = ("format", "name", "notes", "acquired")
 MAPPING_KEYS = (*TEXT_KEYS, "channels", "device")
 CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "offset", "row")
+EDGE_KEYS = ("variable", "unit", "event", "angle", "hysteresis")
 
 Plan = Mapping[str, Any]
 """Content of a mapping file."""
@@ -68,7 +70,8 @@ def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, 
     Returns:
         Summary: ``recording``, ``source``, ``format``, ``duration`` [s], ``device`` (its name or None) and, for each of
         ``channels``, ``variable``, ``unit``, ``sample_rate`` [Hz], ``start`` [s], ``shape``, ``stated_by`` (the source
-        of unit, rate and start) and ``overruled`` (statements of the file that the mapping contradicts).
+        of unit, rate and start) and ``overruled`` (statements of the file that the mapping contradicts); for each of
+        ``edges``, ``number`` and ``event``.
 
     Raises:
         BadInput: as :func:`convert`.
@@ -89,6 +92,7 @@ def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, 
                 | _origin(plan["channels"][name], contents)
                 for name, channel in recording.channels.items()
             },
+            "edges": {name: {"number": each.times.size, "event": each.event} for name, each in recording.edges.items()},
         }
 
 
@@ -133,8 +137,11 @@ def _contents(source: Path, plan: Plan, plan_source: object) -> Contents:
 def _recording(contents: Contents, source: Path, plan: Plan, plan_source: object) -> Recording:
     try:
         device = Device.from_table(plan["device"], source=str(plan_source)) if "device" in plan else None
-        channels = {
-            name: _channel(name, spec, contents, source, plan_source) for name, spec in plan["channels"].items()
+        sampled = {name: spec for name, spec in plan["channels"].items() if name not in EDGE_CHANNELS}
+        channels = {name: _channel(name, spec, contents, source, plan_source) for name, spec in sampled.items()}
+        edges = {
+            name: _edges(name, plan["channels"][name], contents, source, plan_source)
+            for name in plan["channels"].keys() - sampled.keys()
         }
     except BaseException:
         contents.close()
@@ -142,7 +149,7 @@ def _recording(contents: Contents, source: Path, plan: Plan, plan_source: object
     attrs = {"name": source.stem, "source": source.name, "source_format": contents.kind} | dict(contents.about)
     attrs |= {key: plan[key] for key in TEXT_KEYS if key in plan and key != "format"}
     text = None if device is None else device.to_toml()
-    return Recording(MappingProxyType(channels), MappingProxyType(attrs), None, text, contents)
+    return Recording(MappingProxyType(channels), MappingProxyType(attrs), None, text, contents, MappingProxyType(edges))
 
 
 def _origin(spec: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
@@ -203,6 +210,25 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
         raw = matrix_row(raw, spec["row"])
     file = f"{source} by {plan_source}"
     return make_channel(name, raw, unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file)
+
+
+def _edges(name: str, spec: Any, contents: Contents, source: Path, plan_source: object) -> Edges:
+    """The edge times of one channel; their mapping states ``variable``, ``unit`` and ``event`` or ``angle``."""
+
+    def bad(what: str, hint: str) -> BadInput:
+        return BadInput(what, file=plan_source, channel=f"channels.{name}", hint=hint)
+
+    if not isinstance(spec, dict) or not isinstance(spec.get("variable"), str):
+        raise bad("says no variable", f"write [channels.{name}] with variable = ...")
+    if unknown := [key for key in spec if key not in EDGE_KEYS]:
+        raise bad(f"{unknown[0]} is not a known key of edges", f"known: {', '.join(EDGE_KEYS)}")
+    if spec["variable"] not in contents.variables:
+        what = f"there is no variable {spec['variable']!r}"
+        raise bad(what, f"{source.name} holds {format_variables(contents.variables)}")
+    variable = contents.variables[spec["variable"]]
+    times = flatten_row(variable.raw)[0 : variable.raw.shape[-1]]
+    stated = {"unit": variable.unit} | {key: value for key, value in spec.items() if key != "variable"}
+    return make_edges(name, times, stated, f"{source} by {plan_source}")
 
 
 def _clock(times: Variable, name: str, bad: Any) -> tuple[float, float]:

@@ -82,6 +82,11 @@ def _of_recording(path: Path, mapping: Path | None) -> dict[str, Any]:
                 name: {key: getattr(channel, key) for key in ("shape", "unit", "sample_rate", "start")}
                 | {"dtype": str(channel.raw.dtype), "note": ""}
                 for name, channel in recording.channels.items()
+            }
+            | {
+                name: {"shape": each.times.shape, "unit": "s", "sample_rate": None, "start": None}
+                | {"dtype": str(each.times.dtype), "note": f"edges: {each.event}"}
+                for name, each in recording.edges.items()
             },
             "suggestion": None,
         }

@@ -27,6 +27,7 @@ from recon.io.readers import readers
 from recon.study import plan, table
 from scanner.channel import CHANNEL_UNITS
 from scanner.device import READOUTS, Capacitance, Device, Drive, Mechanics, Scan
+from scanner.edges import EDGE_CHANNELS
 from tests.support.simulated import imaging
 
 ROOT = Path(__file__).parent.parent.parent
@@ -87,8 +88,11 @@ def test_every_key_of_a_device_is_in_the_reference(tables: ModuleType) -> None:
 
 
 def test_every_channel_format_and_mapping_key_is_in_the_reference() -> None:
-    assert missing((*CHANNEL_UNITS, "intensity"), page("recording")) == []
-    assert missing((*readers(), *convert.TEXT_KEYS, *convert.CHANNEL_KEYS), page("instrument_files")) == []
+    assert missing((*CHANNEL_UNITS, *EDGE_CHANNELS, "intensity"), page("recording")) == []
+    assert (
+        missing((*readers(), *convert.TEXT_KEYS, *convert.CHANNEL_KEYS, *convert.EDGE_KEYS), page("instrument_files"))
+        == []
+    )
 
 
 def test_every_estimator_is_in_the_reference(tables: ModuleType) -> None:
@@ -173,7 +177,9 @@ def test_toml_blocks_on_pages_are_valid(where: str, text: str, tmp_path: Path) -
         assert all(axis.extra == {} for axis in Device.from_table(content).axes.values())
     elif kind == "mapping.toml":
         assert set(content) <= set(convert.MAPPING_KEYS)
-        assert all(set(channel) <= set(convert.CHANNEL_KEYS) for channel in content["channels"].values())
+        assert all(
+            set(channel) <= {*convert.CHANNEL_KEYS, *convert.EDGE_KEYS} for channel in content["channels"].values()
+        )
         Device.from_table(content["device"])
     elif kind == "study.toml":
         plan.read_study(tmp_path / "file.toml")

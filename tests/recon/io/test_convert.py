@@ -81,6 +81,7 @@ def test_a_mapping_converts_a_file_to_a_recording(bench: Path) -> None:
                 "stated_by": {"unit": "mapping", "sample_rate": "mapping", "start": "mapping"},
             },
         },
+        "edges": {},
     }  # fmt: skip
 
 
@@ -339,3 +340,19 @@ def test_a_row_of_a_matrix_is_a_channel(tmp_path: Path) -> None:
     for row in (3, -1, "first"):
         with pytest.raises(BadInput, match=f"no row {row!r} of 'rows'; count from 0"):
             convert(tmp_path / "a.npz", {"channels": {"sense_x": spec | {"row": row}}})
+
+
+def test_edge_times_become_a_sync_channel(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", light=np.ones(50), edges=np.arange(20.0))
+    channels = {
+        "intensity": {"variable": "light", "unit": "V", "sample_rate": 1e6},
+        "sync_x": {"variable": "edges", "unit": "us", "angle": 0.02},
+    }
+    summary = convert_file(tmp_path / "a.npz", {"channels": channels}, tmp_path / "a.h5")
+    assert summary["edges"] == {"sync_x": {"number": 20, "event": "both-edges"}}
+    with Recording.open(tmp_path / "a.h5") as made:
+        assert np.allclose(made.edges["sync_x"].times, 1e-6 * np.arange(20.0))
+    for change, line in (({"unit": "V"}, "unit 'V' is unknown"), ({"rate": 1.0}, "rate is not a known key of edges")):
+        wrong = channels | {"sync_x": channels["sync_x"] | change}
+        with pytest.raises(BadInput, match=line):
+            convert(tmp_path / "a.npz", {"channels": wrong})

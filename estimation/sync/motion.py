@@ -1,0 +1,184 @@
+"""Motion of an axis from the edges of a detector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.reference import absolute_reference
+from estimation.signals import phase_reference
+from estimation.sync.numbering import NumberedEdges, number_edges
+from estimation.sync.smoother import SmoothedPhase, smooth_phase
+from scanner.arrays import Array
+from scanner.device import Device
+from scanner.edges import Edges
+from scanner.errors import BadInput
+from scanner.motion import AxisMotion, SampledAngle
+from scanner.recording import Recording
+
+NOMINAL_PHASE = {
+    "zero-crossing-up": (0.0,),
+    "zero-crossing-down": (np.pi,),
+    "turn": (0.5 * np.pi, 1.5 * np.pi),
+    "both-edges": (0.0, np.pi),
+}
+"""Phase of theta = A sin(phi) at the edges of each kind, for a detector in the centre [rad]."""
+
+KNOT_PERIODS = 4.0
+"""Periods between two points of the slow clock: as those of the other estimators."""
+
+SIGNIFICANT_SD = 6.0
+"""Asymmetry in standard deviations from which it determines sign and amplitude; by chance once in 1e8."""
+
+MAX_BEYOND_PERIODS = 2.0
+"""Periods before the first and after the last edge to which the angle is extrapolated."""
+
+
+@dataclass(frozen=True)
+class EdgePhase:
+    """Phase of an axis at the edges that are used.
+
+    Attributes:
+        time: shape (n,) [s].
+        phase: of theta = A sin(phase), unwrapped, shape (n,) [rad]. frequency: shape (n,) [Hz].
+        phase_sd: shape (n,) [rad].
+        asymmetry: phase by which the beam passes the detector after the centre on its way up [rad], and its sd.
+        asymmetry_sd: [rad].
+        jitter_sd: of an edge [s].
+        sign: ``"known: <how>"`` or ``"ambiguous"``.
+        numbered: the edges before outliers were left out.
+        outliers: edges left out for their distance from the smoothed phase.
+    """
+
+    time: Array
+    phase: Array
+    frequency: Array
+    phase_sd: Array
+    asymmetry: float
+    asymmetry_sd: float
+    jitter_sd: float
+    sign: str
+    numbered: NumberedEdges
+    outliers: int
+
+    def describe(self, name: str) -> str:
+        """What is wrong with the edges, in one line; empty where nothing is."""
+        counts = {
+            "missing": self.numbered.missing,
+            "repeated and left out": self.numbered.doubled,
+            "out of place and left out": self.numbered.stray + self.outliers,
+        }
+        found = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        return f"{name}: {self.time.size} edges are used; {found}" if found else ""
+
+
+def phase_from_edges(edges: Edges) -> EdgePhase:
+    """Phase and frequency of a motion from edge times alone. Raises as ``number_edges``."""
+    numbered = number_edges(edges)
+    nominal = np.array(NOMINAL_PHASE[edges.event])
+    f0, t0 = 1.0 / numbered.length, float(numbered.times[0])
+    periods = (numbered.times - t0) * f0
+    side = np.array([-1.0, 1.0] if nominal.size == 2 else [0.0, 0.0])[numbered.kind]
+    measured = 2 * np.pi * (numbered.period - periods) + nominal[numbered.kind]
+    smoothed = smooth_phase(periods, measured, side)
+    flipped, sign = _sign(edges, smoothed)
+    used = smoothed.used
+    return EdgePhase(
+        time=numbered.times[used],
+        phase=(2 * np.pi * periods + smoothed.phase + np.pi * flipped)[used],
+        frequency=f0 * (1.0 + smoothed.rate[used] / (2 * np.pi)),
+        phase_sd=smoothed.phase_sd[used],
+        asymmetry=-smoothed.asymmetry if flipped else smoothed.asymmetry,
+        asymmetry_sd=smoothed.asymmetry_sd,
+        jitter_sd=smoothed.jitter_sd / (2 * np.pi * f0),
+        sign=sign,
+        numbered=numbered,
+        outliers=int(np.sum(~used)),
+    )
+
+
+def _sign(edges: Edges, smoothed: SmoothedPhase) -> tuple[bool, str]:
+    """Whether the phase has to be turned by half a period, and what the edges say of the sign."""
+    if edges.event.startswith("zero-crossing"):
+        return False, f"known: {edges.name}"
+    significant = abs(smoothed.asymmetry) > SIGNIFICANT_SD * smoothed.asymmetry_sd
+    if edges.event == "turn" or not edges.angle or not significant:
+        return False, "ambiguous"
+    return smoothed.asymmetry * edges.angle < 0.0, f"known: {edges.name}"
+
+
+def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[float, float] | None:
+    """Amplitude and its standard deviation [rad], from the asymmetry of a detector at a known angle; else None."""
+    if not edges.angle or abs(found.asymmetry) < SIGNIFICANT_SD * found.asymmetry_sd or found.sign == "ambiguous":
+        return None
+    amplitude = edges.angle / np.sin(found.asymmetry)
+    return float(amplitude), float(abs(amplitude / np.tan(found.asymmetry)) * found.asymmetry_sd)
+
+
+def axis_motion_from_edges(
+    recording: Recording, device: Device, edges: Edges, clock: tuple[float, float, int]
+) -> tuple[AxisMotion, list[str], dict[str, object]]:
+    """The motion of one axis from its edges.
+
+    Args:
+        clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
+
+    Returns:
+        the motion, notes on it, and facts about the edges.
+
+    Raises:
+        BadInput: as ``number_edges``, or nothing determines the amplitude.
+    """
+    from scipy.interpolate import CubicHermiteSpline
+
+    name, found = edges.name.partition("_")[2], phase_from_edges(edges)
+    measured = amplitude_from_edges(edges, found)
+    notes = [line for line in [found.describe(edges.name)] if line]
+    if measured is None:
+        if device.scan is None:
+            what = "edges alone do not determine the amplitude"
+            hint = "state the field of view, [scan], in the device, or the angle of a detector beside the centre"
+            raise BadInput(what, file=edges.file, channel=edges.name, hint=hint)
+        amplitude = float(getattr(device.scan, f"half_angle_{name}"))
+        notes.append(f"{edges.name}: the edges do not determine the amplitude; the motion is taken to fill the field")
+    else:
+        amplitude = measured[0]
+    if edges.hysteresis:
+        lag = np.arcsin(np.clip(edges.hysteresis / (amplitude * np.cos(found.asymmetry)), -1.0, 1.0))
+    else:
+        lag = 0.0
+    phase = found.phase + lag
+    spline = CubicHermiteSpline(found.time, phase, 2 * np.pi * found.frequency)
+    rate, start, n = clock
+    time = start + np.arange(n) / rate
+    angle = amplitude * np.sin(spline(time))
+    beyond = MAX_BEYOND_PERIODS / float(np.median(found.frequency))
+    angle[(time < found.time[0] - beyond) | (time > found.time[-1] + beyond)] = np.nan
+    step = max(1, round(KNOT_PERIODS * found.time.size * found.numbered.length / np.ptp(found.time)))
+    if f"drive_{name}" in recording and device.axis(name).drive is not None:
+        reference = phase_reference(recording, device, name)
+    else:
+        reference = absolute_reference(float(np.median(found.frequency)), *map(float, found.time[[0, -1]]))
+    knots = found.time[::step]
+    motion = AxisMotion(
+        time=knots,
+        phase=phase[::step] - reference.phase(knots),
+        amplitude=np.full(knots.size, amplitude),
+        frequency=found.frequency[::step],
+        phase_sd=found.phase_sd[::step],
+        angle=SampledAngle(angle, rate, start),
+        reference=reference.kind,
+        sign=found.sign,
+    )
+    facts: dict[str, object] = {
+        "edges": int(found.time.size),
+        "missing": found.numbered.missing,
+        "repeated": found.numbered.doubled,
+        "out_of_place": found.numbered.stray + found.outliers,
+        "jitter_s": found.jitter_sd,
+        "asymmetry_rad": found.asymmetry,
+        "asymmetry_sd_rad": found.asymmetry_sd,
+        "amplitude_sd_rad": None if measured is None else measured[1],
+    }
+    return motion, notes, facts
