@@ -7,7 +7,12 @@ from pathlib import Path
 from typing import Any
 
 # What may be said of channels in arguments: option -> key of the mapping, and what its value is.
-OPTIONS = {"unit": ("unit", str), "rate": ("sample_rate", float), "start": ("start", float)}
+OPTIONS = {
+    "unit": ("unit", str),
+    "rate": ("sample_rate", float),
+    "start": ("start", float),
+    "time": ("time", str),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,13 +20,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mapping", type=Path, help="TOML: which variable is which channel, unit, rate, device")
     parser.add_argument(
         "--channel", action="append", default=[], metavar="NAME=VARIABLE",
-        help="for each channel, in place of a mapping",
+        help="for each channel, in place of a mapping; intensity=CH3,CH4 makes detectors of two variables",
     )  # fmt: skip
     for option, text in (("unit", "unit"), ("rate", "sample rate [Hz]"), ("start", "time of the first sample [s]")):
         parser.add_argument(
             f"--{option}", action="append", default=[], metavar=f"[NAME=]{option.upper()}",
             help=f"{text} of all channels, or of one, where the file does not state it",
         )  # fmt: skip
+    parser.add_argument(
+        "--time", action="append", default=[], metavar="[NAME=]COLUMN",
+        help="variable that holds the times of all channels, or of one, in place of a rate",
+    )  # fmt: skip
     parser.add_argument("--format", help="format, if it follows neither from the file's beginning nor from its name")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the recording to write (.h5)")
 
@@ -54,7 +63,7 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
         name, given, variable = text.partition("=")
         if not (name and given and variable) or name in channels:
             raise BadInput(f"{text!r} is not NAME=VARIABLE, or repeats a channel", channel="--channel", hint=hint)
-        channels[name] = {"variable": variable}
+        channels[name] = {"variable": variable.split(",") if "," in variable else variable}
     if not channels:
         raise BadInput("no option assigns variables to channels", file=args.file, hint=f"assign them, {hint}")
     for option, (key, kind) in OPTIONS.items():

@@ -8,6 +8,9 @@ from typing import Any
 
 from recon.cli.argument_types import parse_positive
 
+KINDS = ("parametric", "electromagnetic", "piezo", "fibre", "afm", "galvo")
+"""Keys of ``scanner.device_templates.KINDS``, which would take long to import."""
+
 KNOWN = {
     "resonance": ("HZ", "resonance of {axis}"),
     "q": ("Q", "quality factor of {axis}"),
@@ -18,8 +21,6 @@ KNOWN = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    from scanner.device_templates import KINDS
-
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the device file to write")
     parser.add_argument("--kind", choices=KINDS, default="parametric", help="of the scanner (parametric)")
     parser.add_argument("--name", help="of the device (the kind)")

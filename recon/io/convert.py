@@ -6,7 +6,7 @@ A mapping (TOML) states for each channel the variable, its unit and its clock; i
     name = "afm-spiral"
 
     [channels.sense_x]
-    variable = "x"
+    variable = "x"                  # or a list: the detectors of an intensity
     unit = "V"                      # after scaling
     sample_rate = 20000.0           # Hz; or time = "t", the variable that holds the times [s]
     start = 0.0                     # s
@@ -22,15 +22,18 @@ Unit, rate and start may be omitted if the file states them. What neither states
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from recon.io.readers import read
+from recon.io.readers.column_names import TIME_UNITS, split_label
 from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock, matrix_row
-from scanner.channel import Channel, make_channel
+from scanner.channel import Channel, LazySamples, make_channel
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput
@@ -154,7 +157,9 @@ def _recording(contents: Contents, source: Path, plan: Plan, plan_source: object
 
 def _origin(spec: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
     """Which variable a channel comes from, and which source states its unit and clock."""
-    stated = {key: getattr(contents.variables[spec["variable"]], key) for key in ("unit", "sample_rate", "start")}
+    names = spec["variable"] if isinstance(spec["variable"], list) else [spec["variable"]]
+    variable = contents.variables[str(find_variable(names[0], contents.variables))]
+    stated = {key: getattr(variable, key) for key in ("unit", "sample_rate", "start")}
     by = {key: "file" if value is not None else "default: 0" for key, value in stated.items()}
     by |= {key: "mapping" for key in stated if key in spec}
     by |= {key: f"variable {spec['time']}" for key in ("sample_rate", "start") if "time" in spec}
@@ -164,7 +169,7 @@ def _origin(spec: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
         for key, value in stated.items()
         if key in spec and value not in (None, spec[key]) and not (scaled and key == "unit")
     }
-    return {"variable": spec["variable"], "stated_by": by, "overruled": overruled}
+    return {"variable": ", ".join(names), "stated_by": by, "overruled": overruled}
 
 
 def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Path, plan_source: object) -> Channel:
@@ -178,15 +183,22 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
         raise bad("is no name for a channel", "name it without / and control characters")
     if unknown := [key for key in spec if key not in CHANNEL_KEYS]:
         raise bad(f"{unknown[0]} is not a known key", f"known: {', '.join(CHANNEL_KEYS)}")
-    for key in ("variable", "unit", "time"):
+    for key in ("unit", "time"):
         if not isinstance(spec.get(key, ""), str):
             raise bad(f"{key} is {spec[key]!r} and must be text", "put it in quotes")
     if "variable" not in spec:
         raise bad("says no variable", f"add variable = ...; {holds}")
-    for key in {"variable", "time"} & spec.keys():
-        if spec[key] not in contents.variables:
-            raise bad(f"there is no variable {spec[key]!r}", holds)
-    variable = contents.variables[spec["variable"]]
+    names = spec["variable"] if isinstance(spec["variable"], list) else [spec["variable"]]
+    if not names or not all(isinstance(each, str) for each in names):
+        raise bad(f"variable is {spec['variable']!r} and must be text", "put it in quotes, or a list of names")
+    found: list[Variable] = []
+    for name_in_file in (*names, *([spec["time"]] if "time" in spec else [])):
+        variable_name = find_variable(name_in_file, contents.variables)
+        if variable_name is None:
+            raise bad(f"there is no variable {name_in_file!r}", holds)
+        found.append(contents.variables[variable_name])
+    variables, times = found[: len(names)], found[len(names) :]
+    variable = variables[0] if len(variables) == 1 else join_columns(variables, names, bad)
     scaled = "scale" in spec or "offset" in spec
     scale, offset = _number(spec.get("scale", 1.0)), _number(spec.get("offset", 0.0))
     if not scale or offset is None:
@@ -195,7 +207,7 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
     if "time" in spec:
         if "sample_rate" in spec or "start" in spec:
             raise bad("says time and sample_rate or start", "the times state both")
-        rate, start = _clock(contents.variables[spec["time"]], spec["time"], bad)
+        rate, start = _clock(times[0], spec["time"], bad)
     else:
         rate, start = spec.get("sample_rate", variable.sample_rate), spec.get("start", variable.start or 0.0)
     unit = spec.get("unit", None if scaled else variable.unit)  # the file states the unit before scaling
@@ -238,7 +250,40 @@ def _clock(times: Variable, name: str, bad: Any) -> tuple[float, float]:
     rate, start, note = infer_clock(column)
     if rate is None or start is None:
         raise bad(f"time = {name!r} is no clock: {note}", "cut the file there, or state sample_rate")
-    return rate, start
+    seconds = TIME_UNITS.get((times.unit or "s").lower())
+    if seconds is None:
+        raise bad(f"time = {name!r} has the unit {times.unit!r}", "name a column of times")
+    return rate / seconds, start * seconds
+
+
+def find_variable(name: str, variables: Mapping[str, Variable]) -> str | None:
+    """The variable of that name, or of that heading with its unit, as ``CH1 (V)``; None if there is none."""
+    bare = split_label(name)[0]
+    return name if name in variables else bare if bare in variables else None
+
+
+def join_columns(variables: Sequence[Variable], names: Sequence[str], bad: Callable[[str, str], BadInput]) -> Variable:
+    """Several variables as the detectors of one, shape (n, detectors).
+
+    Raises:
+        BadInput: they differ in length, clock or unit.
+    """
+    first = variables[0]
+    columns = [flatten_row(each.raw) for each in variables]
+    if any(each.ndim != 1 for each in columns):
+        raise bad("variable lists a matrix", "list columns, or name the matrix alone")
+    sizes = [each.shape[0] for each in columns]
+    if len(set(sizes)) > 1:
+        lengths = ", ".join(f"{name} {size}" for name, size in zip(names, sizes, strict=True))
+        raise bad(f"its detectors differ in length: {lengths} samples", "cut them to one length")
+    for key in ("unit", "sample_rate", "start"):
+        if len({getattr(each, key) for each in variables}) > 1:
+            raise bad(f"its detectors differ in {key}", "make a channel of each, or export them alike")
+    dtype = np.result_type(*(each.dtype for each in columns))
+    joined = LazySamples(
+        (sizes[0], len(columns)), dtype, lambda low, stop: np.stack([each[low:stop] for each in columns], axis=-1)
+    )
+    return Variable(joined, first.unit, first.sample_rate, first.start, first.note)
 
 
 def format_variables(variables: Mapping[str, Variable]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from recon.io.convert import open_any
 from recon.io.readers import read
+from recon.io.readers.column_names import TIME_NAMES
 from recon.io.readers.contents import Variable
 from scanner.channel import CHANNEL_UNITS
 from scanner.hdf5 import attributes, check_ends, is_hdf5, open_hdf5
@@ -14,7 +15,31 @@ from scanner.recording import FORMAT
 
 HEADING = f"""\
 # A suggestion to edit: name each channel by what it is, remove the others, state what is commented out.
-# Channels: {", ".join(CHANNEL_UNITS)}, intensity."""
+# Channels: {", ".join(CHANNEL_UNITS)}, intensity (several detectors: variable = ["CH3", "CH4"])."""
+
+DEVICE_PART = """\
+# The device: remove the first # of each line and edit, or give a file of `lissajous new-device` with --device.
+# [device]
+# name = "my scanner"
+# [device.x.drive]
+# kind = "linear"            # or "electrostatic": combs, which move the mirror at half the drive's frequency
+# frequency = 2000.0         # Hz, of the drive
+# [device.x.readout]         # only with channels sense_x, sense_y: V = gain theta
+# kind = "position"
+# gain = 20.0                # V / rad
+# noise_sd = 0.002           # V
+# [device.y.drive]
+# kind = "linear"
+# frequency = 835.0
+# [device.y.readout]
+# kind = "position"
+# gain = 20.0
+# noise_sd = 0.002
+# [device.scan]
+# half_angle_x = 0.1         # rad, half the field of view
+# half_angle_y = 0.1
+# angle = "mechanical"       # or "optical"\
+"""
 
 
 def info(path: Path, format: str | None = None, mapping: Path | None = None) -> dict[str, Any]:
@@ -53,7 +78,8 @@ def suggestion(variables: Any, format: str | None = None) -> str:
     """A mapping (TOML) of all signals; values that the file does not state are commented out, to be filled in."""
     lines = [HEADING, *([f"format = {_quoted(format)}"] if format else [])]
     for name, variable in variables.items():
-        if not variable.is_signal or variable.raw.shape[0] < 2:
+        is_clock = name.lower() in TIME_NAMES and variable.sample_rate is None
+        if not variable.is_signal or variable.raw.shape[0] < 2 or (is_clock and len(variables) > 1):
             continue
         channel = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name) or "_"
         lines += ["", f"[channels.{channel}]", f"variable = {_quoted(name)}"]
@@ -61,7 +87,7 @@ def suggestion(variables: Any, format: str | None = None) -> str:
         rate = variable.sample_rate
         lines.append(f"sample_rate = {float(rate)!r}" if rate else "# sample_rate = 1e6  # Hz")
         lines += [f"start = {float(variable.start)!r}"] if variable.start is not None else []
-    return "\n".join(lines)
+    return "\n".join([*lines, "", DEVICE_PART])
 
 
 def _is_recording(path: Path) -> bool:

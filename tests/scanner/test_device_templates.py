@@ -8,9 +8,14 @@ from pathlib import Path
 import pytest
 
 from recon.cli import main
+from recon.cli import new_device as new_device_command
 from scanner.device import Device
 from scanner.device_templates import KINDS, KnownAxis, new_device
 from scanner.errors import BadInput, DeviceInvalid
+
+
+def test_the_command_offers_every_kind() -> None:
+    assert tuple(KINDS) == new_device_command.KINDS
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from recon.io.readers.column_names import TIME_NAMES, TIME_UNITS, find_time_column, name_columns
 from recon.io.readers.contents import (
     Contents,
     Variable,
@@ -52,6 +53,8 @@ class Layout:
         rate: stated sample rate [Hz].
         start: stated time of the first sample [s].
         starts: start [s] by number of rows, if the header states it that way.
+        clock: index of the column of times of a table of no known format; it stays a variable.
+        clock_scale: seconds of its unit.
         about: other statements of the header.
     """
 
@@ -66,12 +69,15 @@ class Layout:
     start: float | None = None
     about: dict[str, str] = field(default_factory=dict)
     starts: Mapping[int, float] = field(default_factory=dict)
+    clock: int | None = None
+    clock_scale: float = 1.0
 
 
 def read_csv(path: Path) -> Contents:
-    """Columns of an oscilloscope's CSV file, or of another table with at most one line of names.
+    """Columns of an oscilloscope's CSV file, or of another table with names and perhaps units above its columns.
 
-    In a known format the column of times or sample numbers becomes the clock. In an unknown table no column does.
+    In a known format the column of times or sample numbers becomes the clock. In another table a column does that is
+    named as a time and states a unit of time; it remains a variable.
 
     Raises:
         BadInput: no such file, or a line that is no row of the table.
@@ -101,11 +107,21 @@ def _variables(layout: Layout, table: Array) -> dict[str, Variable]:
     elif layout.index is not None:
         samples_per_row, _, note = infer_clock(table[:, layout.index])
         rate = None if samples_per_row is None else rate
+    elif layout.clock is not None:
+        rate, start, note = infer_clock(table[:, layout.clock])
+        rate = None if rate is None else float(f"{rate / layout.clock_scale:.12g}")
+        start = None if start is None else start * layout.clock_scale
     signals = [at for at in range(len(layout.names)) if at not in (layout.times, layout.index)]
-    return {
-        name: Variable(table[:, at], normalise_unit(layout.units[at]), rate, start if rate is not None else None, note)
-        for at, name in zip(signals, unique_names(layout.names[at] for at in signals), strict=True)
-    }
+    variables = {}
+    for at, name in zip(signals, unique_names(layout.names[at] for at in signals), strict=True):
+        unit = normalise_unit(layout.units[at])
+        if at == layout.clock:
+            variables[name] = Variable(table[:, at], unit, note=note or "the clock of the other columns")
+        elif layout.clock is None and layout.times is None and name.lower() in TIME_NAMES:
+            variables[name] = Variable(table[:, at], unit, note=f"if these are seconds, state it: --time {name}")
+        else:
+            variables[name] = Variable(table[:, at], unit, rate, start if rate is not None else None, note)
+    return variables
 
 
 def _marks(line: str) -> tuple[str, str]:
@@ -134,7 +150,10 @@ def _layout(path: Path, head: list[list[str]], row: str, separator: str) -> Layo
         return Layout("Keysight InfiniiVision CSV", _padded(head[0], width), units, range(width), len(head), times)
     if "sample interval" in keys and "horizontal units" in keys:
         return _tektronix_above(head, keys, width)
-    return Layout("CSV", _padded(head[-1], width), [""] * width, range(width), len(head))
+    names, units = name_columns(head, width)
+    clock = find_time_column(names, units)
+    scale = 1.0 if clock is None else TIME_UNITS[units[clock].lower()]
+    return Layout("CSV", names, units, range(width), len(head), clock=clock, clock_scale=scale)
 
 
 def _padded(fields: Sequence[str], width: int) -> list[str]:
