@@ -19,7 +19,7 @@ SENSED_STAGES = ("capacitance", "readout", "timing")
 """Stages whose terms change the phase of the motion that is estimated from the sense signal."""
 
 MeasureReference = Callable[[Recording, Device], "ReferencePhase | None"]
-"""Measures the phase errors of the motion from the sense signal without the readout; None where it cannot."""
+"""Measures the phase errors of the motion independently of the readout; None if the recording does not allow it."""
 
 
 def diagnose_with_optics(

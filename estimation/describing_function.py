@@ -30,7 +30,7 @@ repeated."""
 
 DEGENERATE_FREQUENCY_RATIO = 0.05
 """Relative distance of two axes' frequencies below which their coupled motion is not separated: the response of one
-axis to the other's frequency is then resonant and no small addition."""
+axis at the frequency of the other is then resonant and not a small correction."""
 
 MIN_DAMPING_RATIO = 0.01
 """Smallest equivalent damping relative to the nominal one, so that a linearised device is always stable."""

@@ -57,7 +57,7 @@ class PhaseReference:
         return inside + 2 * np.pi * self.frequency * time
 
     def frequency_at(self, time: Array) -> Array:
-        """psi' / 2 pi at ``time`` [s]: [Hz], shape (n,); the motion's frequency without its slow phase."""
+        """Frequency of the reference, psi' / 2 pi, at ``time`` [s]: shape (n,) [Hz]."""
         slope = np.gradient(self.slow, self.knots) / (2 * np.pi)
         return self.frequency + np.interp(time, self.knots, slope)
 

@@ -1,11 +1,12 @@
-"""Any estimator for a device that states terms: the contribution of the terms along the motion is subtracted.
+"""Estimation for a device with terms by an estimator of nominal devices: the contribution of the terms is subtracted.
 
-What a nominal device or a corrected recording can express is absorbed there (``estimation.term_absorption``). Every
-other law acts on a motion that is not known yet, so it is compensated iteratively: the motion estimated so far is
-passed through ``scanner.forward_model`` with and without the terms, the difference is subtracted from the measured
-channels, and the motion is estimated again. A torque enters as its equivalent stiffness and damping at the motion's
-amplitude and by the harmonics that it adds (``estimation.describing_function``). Every estimator so handles every term
-by the one definition in the term's file, and keeps its nominal equations.
+Terms that are equivalent to other nominal values or to a corrected recording are replaced by these
+(``estimation.term_absorption``). Every other law depends on the unknown motion, so it is compensated iteratively: the
+motion estimated so far is passed through ``scanner.forward_model`` with and without the terms, the difference is
+subtracted from the measured channels, and the motion is estimated again. A torque enters as its equivalent stiffness
+and damping at the motion's amplitude and by the harmonics that it adds (``estimation.describing_function``). Thus every
+estimator handles every term by its single definition in the term's file, and the equations of the estimators are the
+nominal ones.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ def simulate_excitation(excitation: Excitation, device: Device) -> Recording:
 
 
 def prepare_planned_run(excitation: Excitation, device: Device) -> Run:
-    """An excitation played, ready to be compared with; raises as :func:`played`."""
+    """Simulate an excitation and prepare the recording for a fit; raises as :func:`played`."""
     from estimation.diagnosis.data import prepare_run
 
     run = prepare_run(simulate_excitation(excitation, device), device)

@@ -41,7 +41,8 @@ _TONGUE_STEPS = 12
 """Steps of the drive's frequency across the instability tongue."""
 
 _EDGE_HALVINGS = 8
-"""Halvings of a step at the frequency where the motion ceases: to 1/3000 of the tongue's width."""
+"""Halvings of a step in the search for the frequency at which the motion ceases: to 1/3000 of the width of the
+instability tongue."""
 
 
 def wanted_field(device: Device, half_angles: tuple[float, float] | None) -> Scan:

@@ -15,13 +15,13 @@ COMB_STIFFNESS = 9.6e-6
 COMB_C0 = 5.71e-12
 """Amplitude of its capacitance [F], of the same mirror."""
 COMB_AMPLITUDE_THETA0 = 0.9
-"""Amplitude over theta0 at which its combs are used: that of the named device ``imaging``."""
+"""Typical amplitude of a comb-driven axis in units of theta0: that of the named device ``imaging``."""
 COMB_VOLTS, COMB_THETA0, COMB_QUALITY = 30.0, 0.2, 120.0
 """Amplitude and offset of the voltage [V] that sustains that amplitude for this theta0 [rad] and Q."""
 COMB_DETUNING = 0.67
 """Half the drive's frequency over the resonance, less one, times Q: where that voltage sustains the amplitude."""
 MIRROR_INERTIA = 1.0e-10
-"""Moment of inertia of a linearly driven axis [kg m2]: not stated, and only the scale of b, k and torque."""
+"""Moment of inertia of a linearly driven axis [kg m2]: an arbitrary value, which only scales b, k and the torque."""
 LINEAR_VOLTS = 10.0
 """Voltage of a linear drive that reaches the amplitude [V]: sets the torque per volt where none is stated."""
 

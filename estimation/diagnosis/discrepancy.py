@@ -26,8 +26,8 @@ FORCE_POWERS = tuple((i, n - i) for n in range(2, FORCE_DEGREE + 1) for i in ran
 """Powers (i, j) of angle and rate in the force polynomial, in the order of its coefficients."""
 
 FORCE_DRIFT_COSINES = 3
-"""Cosines over the duration by which stiffness and damping may drift beside the force polynomial. Three describe a
-monotonic drift; more belong to ``free-stiffness``."""
+"""Number of cosines over the duration for the drift of stiffness and damping in ``free-mechanics``. Three describe a
+monotonic drift; other drifts are described by ``free-stiffness``."""
 
 STIFFNESS_COSINES, DAMPING_COSINES = 20, 8
 """Numbers of cosines over the duration of stiffness and damping in ``free-stiffness``, which has no other parameters.

@@ -107,7 +107,7 @@ def make_whitener(psd: Array, size: int, guard: tuple[int, int], first: float = 
 
 
 def flat_psd(data: Array, bins: int) -> Array:
-    """White noise with the level of the upper third of the spectrum of a signal, shape (bins,)."""
+    """Flat noise spectrum with the level of a band at 60 to 68 % of a signal's bandwidth, shape (bins,)."""
     power = periodogram(data)
     level = float(np.median(power[int(0.6 * power.size) : int(0.68 * power.size)]) / MEDIAN_TO_MEAN_POWER)
     if level <= 0.0:

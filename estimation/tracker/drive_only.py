@@ -99,7 +99,7 @@ def track_drive_only(
 
 
 def drive_only_observations(recording: Recording, device: Device, name: str) -> BlockObservations:
-    """Blocks of one axis with its drive and without projections.
+    """Observations of one axis that contain its drive, but no projections of a sense signal.
 
     Raises:
         ChannelMissing: the drive was not recorded. BadInput: it cannot be used. DeviceInvalid: a value is missing.

@@ -33,7 +33,7 @@ OFFSET_SD_V = 1.0
 """Offset of the readout [V]: unknown on the scale of the signals."""
 
 MAX_ACQUISITION_BLOCKS = 64
-"""Most blocks that are averaged to detect a motion in noise; over more, the motion may drift in phase."""
+"""Largest number of blocks that are averaged to detect a motion in noise: the phase drifts over longer times."""
 
 SIGN_TEST_BLOCKS = 200
 """Blocks over which the likelihoods of both signs are compared."""

@@ -38,9 +38,9 @@ MIN_BLOCK_CYCLES = 2.0
 """Least length of a block in cycles of the slowest axis: its harmonics are then separable from the other axis's."""
 
 MAX_BLOCK_S = 1e-3
-"""Largest length of a block with more than MIN_BLOCK_CYCLES [s]. Drift and the turn of the phase where the amplitude
-passes near zero take some milliseconds, however long the decay; with blocks of 10 ms (Q 400 at 2 kHz) the phase was 6°
-off."""
+"""Largest length of a block with more than MIN_BLOCK_CYCLES [s]. Drift, and the change of the phase while the
+amplitude passes near zero, take some milliseconds even if the decay is long; with blocks of 10 ms (Q 400 at 2 kHz) the
+phase error was 6°."""
 
 MIN_BLOCK_SAMPLES = 64
 """Least length of a block: enough for all lines of two axes."""

@@ -35,7 +35,8 @@ class NormalEquations(NamedTuple):
 
 
 def normal_equations(samples: RegistrationSamples, error: Array, grid: Grid, cell: float) -> NormalEquations:
-    """Map with the given phase errors, smooth over cells of one size [px], and compare each sample with its place."""
+    """Map with the given phase errors, smooth over cells of one size [px], and compare each sample with the map at its
+    position."""
     import cv2
 
     shape = (math.ceil(grid.height / cell) + 1, math.ceil(grid.width / cell) + 1)

@@ -39,7 +39,8 @@ Frame = Sequence[NDArray[np.float32]]
 
 
 MIN_NOISE_FRACTION = 0.1
-"""Least part of a squared standard error that is taken as noise; guards against a chance estimate of the rest."""
+"""Smallest share of a squared standard error that is attributed to noise, because the estimate of the other part
+scatters."""
 
 COLUMN_GROUPS = 16
 """Groups of columns whose lag is measured separately, for the figure that compares it with the law."""

@@ -51,8 +51,8 @@ def refine_motion(
     """Refine a motion with the phases that the picture shows.
 
     Axes whose sense signal determines the phase to ``MAX_PHASE_ERROR_PX`` are not changed, nor are motions of other
-    estimators than ``tracker`` and ``picture``. Otherwise the picture's phases are smoothed together with the sense
-    signal, or without it where it is worse than drive and picture.
+    estimators than ``tracker`` and ``picture``. Otherwise the phases from the picture are smoothed together with the
+    sense signal, or without it if drive and picture alone give the smaller phase error.
 
     Args:
         recording: with its intensity corrected for the optics.

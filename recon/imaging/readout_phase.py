@@ -47,7 +47,7 @@ UNDESCRIBED_DELAY_SD_S = 0.5e-6
 """Standard deviation of the delay of electronics that no device file describes, where no picture measures it: cables,
 converters and amplifiers are late by up to a microsecond."""
 REPORTED_SDS = 3.0
-"""A phase error beyond so many standard deviations is reported in words: 0.3 % of correct readouts exceed it."""
+"""Number of standard deviations from which a phase error is reported in a note: 0.3 % of correct readouts exceed it."""
 MAX_ROUNDS = 3
 """Registrations about an improved motion: an error of 10° needs two, because the picture itself sharpens."""
 CONVERGENCE_SD = 0.5

@@ -26,7 +26,7 @@ from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 CYCLES_PER_PHASE = 8.0
-"""Cycles of a line in one phase sample: enough to average the noise, and short against a millisecond at 10 kHz."""
+"""Cycles of a spectral line per phase sample: enough to average the noise, and at 10 kHz shorter than a millisecond."""
 
 PHASE_SPACING_S = 2e-3
 """Time between phase samples. It bounds the cost; a mirror's phase changes little in this time."""

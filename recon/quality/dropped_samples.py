@@ -1,4 +1,6 @@
-"""Dropped samples of the intensity alone: from some time on the intensity is early, and no phase shows it.
+"""Samples that were dropped from the intensity only: from some time on the intensity is early against the motion.
+
+No phase estimate contains this error, because the other channels are complete.
 
 Forward and backward half-periods then disagree from there on, by a delay that is a whole number of samples and common
 to both axes. The picture of the time before predicts the intensity along the beam's path, and the lag at which

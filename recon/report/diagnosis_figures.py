@@ -29,7 +29,7 @@ SPECTRUM_BINS = 400
 """Bins of a spectrum, about as many as its figure has columns."""
 
 MIN_DRAWN_BLUR_PX = 1e-3
-"""Blur below this is drawn here: zero has no place on a logarithmic axis."""
+"""Blur below this value is drawn at it, because a logarithmic axis has no zero."""
 
 
 def one_panel(draw: Callable[[Axes], None], caption: str, height: float = 3.2) -> Figure:

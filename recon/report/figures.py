@@ -44,9 +44,9 @@ COLOURS = ("#2f6fb0", "#c8553d", "#3d8f5f", "#8a5fb0", "#b08a2f")
 
 
 def normalise_intensity(image: NDArray[Any], limits: tuple[float, float] | None = None) -> Array:
-    """Values scaled to [0, 1] between ``limits``, by default those of ``contrast_limits``; NaN remains NaN.
+    """Scale values to [0, 1] between ``limits``, by default those of ``contrast_limits``; NaN remains NaN.
 
-    Detectors are averaged.
+    If the picture has several detectors, their mean is used.
     """
     values = np.asarray(image if image.ndim == 2 else image.mean(-1), np.float64)
     low, high = limits or contrast_limits(image)

@@ -22,7 +22,7 @@ MARKERS = "o+^xs"
 """Markers of the phantoms, repeated if there are more."""
 
 MIN_PHASE_ERROR_DEG = 1e-4
-"""Phase errors below this are drawn here: zero has no place on a logarithmic axis."""
+"""Phase errors below this value are drawn at it, because a logarithmic axis has no zero."""
 
 
 def study_report(study: Study, data: Columns, summary: Mapping[str, Any]) -> str:

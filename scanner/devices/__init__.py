@@ -28,7 +28,7 @@ def load(name: str) -> Device:
 
 
 def find(source: Device | str | Path) -> Device:
-    """Return a device as it is, the device of that name that comes with the program, or else the one in that TOML file.
+    """Return ``source`` itself if it is a device, else the built-in device of that name, else the device in that file.
 
     Raises:
         BadInput: there is neither, or the file is not a valid device.
