@@ -29,8 +29,8 @@ from scanner.integrator.runge_kutta import LANES
 from scanner.terms import NaturalScales, Parameter, Term
 
 START_STATE_SD = 3.0
-"""Prior standard deviation of the initial angle and rate in amplitudes of the motion: so wide that data determine
-them."""
+"""Prior standard deviation of the initial angle and rate in amplitudes of the motion: so wide that the data determine
+both."""
 
 REFERENCE_GAIN_RELATIVE_SD = 0.02
 """Prior relative standard deviation of the gain of a reference angle: the default tolerance of the device file."""
@@ -47,7 +47,7 @@ AXIS_CACHE_SIZE = 64
 """Axes with fitted nominal values that a model caches: about as many as one Jacobian has columns."""
 
 HUM_HARMONICS = 3
-"""Harmonics of the mains that are part of the noise model, the n-th with a prior of 1/n: rectifiers leave these."""
+"""Number of harmonics of the mains in the noise model, the n-th with a prior of 1/n, as rectifiers cause them."""
 
 HUM_RELATIVE_SD = 0.5
 """Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
@@ -104,7 +104,7 @@ class _Motion(NamedTuple):
         axis, active_terms, start = self
         return (
             r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
-            *[(each.term.effect, each.values, each.hidden_state) for each in active_terms],
+            *[(active.term.effect, active.values, active.hidden_state) for active in active_terms],
         )  # fmt: skip
 
 
@@ -119,7 +119,12 @@ class Model:
         runs: the recordings.
         device: the nominal device.
         candidates: added terms.
-        free: specification of each element of x.
+        mains: frequencies of the mains whose hum is part of the noise model [Hz].
+        given: terms that the device states, by axis.
+        axes: axes that the recordings contain.
+        parameters: specification of each element of x.
+        precision: 1 / variance of the prior of each element of x, shape (p,).
+        basis: by (run, channel) the indices in x and the waveforms of what is added to the channel.
     """
 
     def __init__(
@@ -134,19 +139,20 @@ class Model:
         self.given = {name: stated_terms(axis) for name, axis in device.axes.items()}
         self.axes = tuple(name for name in device.axes if any(name in run.inputs for run in runs))
         self.parameters = tuple(self._parameter_specs())
-        self.precision = np.array([each.precision for each in self.parameters])
+        self.precision = np.array([spec.precision for spec in self.parameters])
         self._indices = {(f.kind, f.owner, f.name, f.run): i for i, f in enumerate(self.parameters)}
-        # Additive waveforms of each channel: added after all else, or before an output that clips.
+        # Additive waveforms of each channel: added last, or before the output law if that clips.
         self.basis, self._pre_saturation_basis = {}, {}
-        terms = [each.term for each in self.candidates] + [each.term for added in self.given.values() for each in added]
+        terms = [candidate.term for candidate in self.candidates]
+        terms += [active.term for of_axis in self.given.values() for active in of_axis]
         clips = any(term.after_noise for term in terms)
         for r, run in enumerate(self.runs):
             for output in run.outputs:
-                at, shapes = self._additive_basis(r, output)
+                indices, waveforms = self._additive_basis(r, output)
                 if clips and output.kind == "sense":
-                    self._pre_saturation_basis[r, output.name] = at, _on_grid(shapes, output, run)
-                    at, shapes = _EMPTY_BASIS
-                self.basis[r, output.name] = at, shapes
+                    self._pre_saturation_basis[r, output.name] = indices, _on_grid(waveforms, output, run)
+                    indices, waveforms = _EMPTY_BASIS
+                self.basis[r, output.name] = indices, waveforms
         self._trajectory_cache: dict[_Key, AxisTrajectory] = {}
         self._prefetched: dict[_Key, AxisTrajectory] = {}
         self._axis_cache: dict[_Key, Axis] = {}
@@ -158,46 +164,48 @@ class Model:
         self._lock = Lock()
 
     def _parameter_specs(self) -> list[ParameterSpec]:
-        free = [
+        specs = [
             ParameterSpec("nominal", axis, name)
             for axis in self.axes
             for name, _, _ in nominal_parameters(self.device, axis)
         ]
-        for each in self.candidates:
-            free += [ParameterSpec("term", each.key, p.name, parameter=p) for p in each.term.free_parameters]
+        for candidate in self.candidates:
+            specs += [ParameterSpec("term", candidate.key, p.name, parameter=p) for p in candidate.term.free_parameters]
         for r, run in enumerate(self.runs):
             for axis in run.inputs:
-                free += [ParameterSpec("start", axis, name, r, START_STATE_SD**-2) for name in ("angle", "rate")]
-            for each in self.candidates:
-                if each.axis in run.inputs:
-                    free += [
-                        ParameterSpec("hidden", each.key, str(i), r) for i in range(len(each.term.hidden_state_scales))
+                specs += [ParameterSpec("start", axis, name, r, START_STATE_SD**-2) for name in ("angle", "rate")]
+            for candidate in self.candidates:
+                if candidate.axis in run.inputs:
+                    specs += [
+                        ParameterSpec("hidden", candidate.key, str(i), r)
+                        for i in range(len(candidate.term.hidden_state_scales))
                     ]
             for output in run.outputs:
                 if output.kind != "sense":
-                    free.append(ParameterSpec("gain", output.name, "gain", r))
-                free += [ParameterSpec("additive", output.name, name, r) for name in self.additive_terms(output)]
-        return free
+                    specs.append(ParameterSpec("gain", output.name, "gain", r))
+                specs += [ParameterSpec("additive", output.name, name, r) for name in self.additive_terms(output)]
+        return specs
 
     def additive_terms(self, output: Output) -> dict[str, Array]:
-        """Waveforms that may add to a channel whatever the motion, each shape (n,): an unstated offset, and hum."""
-        found = {}
+        """Waveforms that may add to a channel and do not depend on the motion, each shape (n,): an unstated offset, and
+        hum."""
+        waveforms = {}
         if output.kind != "sense" or not isinstance(readout_of(self.device, output.axes[0]), Amdm):
-            found["offset"] = np.full(output.data.size, OFFSET_RELATIVE_SD * output.data.std())
+            waveforms["offset"] = np.full(output.data.size, OFFSET_RELATIVE_SD * output.data.std())
         if output.kind == "sense":
             noise = output.noise_sd or 0.0
             for mains in self.mains:
-                found |= {
+                waveforms |= {
                     name: HUM_RELATIVE_SD * noise * values
                     for name, values in _hum_quadratures(mains, output.data.size, output.step).items()
                 }
-        return found
+        return waveforms
 
     def _additive_basis(self, r: int, output: Output) -> tuple[list[int], Array]:
         """Indices in x of the additive parameters of a channel, and their waveforms, shape (q, n)."""
-        shapes = self.additive_terms(output)
-        at = [self._indices[("additive", output.name, name, r)] for name in shapes]
-        return at, np.stack(list(shapes.values())) if shapes else np.zeros((0, output.data.size))
+        waveforms = self.additive_terms(output)
+        indices = [self._indices[("additive", output.name, name, r)] for name in waveforms]
+        return indices, np.stack(list(waveforms.values())) if waveforms else np.zeros((0, output.data.size))
 
     def index(self, kind: str, owner: str, name: str, run: int = -1) -> int | None:
         """Index in x of one parameter, None if the model does not have it."""
@@ -209,41 +217,45 @@ class Model:
 
     def values(self, candidate: Candidate, x: Array) -> tuple[float, ...]:
         """Physical values of the parameters of a candidate."""
-        at = [self._indices[("term", candidate.key, p.name, -1)] for p in candidate.term.free_parameters]
-        return candidate.term.values([float(v) for v in x[at]], self.scales(candidate.axis))
+        indices = [self._indices[("term", candidate.key, p.name, -1)] for p in candidate.term.free_parameters]
+        return candidate.term.values([float(v) for v in x[indices]], self.scales(candidate.axis))
 
     def nominal(self, axis: str, x: Array) -> Axis:
         """An axis with the nominal values from x, including a shared readout."""
         parameters = self._nominal[axis]
         factors = [max(1.0 + tolerance * x[i], 0.02) for i, _, _, tolerance in parameters]
         key = (axis, *factors)
-        made = self._axis_cache.get(key)
-        if made is None:  # validating a device takes as long as simulating ten periods
+        result = self._axis_cache.get(key)
+        if result is None:  # cached, because the validation of a device takes as long as the simulation of ten periods
             tables: dict[str, dict[str, object]] = {}
             for (_, name, value, _), factor in zip(parameters, factors, strict=True):
-                stage, own = name.split(".")
+                stage, value_key = name.split(".")
                 new = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
-                tables.setdefault(stage, {})[own] = new
-            bare = replace(self.device.axis(axis), readout=readout_of(self.device, axis))
-            made = replace(bare, **{stage: replace(getattr(bare, stage), **table) for stage, table in tables.items()})
+                tables.setdefault(stage, {})[value_key] = new
+            stated = replace(self.device.axis(axis), readout=readout_of(self.device, axis))
+            result = replace(
+                stated, **{stage: replace(getattr(stated, stage), **table) for stage, table in tables.items()}
+            )
             if len(self._axis_cache) > AXIS_CACHE_SIZE:
                 self._axis_cache.clear()
-            self._axis_cache[key] = made
-        return made
+            self._axis_cache[key] = result
+        return result
 
     def active_terms(self, axis: str, r: int, x: Array) -> tuple[ActiveTerm, ...]:
         """The stated and the added terms of an axis with their values, as the simulation takes them."""
-        made = list(self.given[axis])
-        for each in self.candidates:
-            if each.axis == axis:
+        terms = list(self.given[axis])
+        for candidate in self.candidates:
+            if candidate.axis == axis:
                 scales = self.scales(axis)
                 hidden = [
-                    size(scales) * x[self._indices[("hidden", each.key, str(i), r)]]
-                    for i, size in enumerate(each.term.hidden_state_scales)
+                    size(scales) * x[self._indices[("hidden", candidate.key, str(i), r)]]
+                    for i, size in enumerate(candidate.term.hidden_state_scales)
                 ]
                 padded = [*hidden, 0.0, 0.0][:2]
-                made.append(ActiveTerm(each.term, self.values(each, x), each.channel, (padded[0], padded[1])))
-        return tuple(made)
+                terms.append(
+                    ActiveTerm(candidate.term, self.values(candidate, x), candidate.channel, (padded[0], padded[1]))
+                )
+        return tuple(terms)
 
     def outputs(self, x: Array, stop: float = 1.0) -> list[list[Array]]:
         """Every compared channel of every run, up to the fraction ``stop`` of the recording."""
@@ -252,46 +264,52 @@ class Model:
 
     def full_signals(self, x: Array, r: int = 0) -> list[Array]:
         """Every channel of one run on the integration grid, each shape (n + 1,), without additive waveforms."""
-        bare = np.where([each.kind == "additive" for each in self.parameters], 0.0, x)
-        return self._signals(self.runs[r], r, {name: self.nominal(name, x) for name in self.axes}, bare, 1.0)
+        without_additive = np.where([spec.kind == "additive" for spec in self.parameters], 0.0, x)
+        return self._signals(
+            self.runs[r], r, {name: self.nominal(name, x) for name in self.axes}, without_additive, 1.0
+        )
 
     def _run_outputs(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
         signals = self._signals(run, r, axes, x, stop)
         return [self._offset(o, o.sampled(signal), r, x) for o, signal in zip(run.outputs, signals, strict=True)]
 
     def _signals(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
-        added = {name: self.active_terms(name, r, x) for name in run.inputs}
-        paths = self.trajectories(run, r, axes, added, x, stop)
+        active = {name: self.active_terms(name, r, x) for name in run.inputs}
+        trajectories = self.trajectories(run, r, axes, active, x, stop)
         signals = []
         for output in run.outputs:
-            seen = [paths[name] for name in output.axes]
+            of_channel = [trajectories[name] for name in output.axes]
             if output.kind == "sense":
                 readout = axes[output.axes[0]].readout
                 assert readout is not None
-                at, shapes = self._pre_saturation_basis.get((r, output.name), _EMPTY_BASIS)
-                signals.append(sense_signal(readout, seen, x[at] @ shapes[:, : seen[0].angle.size] if at else 0.0))
+                indices, waveforms = self._pre_saturation_basis.get((r, output.name), _EMPTY_BASIS)
+                signals.append(
+                    sense_signal(
+                        readout, of_channel, x[indices] @ waveforms[:, : of_channel[0].angle.size] if indices else 0.0
+                    )
+                )
             else:
-                signals.append(reference_signal(seen[0], output.kind))
+                signals.append(reference_signal(of_channel[0], output.kind))
         return signals
 
     def trajectories(self, run: Run, r: int, axes: dict[str, Axis], added: dict[str, tuple[ActiveTerm, ...]], x: Array,
               stop: float) -> dict[str, AxisTrajectory]:  # fmt: skip
         """Trajectories of all axes of one run."""
 
-        def moved(name: str, inputs: DriveInput, start: tuple[float, float], other: Array | None) -> AxisTrajectory:
+        def simulate(name: str, inputs: DriveInput, start: tuple[float, float], other: Array | None) -> AxisTrajectory:
             if other is not None:
                 return simulate_axis(axes[name], added[name], inputs, start, other)
             return self._cached_trajectory(axes[name], added[name], inputs, start, r)
 
-        inputs = {name: _truncate(each, stop) for name, each in run.inputs.items()}
-        coupled = any(each.term.coupled for terms in added.values() for each in terms)
+        inputs = {name: _truncate(drive, stop) for name, drive in run.inputs.items()}
+        coupled = any(drive.term.coupled for terms in added.values() for drive in terms)
         starts = {name: self.start(name, r, x) for name in run.inputs}
-        return simulate_coupled(inputs, starts, coupled, moved)
+        return simulate_coupled(inputs, starts, coupled, simulate)
 
     def start(self, name: str, r: int, x: Array) -> tuple[float, float]:
         """Initial angle [rad] and rate [rad/s] of an axis in one run."""
         scales = self.runs[r].scales[name]
-        angle, rate = (x[self._indices[("start", name, each, r)]] for each in ("angle", "rate"))
+        angle, rate = (x[self._indices[("start", name, quantity, r)]] for quantity in ("angle", "rate"))
         return scales.amplitude * angle, scales.amplitude * scales.rate * rate
 
     def prefetch_trajectories(
@@ -315,19 +333,20 @@ class Model:
                             drive = tuple(each.values for each in motion.active_terms if each.term.voltage is not None)
                             groups.setdefault((r, name, drive), {})[key] = motion
 
-        def moved(some: tuple[DriveInput, list[tuple[_Key, _Motion]]]) -> None:
-            paths = simulate_batch([motion for _, motion in some[1]], some[0])
+        def simulate_part(part: tuple[DriveInput, list[tuple[_Key, _Motion]]]) -> None:
+            trajectories = simulate_batch([motion for _, motion in part[1]], part[0])
             with self._lock:
-                self._prefetched |= {key: path for (key, _), path in zip(some[1], paths, strict=True)}
+                self._prefetched |= {
+                    key: trajectory for (key, _), trajectory in zip(part[1], trajectories, strict=True)
+                }
 
         batches = []
         for (r, name, _), group in groups.items():
             inputs, requests = _truncate(self.runs[r].inputs[name], stop), list(group.items())
-            parts = max(
-                -(-len(requests) // LANES), 1 + (len(requests) > LANES // 2)
-            )  # at least two parts of a large batch, for a second processor
+            # at least two parts of a large batch, for a second processor
+            parts = max(-(-len(requests) // LANES), 1 + (len(requests) > LANES // 2))
             batches += [(inputs, requests[i::parts]) for i in range(parts)]
-        list(map_function(moved, batches))
+        list(map_function(simulate_part, batches))
 
     def _cached_trajectory(self, axis: Axis, added: tuple[ActiveTerm, ...], inputs: DriveInput,
                     start: tuple[float, float], r: int) -> AxisTrajectory:  # fmt: skip
@@ -335,23 +354,24 @@ class Model:
         motion = _Motion(axis, _motion_terms(added), start)
         key = motion.key(r, inputs)
         with self._lock:
-            path = self._prefetched.pop(key, None) or self._trajectory_cache.pop(key, None)
-        if path is None:
-            (path,) = simulate_batch([motion], inputs)
+            trajectory = self._prefetched.pop(key, None) or self._trajectory_cache.pop(key, None)
+        if trajectory is None:
+            (trajectory,) = simulate_batch([motion], inputs)
         with self._lock:  # reinserted at the end: the least recently used one is dropped first
-            self._trajectory_cache[key] = path
+            self._trajectory_cache[key] = trajectory
             if len(self._trajectory_cache) > 8 * len(self.runs):
                 self._trajectory_cache.pop(next(iter(self._trajectory_cache)))
-        return replace(path, axis=with_constants(axis, added), active_terms=added)
+        return replace(trajectory, axis=with_constants(axis, added), active_terms=added)
 
     def _offset(self, output: Output, signal: Array, r: int, x: Array) -> Array:
+        """A simulated channel with the gain of a reference channel and the additive waveforms of x."""
         gain = self.index("gain", output.name, "gain", r)
         if gain is not None:
             signal = signal * (1.0 + REFERENCE_GAIN_RELATIVE_SD * x[gain])
-        at, shapes = self.basis[(r, output.name)]
-        if not np.any(x[at]):
+        indices, waveforms = self.basis[(r, output.name)]
+        if not np.any(x[indices]):
             return signal
-        return signal + x[at] @ shapes[:, : signal.size]
+        return signal + x[indices] @ waveforms[:, : signal.size]
 
     def map_parameters_from(self, other: Model, x: Array) -> Array:
         """``x`` of another model in the order of this one; parameters that the other lacks are zero."""
@@ -360,19 +380,21 @@ class Model:
         )
 
 
-def _on_grid(shapes: Array, output: Output, run: Run) -> Array:
+def _on_grid(waveforms: Array, output: Output, run: Run) -> Array:
     """Waveforms (q, n) from the clock of a channel to the integration grid, (q, N + 1), linearly: they are slow."""
     grid = np.arange(len(run.inputs[output.axes[0]].voltage) + 1)
-    at, own = (grid - output.first) / output.stride, np.arange(shapes.shape[1])
-    return np.array([np.interp(at, own, shape) for shape in shapes]).reshape(len(shapes), grid.size)
+    positions, samples = (grid - output.first) / output.stride, np.arange(waveforms.shape[1])
+    return np.array([np.interp(positions, samples, waveform) for waveform in waveforms]).reshape(
+        len(waveforms), grid.size
+    )
 
 
 @lru_cache(maxsize=16)
 def _hum_quadratures(mains: float, n: int, step: float) -> dict[str, Array]:
     """Quadratures of the first harmonics of the mains, the n-th with amplitude 1/n."""
-    turn = 2 * np.pi * step * np.arange(n)
+    phase = 2 * np.pi * step * np.arange(n)
     return {
-        f"{name} {mains * multiple:g} Hz": wave(mains * multiple * turn) / multiple
+        f"{name} {mains * multiple:g} Hz": wave(mains * multiple * phase) / multiple
         for multiple in range(1, HUM_HARMONICS + 1)
         for name, wave in (("cos", np.cos), ("sin", np.sin))
     }
@@ -380,14 +402,18 @@ def _hum_quadratures(mains: float, n: int, step: float) -> dict[str, Array]:
 
 def nominal_parameters(device: Device, axis: str) -> list[tuple[str, float | tuple[float, ...], float]]:
     """Uncertain nominal values of an axis: (``stage.key``, nominal value, relative tolerance)."""
-    of = device.axis(axis)
+    device_axis = device.axis(axis)
     readout = readout_of(device, axis)
     shared = device.readout is not None and axis != next(iter(device.axes))
-    found: list[tuple[str, float | tuple[float, ...], float]] = []
+    parameters: list[tuple[str, float | tuple[float, ...], float]] = []
     stages: list[tuple[str, object, tuple[str, ...]]] = [
-        ("mechanics", of.mechanics, ("J", "b", "k")),
-        ("capacitance", of.capacitance, ("C0", "theta0", "theta_th", *(("Cb",) if isinstance(readout, Amdm) else ()))),
-        ("drive", of.drive, ("torque_per_volt",)),
+        ("mechanics", device_axis.mechanics, ("J", "b", "k")),
+        (
+            "capacitance",
+            device_axis.capacitance,
+            ("C0", "theta0", "theta_th", *(("Cb",) if isinstance(readout, Amdm) else ())),
+        ),
+        ("drive", device_axis.drive, ("torque_per_volt",)),
         ("readout", None if shared else readout, _readout_keys(readout)),
     ]
     for stage, table, keys in stages:
@@ -395,8 +421,8 @@ def nominal_parameters(device: Device, axis: str) -> list[tuple[str, float | tup
             value = getattr(table, key, None)
             tolerance = device.tolerance(axis, key)
             if value and tolerance > 0.0:
-                found.append((f"{stage}.{key}", value, tolerance))
-    return found
+                parameters.append((f"{stage}.{key}", value, tolerance))
+    return parameters
 
 
 def _readout_keys(readout: Readout | None) -> tuple[str, ...]:
@@ -409,7 +435,7 @@ def _readout_keys(readout: Readout | None) -> tuple[str, ...]:
 
 def _motion_terms(added: Iterable[ActiveTerm]) -> tuple[ActiveTerm, ...]:
     """The terms that change the motion."""
-    return tuple(each for each in added if each.term.stage in ("drive", "mechanics", "capacitance"))
+    return tuple(active for active in added if active.term.stage in ("drive", "mechanics", "capacitance"))
 
 
 def _truncate(inputs: DriveInput, stop: float) -> DriveInput:
