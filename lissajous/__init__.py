@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         reconstruct,
         simulate,
     )
+    from recon.frames import ScanFrames, frames
     from recon.imaging.blur import compare_with_scene, phase_bound
     from recon.imaging.gridding import map_samples
     from recon.imaging.picture import Grid, Picture
@@ -46,6 +47,7 @@ __all__ = [
     "Picture",
     "Recording",
     "ScanDesign",
+    "ScanFrames",
     "Simulation",
     "__version__",
     "blur_study",
@@ -55,6 +57,7 @@ __all__ = [
     "design",
     "diagnose",
     "estimate",
+    "frames",
     "identify",
     "load_device",
     "map_samples",
@@ -74,8 +77,10 @@ _DEFINED_ELSEWHERE = {
     "Motion": ("scanner.motion", "Motion"),
     "Picture": ("recon.imaging.picture", "Picture"),
     "Recording": ("scanner.recording", "Recording"),
+    "ScanFrames": ("recon.frames", "ScanFrames"),
     "catalogue": ("scanner.terms", "catalogue"),
     "compare_with_scene": ("recon.imaging.blur", "compare_with_scene"),
+    "frames": ("recon.frames", "frames"),
     "map_samples": ("recon.imaging.gridding", "map_samples"),
     "phase_bound": ("recon.imaging.blur", "phase_bound"),
     "register_effects": ("scanner.terms", "register"),

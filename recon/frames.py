@@ -3,49 +3,134 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from recon.imaging.intensity_gridding import grid_intensity
-from recon.imaging.picture import Picture
+from recon.imaging.picture import Picture, fill_holes
 from recon.imaging.pixel_noise import pixel_sd
+from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
 from recon.pipeline import Options, Reconstruction
 from recon.quality.defects import unrecoverable_intervals
-from recon.sample_ranges import to_sample_ranges
+from recon.report.movie import write_movie
+from recon.sample_ranges import SampleRanges, to_sample_ranges
 from scanner.errors import BadInput
 
+if TYPE_CHECKING:
+    import xarray
 
-def write_scan_frames(path: Path, result: Reconstruction, options: Options) -> None:
-    """Write ``options.frames`` frames, or one each ``options.frame_time``, and their standard deviations as OME-TIFF.
 
-    With ``frame_time`` the last frame may be shorter than the others.
+@dataclass(frozen=True)
+class ScanFrames:
+    """The frames of a scan. They are computed each time that they are iterated over, one at a time.
+
+    Attributes:
+        result: the reconstruction of the whole scan.
+        frame_time: time from one frame to the next [s].
+        edges: first sample of each frame, and the end of the last one.
+        unlocated: samples that belong to no pixel.
+    """
+
+    result: Reconstruction
+    frame_time: float
+    edges: Sequence[int]
+    unlocated: SampleRanges
+
+    def __len__(self) -> int:
+        return len(self.edges) - 1
+
+    def __iter__(self) -> Iterator[Picture]:
+        for begin, end in pairwise(self.edges):
+            yield grid_intensity(
+                self.result.beam, self.result.intensity, self.result.picture.grid, self.unlocated, begin, end
+            )
+
+    def sd(self, picture: Picture) -> Picture:
+        """The standard deviations of a frame's pixels, as a picture."""
+        return replace(picture, image=pixel_sd(picture, self.result.sample_noise))
+
+    @property
+    def times(self) -> list[float]:
+        """Beginning of each frame on the recording's clock [s]."""
+        intensity = self.result.intensity
+        return [intensity.start + edge / intensity.sample_rate for edge in self.edges[:-1]]
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return all frames as an xarray dataset: ``image``, ``image_sd`` and ``coverage`` over time, y and x.
+
+        Raises:
+            BadInput: xarray is not installed.
+        """
+        from scanner.extras import import_extra
+
+        xr = import_extra("xarray", "xarray")
+        parts = []
+        for picture, time in zip(self, self.times, strict=True):
+            part = picture.to_xarray().assign(image_sd=self.sd(picture).to_xarray()["image"])
+            parts.append(part.expand_dims(time=[time]))
+        frames: xarray.Dataset = xr.concat(parts, "time")
+        frames["time"].attrs = {"units": "s", "long_name": "beginning of the frame"}
+        frames["image"].attrs["units"] = frames["image_sd"].attrs["units"] = self.result.intensity.unit
+        return frames
+
+
+def frames(result: Reconstruction, count: int | None = None, frame_time: float | None = None) -> ScanFrames:
+    """Return the frames of a reconstructed scan.
 
     Args:
-        path: of the new file, ``frames.ome.tif``; the standard deviations are written to ``frames_sd.ome.tif`` in the
-            same folder.
-        result: the reconstruction of the whole scan.
-        options: ``frames`` and ``frame_time``.
+        result: of :func:`lissajous.reconstruct`.
+        count: number of frames, or
+        frame_time: duration of a frame [s]; the last one may be shorter.
 
     Raises:
         BadInput: a frame would hold less than one sample.
     """
-    frame_time = options.frame_time or result.duration / (options.frames or 1)
     intensity = result.intensity
-    length = frame_time * intensity.sample_rate
+    time = frame_time or result.duration / (count or 1)
+    length = time * intensity.sample_rate
     if length < 1:
-        what = f"has {intensity.sample_rate:.4g} samples a second, and frames of {frame_time:.3g} s would hold none"
+        what = f"has {intensity.sample_rate:.4g} samples a second, and frames of {time:.3g} s would hold none"
         raise BadInput(what, channel="intensity", hint="give fewer frames or more time to each")
-    count = options.frames or math.ceil(intensity.size / length - 1e-6)
+    number = count or math.ceil(intensity.size / length - 1e-6)
     unlocated = to_sample_ranges(unrecoverable_intervals(result.motion, result.defects), intensity)
-    edges = [min(round(k * length), intensity.size) for k in range(count + 1)]
+    edges = [min(round(k * length), intensity.size) for k in range(number + 1)]
+    return ScanFrames(result, time, edges, unlocated)
 
-    def pictures() -> Iterator[Picture]:
-        for begin, end in pairwise(edges):
-            yield grid_intensity(result.beam, intensity, result.picture.grid, unlocated, begin, end)
 
-    write_frames(path, pictures(), count, frame_time)
-    deviations = (replace(picture, image=pixel_sd(picture, result.sample_noise)) for picture in pictures())
-    write_frames(path.with_name("frames_sd.ome.tif"), deviations, count, frame_time)
+def write_scan_frames(folder: Path, result: Reconstruction, options: Options) -> None:
+    """Write the frames of ``options.frames`` or ``options.frame_time`` and their standard deviations.
+
+    With ``options.fill_radius`` the frames with holes filled are written too, and shown in the movie.
+
+    Args:
+        folder: for ``frames.ome.tif``, ``frames_sd.ome.tif`` and what the options ask for.
+        result: the reconstruction of the whole scan.
+        options: ``frames``, ``frame_time``, ``fill_radius``, ``zarr`` and ``movie``.
+
+    Raises:
+        BadInput: a frame would hold less than one sample.
+    """
+    own = frames(result, options.frames, options.frame_time)
+    count, frame_time = len(own), own.frame_time
+
+    def filled() -> Iterator[Picture]:
+        for picture in own:
+            yield replace(picture, image=fill_holes(picture, options.fill_radius)[0])
+
+    write_frames(folder / "frames.ome.tif", own, count, frame_time)
+    write_frames(folder / "frames_sd.ome.tif", (own.sd(picture) for picture in own), count, frame_time)
+    if options.fill_radius:
+        write_frames(folder / "frames_filled.ome.tif", filled(), count, frame_time)
+    if options.zarr:
+        pairs = ((picture, own.sd(picture).image) for picture in own)
+        write_ome_zarr(folder / "frames.ome.zarr", pairs, count, frame_time)
+    if options.movie:
+        shown = filled() if options.fill_radius else iter(own)
+        low, high = np.nanpercentile(result.picture.image, [0.5, 99.5])
+        write_movie(folder / f"frames.{options.movie}", shown, own.times, frame_time, (float(low), float(high)))

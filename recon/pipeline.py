@@ -64,6 +64,8 @@ class Options:
         intensity_drift: drift of the detector to remove, "offset" or "gain"; None removes none.
         frames: number of frames to write; None for none.
         frame_time: duration of a frame to write [s], instead of ``frames``.
+        zarr: write the frames as OME-Zarr too.
+        movie: write the frames as a movie too, ``"mp4"`` or ``"gif"``.
     """
 
     device: DeviceSource | None = None
@@ -77,6 +79,8 @@ class Options:
     intensity_drift: DriftKind | None = None
     frames: int | None = None
     frame_time: float | None = None
+    zarr: bool = False
+    movie: str | None = None
 
 
 @dataclass(frozen=True)

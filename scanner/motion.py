@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from scanner.arrays import Array, Complex
 from scanner.interpolation import shift_samples
+
+if TYPE_CHECKING:
+    import xarray
 
 
 class AngleTrack(Protocol):
@@ -179,6 +182,28 @@ class Motion:
     estimator: str
     info: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return phase, amplitude, frequency and their clocks as an xarray dataset: ``phase_x`` over ``time_x``, ….
+
+        Angles are mechanical. ``angle`` of an axis, which has millions of samples, is not part of it.
+
+        Raises:
+            BadInput: xarray is not installed.
+        """
+        from scanner.extras import import_extra
+
+        units = {"phase": "rad", "amplitude": "rad", "frequency": "Hz", "phase_sd": "rad"}
+        variables, coordinates = {}, {}
+        for name, axis in self.axes.items():
+            time = f"time_{name}"
+            coordinates[time] = (time, axis.time, {"units": "s"})
+            for key, unit in units.items():
+                attributes = {"units": unit, "reference": axis.reference, "sign": axis.sign}
+                variables[f"{key}_{name}"] = (time, getattr(axis, key), attributes)
+        attributes = {"estimator": self.estimator}
+        dataset: xarray.Dataset = import_extra("xarray", "xarray").Dataset(variables, coordinates, attributes)
+        return dataset
 
     def __repr__(self) -> str:
         lines = [f"Motion by {self.estimator!r}", *(f"  {name}: {axis!r}" for name, axis in self.axes.items())]

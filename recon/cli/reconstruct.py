@@ -40,6 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="or frames of S seconds; follow: so long (the scan's repeat)",
     )
+    parser.add_argument("--zarr", action="store_true", help="write the frames to frames.ome.zarr too")
+    parser.add_argument("--movie", choices=("mp4", "gif"), help="write the frames to frames.mp4 or frames.gif too")
     parser.add_argument(
         "--quiet-time",
         type=parse_positive,
@@ -83,6 +85,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.pipeline import Options
+    from scanner.errors import BadInput
+    from scanner.extras import import_extra
 
     options = Options(
         device=args.device,
@@ -96,7 +100,14 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         intensity_drift=args.intensity_drift,
         frames=args.frames,
         frame_time=args.frame_time,
+        zarr=args.zarr,
+        movie=args.movie,
     )
+    if (args.zarr or args.movie) and not (args.frames or args.frame_time):
+        option = "--zarr" if args.zarr else "--movie"
+        raise BadInput("needs frames", channel=option, hint="add --frames or --frame-time")
+    if args.zarr:
+        import_extra("zarr", "zarr")
     if len(args.recordings) > 1 or args.scheduler or args.workers:
         return _run_many(args, options)
     live = None
@@ -174,7 +185,7 @@ def reconstruct_file(
         if result.defects:
             write_tiff(folder / "affected.tif", result.affected.astype(np.uint8), grid)
         if options.frames or options.frame_time:
-            write_scan_frames(folder / "frames.ome.tif", result, options)
+            write_scan_frames(folder, result, options)
         write_motion(folder / "motion.h5", result.motion, grid)
         write_json(folder / "summary.json", summary)
         save_picture(folder / "image.png", result.picture, result.affected)

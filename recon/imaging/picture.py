@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.device import Scan
 from scanner.errors import BadInput
+
+if TYPE_CHECKING:
+    import xarray
 
 MAX_PIXELS = 1 << 29
 """Pixels of a picture have to be fewer than this: gridding counts them in an int32 and needs a value beyond them."""
@@ -86,6 +89,31 @@ class Picture:
     grid: Grid
     outside: int = 0
     detectors: tuple[str, ...] = ()
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return ``image`` and ``coverage`` as an xarray dataset over the angles of the pixels' middles.
+
+        Raises:
+            BadInput: xarray is not installed.
+        """
+        from scanner.extras import import_extra
+
+        grid, scale = self.grid, self.grid.angle_scale
+        coordinates: dict[str, Any] = {}
+        for axis, count, half in (("y", grid.height, grid.half_angle_y), ("x", grid.width, grid.half_angle_x)):
+            middle = scale * half * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
+            coordinates[axis] = (axis, middle, {"units": "rad", "long_name": f"{grid.angle} angle of {axis}"})
+        dimensions = ("y", "x") if self.image.ndim == 2 else ("y", "x", "detector")
+        if self.image.ndim == 3 and self.detectors:
+            coordinates["detector"] = ("detector", list(self.detectors))
+        variables = {
+            "image": (dimensions, self.image, {"long_name": "mean intensity"}),
+            "coverage": (("y", "x"), self.coverage, {"units": "1", "long_name": "samples of a pixel"}),
+        }
+        dataset: xarray.Dataset = import_extra("xarray", "xarray").Dataset(variables, coordinates)
+        if grid.metres_per_radian is not None:
+            dataset.attrs["metres_per_radian"] = grid.metres_per_radian / scale  # of the angles that are stated
+        return dataset
 
     def __repr__(self) -> str:
         grid, visited = self.grid, np.count_nonzero(self.coverage) / self.coverage.size

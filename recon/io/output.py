@@ -57,7 +57,10 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         else:
             written = sorted(temporary.iterdir())
             for path in written:
-                (folder / path.name).unlink(missing_ok=True)
+                if (folder / path.name).is_dir():
+                    shutil.rmtree(folder / path.name)
+                else:
+                    (folder / path.name).unlink(missing_ok=True)
             for path in written:
                 path.replace(folder / path.name)
     except OSError as error:

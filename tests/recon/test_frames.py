@@ -1,0 +1,144 @@
+"""Frames of a scan: films, OME-Zarr, movies, xarray, napari's reader."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+import lissajous
+from recon.cli import main
+from recon.frames import frames, write_scan_frames
+from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.report.movie import draw_frame
+from scanner.device import Device
+from scanner.recording import Recording
+from tests.support.simulated import imaging
+
+OPTIONS = Options(pixels=(60, 50), frames=3, fill_radius=2, zarr=True, movie="gif")
+
+
+@pytest.fixture(scope="module")
+def result() -> Reconstruction:
+    recording, _ = imaging()
+    channels = {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
+    light, *clock = channels["intensity"]
+    channels["intensity"] = (np.stack([light, 2.0 * light], axis=1), *clock)
+    both = Recording.from_arrays(channels, recording.device, detectors=("green", "red"))
+    return reconstruct(both, OPTIONS, quiet=True)
+
+
+def test_frames_are_written_in_every_format(result: Reconstruction, tmp_path: Path) -> None:
+    pytest.importorskip("zarr")
+    write_scan_frames(tmp_path, result, OPTIONS)
+    film = tifffile.imread(tmp_path / "frames.ome.tif")
+    filled = tifffile.imread(tmp_path / "frames_filled.ome.tif")
+    assert film.shape == filled.shape == (3, 2, 50, 60)
+    assert np.isnan(filled).sum() < np.isnan(film).sum()
+    visited = np.isfinite(film)
+    assert np.array_equal(filled[visited], film[visited])
+    import imageio.v3 as iio
+
+    movie = iio.imread(tmp_path / "frames.gif")
+    assert movie.shape[0] == 3
+    assert movie.shape[2] >= 400
+    import zarr
+
+    group = zarr.open_group(tmp_path / "frames.ome.zarr", mode="r")
+    stored = np.asarray(group["0"])
+    assert np.array_equal(stored[:, :2], film, equal_nan=True)
+    assert np.array_equal(stored[:, 2:], tifffile.imread(tmp_path / "frames_sd.ome.tif"), equal_nan=True)
+    labels = [channel["label"] for channel in group.attrs["ome"]["omero"]["channels"]]
+    assert labels == ["green", "red", "green, standard deviation", "red, standard deviation"]
+
+
+def test_the_ome_zarr_is_valid_by_its_schema(result: Reconstruction, tmp_path: Path) -> None:
+    pytest.importorskip("zarr")
+    models = pytest.importorskip("ome_zarr_models.v05")
+    import zarr
+
+    write_scan_frames(tmp_path, result, OPTIONS)
+    image = models.Image.from_zarr(zarr.open_group(tmp_path / "frames.ome.zarr", mode="r"))
+    (scale,) = image.attributes.ome.multiscales[0].datasets[0].coordinateTransformations
+    assert scale.scale[2] == pytest.approx(2 * result.picture.grid.half_angle_y / 50)
+
+
+def test_an_mp4_shows_every_frame(result: Reconstruction, tmp_path: Path) -> None:
+    write_scan_frames(tmp_path, result, replace(OPTIONS, zarr=False, movie="mp4"))
+    movie = cv2.VideoCapture(str(tmp_path / "frames.mp4"))
+    shown = 0
+    while movie.read()[0]:
+        shown += 1
+    assert shown == 3
+
+
+def test_a_drawn_frame_has_a_bar_and_a_time(result: Reconstruction) -> None:
+    picture = next(iter(frames(result, 3)))
+    dark = replace(picture, image=np.zeros((50, 60), np.float32))
+    rgb = draw_frame(dark, 0.0123, (0.0, 1.0))
+    assert rgb.shape[0] % 2 == rgb.shape[1] % 2 == 0
+    bar = (rgb[-16:-11] == 255).all(axis=2).any(axis=0)
+    assert 0.1 * rgb.shape[1] <= bar.sum() <= 0.26 * rgb.shape[1]
+    assert (rgb[:30, :120] == 255).any()
+
+
+def test_xarray_has_coordinates_and_units(result: Reconstruction) -> None:
+    pytest.importorskip("xarray")
+    film = lissajous.frames(result, frame_time=0.008).to_xarray()
+    assert dict(film.sizes) == {"time": 3, "y": 50, "x": 60, "detector": 2}
+    assert list(film["detector"].values) == ["green", "red"]
+    assert film["time"].attrs["units"] == "s"
+    assert film["image"].attrs["units"] == result.intensity.unit
+    half, step = result.picture.grid.half_angle_x, 2 * result.picture.grid.half_angle_x / 60
+    assert film["x"].values[0] == pytest.approx(-half + step / 2)
+    assert int(film["coverage"].sum()) == int(result.picture.coverage.sum())
+    motion = result.motion.to_xarray()
+    assert motion["phase_x"].attrs["units"] == "rad"
+    assert motion["frequency_y"].dims == ("time_y",)
+
+
+def test_options_of_frames_need_frames(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for option in (["--zarr"], ["--movie", "gif"]):
+        assert main(["reconstruct", str(tmp_path / "any.h5"), "-o", str(tmp_path / "out"), *option]) == 2
+        assert f"{option[0]}: needs frames" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_folder_of_frames_is_replaced(tmp_path: Path) -> None:
+    pytest.importorskip("zarr")
+    recording, _ = imaging()
+    recording.write(tmp_path / "scan.h5")
+    arguments = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out"), "--pixels", "40x40", "--zarr"]
+    for count in ("3", "2"):
+        assert main([*arguments, "--frames", count]) == 0
+    import zarr
+
+    assert zarr.open_group(tmp_path / "out" / "frames.ome.zarr", mode="r")["0"].shape[0] == 2
+
+
+@pytest.mark.slow
+def test_napari_reads_a_recording(tmp_path: Path) -> None:
+    npe2 = pytest.importorskip("npe2")
+    manifest = npe2.PluginManifest.from_file(Path(lissajous.__file__).parent / "napari.yaml")
+    (reader,) = manifest.contributions.readers
+    assert reader.filename_patterns == ["*.h5"]
+    recording, _ = imaging()
+    recording.write(tmp_path / "scan.h5")
+    manager = npe2.PluginManager()
+    manager.register(manifest)
+    manager.enable(manifest.name)
+    path = str(tmp_path / "scan.h5")
+    layers = manager.commands.execute(reader.command, kwargs={"path": path})(path)
+    assert [(arguments["name"], kind) for _, arguments, kind in layers] == [
+        ("scan", "image"),
+        ("coverage", "image"),
+        ("beam", "shapes"),
+    ]
+    picture, arguments, _ = layers[0]
+    scan = Device.from_toml(str(recording.device_toml)).require_scan()
+    assert arguments["scale"][1] * picture.shape[1] == pytest.approx(2e3 * scan.half_angle_x)
+    (tmp_path / "text.h5").write_text(json.dumps({}), encoding="utf-8")
+    assert manager.commands.execute(reader.command, kwargs={"path": str(tmp_path / "text.h5")}) is None
