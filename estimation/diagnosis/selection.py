@@ -49,33 +49,33 @@ CHI2_LARGE = 10.0
 With a smaller misfit, three terms can explain nearly anything."""
 
 MAX_REMAINING_MISFIT_RATIO = 0.005
-"""Share of the nominal misfit that several named terms may leave to replace a discrepancy term: 7 % of its
-amplitude."""
+"""Largest ratio of the remaining to the nominal misfit with which several named terms replace a discrepancy term. It
+corresponds to 7 % of the amplitude of the misfit."""
 
 CHI2_INADEQUATE = 1.3
-"""Held-out reduced chi-square from which named terms do not explain the data: confounders of the true effect were
-chosen."""
+"""Held-out reduced chi-square above which named terms do not explain the data; probably confounders of the true effect
+were selected."""
 
 CHI2_DIVERGED = 100.0
-"""Reduced chi-square from which a fit has lost the phase of the motion, so that sensitivities around it say nothing
-about a further effect."""
+"""Reduced chi-square above which the phase error of a fit exceeds half a cycle, so that sensitivities around it do not
+predict the effect of a further term."""
 
 MAX_DISCREPANCY_FITS = 3
-"""Discrepancy terms that are pruned to compete with named terms. Pruning costs a fit each."""
+"""Number of discrepancy terms that are pruned and compared with named terms. Each costs a fit."""
 
 REFIT_MARGIN, REFIT_MARGIN_RELATIVE = 80.0, 0.1
-"""Candidates within this distance of the best in -2 log evidence, or within this share of the gain of the best, are
-refitted after the noise has been estimated anew, which may change their order."""
+"""Candidates up to this distance from the best in -2 log evidence, or up to this share of the gain of the best, are
+refitted after the noise has been estimated again, because that may change their order."""
 
 
 @dataclass(frozen=True)
 class SelectionStep:
-    """One effect found: the fits without and with it, and the rivals that were tried in its place.
+    """One selected term, the fits without and with it, and its rivals.
 
     Attributes:
-        candidate: what was added.
-        before, after: fits without and with it, all else that was found in both, under the same noise.
-        rivals: its rivals when it was found.
+        candidate: the term.
+        before, after: fits without and with the term. Both contain all other selected terms and use the same noise.
+        rivals: terms that were fitted instead of it.
     """
 
     candidate: Candidate
@@ -86,13 +86,13 @@ class SelectionStep:
 
 @dataclass(frozen=True)
 class SelectionResult:
-    """What was found.
+    """Result of the selection.
 
     Attributes:
-        likelihood: under the last noise.
-        nominal: the nominal device under the last noise.
-        final: the device with all that was found.
-        steps: effect by effect.
+        likelihood: of the recordings, with the noise spectrum of the last estimate.
+        nominal: fit of the nominal device under that likelihood.
+        final: fit of the device with all selected terms.
+        steps: one for each selected term.
     """
 
     likelihood: Likelihood
@@ -294,7 +294,7 @@ def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
     """
     likelihood, fit = state.likelihood, state.best
     terms = uncertain(fit.model)
-    removed = max(([each for each in terms if each.term.stage == one.term.stage] for one in terms), key=len)
+    removed = max(([each for each in terms if each.term.stage == first.term.stage] for first in terms), key=len)
     if len(removed) == 1:
         if fit.validation_chi2 < CHI2_INADEQUATE:
             return state
@@ -317,8 +317,8 @@ def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
 
 def _rivals_of_newest(found: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, RivalFits]:
     """Rivals, among ``tried``, of the one term that ``found`` has in addition to ``before``."""
-    old = {each.key for each in before.model.candidates}
-    new = [each.key for each in found.model.candidates if each.key not in old]
+    old = {candidate.key for candidate in before.model.candidates}
+    new = [candidate.key for candidate in found.model.candidates if candidate.key not in old]
     less_likely = [
         fit
         for fit in tried
@@ -330,12 +330,12 @@ def _rivals_of_newest(found: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str
 def _merge_rivals(*parts: RivalFits) -> RivalFits:
     """All rivals with their smallest gaps, sorted by evidence."""
     nearest: dict[str, RivalFit] = {}
-    for lead in (each for part in parts for each in part):
-        known = nearest.setdefault(lead.candidate.key, lead)
-        nearest[lead.candidate.key] = RivalFit(
-            min(known.evidence_gap, lead.evidence_gap), lead.candidate, min(known.misfit_gap, lead.misfit_gap)
+    for rival in (entry for part in parts for entry in part):
+        previous = nearest.setdefault(rival.candidate.key, rival)
+        nearest[rival.candidate.key] = RivalFit(
+            min(previous.evidence_gap, rival.evidence_gap), rival.candidate, min(previous.misfit_gap, rival.misfit_gap)
         )
-    return tuple(sorted(nearest.values(), key=lambda each: each.evidence_gap))
+    return tuple(sorted(nearest.values(), key=lambda entry: entry.evidence_gap))
 
 
 def _ends_with_discrepancy(fit: Fit) -> bool:
@@ -345,15 +345,16 @@ def _ends_with_discrepancy(fit: Fit) -> bool:
 def drop_redundant(likelihood: Likelihood, fit: Fit) -> Fit:
     """Refit without the terms that the others make redundant.
 
-    A confounder may be selected first and become redundant once the true effect is added. Hum is selected anew with and
-    without every term: in a short recording a drift and one mains frequency resemble the other mains frequency.
+    A confounder may be selected first and become redundant when the true effect is added. Hum is selected again with
+    and without every term, because in a short recording a drift and one mains frequency resemble the other mains
+    frequency.
     """
     fit = select_mains_hum(likelihood, fit)
     several = len(fit.model.candidates) > 1
-    for each in uncertain(fit.model) if several else ():
-        less = select_mains_hum(likelihood, refit_without(likelihood, fit, each))
-        if not evidence_gain(likelihood, less, fit):
-            return drop_redundant(likelihood, less)
+    for candidate in uncertain(fit.model) if several else ():
+        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate))
+        if not evidence_gain(likelihood, reduced, fit):
+            return drop_redundant(likelihood, reduced)
     return fit
 
 
@@ -388,8 +389,8 @@ def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
 
 def _fit_hum_variants(likelihood: Likelihood, fit: Fit) -> list[Fit]:
     """The fit without hum, and with hum of each mains frequency alone."""
-    heard = ((), *((each,) for each in MAINS_HZ))
-    models = [Model(fit.model.runs, fit.model.device, fit.model.candidates, mains) for mains in heard]
+    mains_variants = ((), *((frequency,) for frequency in MAINS_HZ))
+    models = [Model(fit.model.runs, fit.model.device, fit.model.candidates, mains) for mains in mains_variants]
     return fit_models(
         likelihood, [(model, model.map_parameters_from(fit.model, fit.x)) for model in models], max_iterations=3
     )
@@ -400,8 +401,8 @@ def _min_entropy_whiteners(fits: Iterable[Fit]) -> list[list[Whitener]]:
 
     Hum of both mains frequencies together resembles a drift of the baseline and would raise the estimate of slow noise.
     """
-    found = [estimate_whiteners(fit.model, fit.x) for fit in fits]
-    return min(found, key=lambda noise: sum(float(np.log(each.psd).sum()) for row in noise for each in row))
+    whiteners = [estimate_whiteners(fit.model, fit.x) for fit in fits]
+    return min(whiteners, key=lambda noise: sum(float(np.log(whitener.psd).sum()) for row in noise for whitener in row))
 
 
 def with_interference_line(likelihood: Likelihood, fit: Fit) -> Fit:
