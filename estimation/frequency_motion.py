@@ -12,6 +12,7 @@ from estimation.signals import phase_reference
 from estimation.tracker.angle_synthesis import PhasorAngle, PhasorMotion
 from scanner.arrays import Array
 from scanner.device import Device
+from scanner.errors import DeviceInvalid
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
@@ -42,10 +43,14 @@ def frequency_motion(recording: Recording, device: Device) -> Motion:
         device: with a field of view and the drive of every axis.
 
     Raises:
-        DeviceInvalid: the device states no field or no drive.
+        DeviceInvalid: the device states no drive, no field, or one of more than half a turn.
         ChannelMissing: an axis has neither a drive channel nor a drive frequency; no intensity.
     """
-    half_angles = dict(zip("xy", device.require_scan().mechanical_half_angles, strict=True))
+    scan = device.require_scan()
+    half_angles = dict(zip("xy", scan.mechanical_half_angles, strict=True))
+    if max(half_angles.values()) > pi / 2 and scan.metres_per_radian is None:
+        what = f"half angles of {scan.half_angle_x:g} and {scan.half_angle_y:g} rad look like degrees or mrad"
+        raise DeviceInvalid(what, file=device.source, channel="scan", hint="state them in rad")
     intensity = recording.require("intensity", "without a sense signal the phases come from it")
     clock = intensity.sample_rate, intensity.start, intensity.size
     axes = {}

@@ -178,6 +178,7 @@ def reconstruct(
     flip_y: bool = False,
     spot: float | None = None,
     sense_only: bool = False,
+    allow_outside: bool = False,
     intensity_drift: DriftKind | None = None,
     mapping: MappingSource | None = None,
     truth: Mapping[str, Any] | None = None,
@@ -193,6 +194,7 @@ def reconstruct(
         flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
         spot: standard deviation of the beam's spot [px], for the account of the blur.
         sense_only: do not correct the phase by the error that the picture shows.
+        allow_outside: make the picture although most samples lie outside the field of view.
         intensity_drift: drift of the detector to remove, ``"offset"`` or ``"gain"``; None removes none.
         mapping: needed where ``recording`` is an instrument's file.
         truth: of a simulation, for ``evaluation``; a simulated file's own truth is read from the file.
@@ -211,6 +213,7 @@ def reconstruct(
         flips={"x": flip_x, "y": flip_y},
         spot=spot,
         sense_only=sense_only,
+        allow_outside=allow_outside,
         intensity_drift=intensity_drift,
     )
     known = truth_from_simulation(truth) if truth is not None else None

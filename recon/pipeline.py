@@ -17,6 +17,7 @@ from tqdm import tqdm
 from estimation.estimate import default_estimator, estimate
 from estimation.optics.correction import beam_motion
 from recon.evaluation import AxisEvaluation, Truth, evaluate_axis
+from recon.field_check import check_field, check_units
 from recon.imaging import blur
 from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
 from recon.imaging.image_phase import refine_motion
@@ -26,7 +27,7 @@ from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
 from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
-from recon.notes import describe_ambiguous_signs, describe_clock_jumps, describe_outside
+from recon.notes import describe_ambiguous_signs, describe_clock_jumps
 from recon.preparation import DeviceSource, PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
@@ -34,7 +35,7 @@ from recon.quality.dropped_samples import find_timing_break, first_late_slice, r
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from scanner.channel import Channel
 from scanner.device import AXES, Device
-from scanner.errors import DeviceInvalid
+from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
 
@@ -60,6 +61,7 @@ class Options:
         flips: axes whose sign is inverted.
         fill_radius: holes up to this many pixels are filled and marked as filled; 0 fills none.
         spot: standard deviation of the beam's spot [px] for the account of the blur. A recording does not contain it.
+        allow_outside: make the picture although most samples lie outside the field of view.
         sense_only: keep the phase of the estimator, without the correction by the phase error that the picture shows.
         intensity_drift: drift of the detector to remove, "offset" or "gain"; None removes none.
         frames: number of frames to write; None for none.
@@ -76,6 +78,7 @@ class Options:
     fill_radius: int = 0
     spot: float | None = None
     sense_only: bool = False
+    allow_outside: bool = False
     intensity_drift: DriftKind | None = None
     frames: int | None = None
     frame_time: float | None = None
@@ -186,12 +189,14 @@ class GriddedScan:
         picture: mean intensity and sample count of each pixel.
         unlocated: samples left out because the mirror's angle is unknown there.
         affected: pixels that hold samples from defects, or were missed through a clock jump, shape (height, width).
+        field_notes: on samples outside the field, a line each.
     """
 
     estimated: EstimatedMotion
     picture: Picture
     unlocated: SampleRanges
     affected: NDArray[np.bool_]
+    field_notes: list[str] = field(default_factory=list)
 
 
 def reconstruct(
@@ -230,7 +235,7 @@ def _reconstruct_prepared(
         estimated = correct_readout_phase(estimated, options)
         progress.update()
         progress.set_postfix_str("gridding")
-        gridded = grid_scan(correct_intensity_drift(estimated, options))
+        gridded = grid_scan(correct_intensity_drift(estimated, options), options)
         progress.update()
         progress.set_postfix_str("assessment")
         result = assess(gridded, options, truth)
@@ -247,11 +252,12 @@ def estimate_motion(prepared: PreparedRecording, options: Options, before: Motio
         before: motion of an earlier segment of the same scan, which shortens the tracker's tuning.
 
     Raises:
-        BadInput: no such estimator, or the recording lacks what it needs.
+        BadInput: no such estimator, or the recording lacks what it needs, or a half angle is stated in another unit.
     """
     recording, device = prepared.recording, prepared.device
     motion = estimate(recording, device, options.estimator, options.flips, before)
     grid, _ = _picture_grid(device, motion, options)
+    check_units(grid, motion)
     motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)
     grid, field_notes = _picture_grid(device, motion, options)
     return EstimatedMotion(prepared, motion, grid, field_notes, [*notes, *motion.notes])
@@ -300,23 +306,23 @@ def correct_intensity_drift(estimated: EstimatedMotion, options: Options) -> Est
     )
 
 
-def grid_scan(estimated: EstimatedMotion) -> GriddedScan:
+def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
     """Grid the intensity, and mark the pixels that defects affect.
 
     Raises:
-        DeviceInvalid: no sample lies in the field of view.
+        DeviceInvalid: most samples lie outside the field of view.
+        BadInput: no sample was mapped.
     """
     prepared, beam, grid = estimated.prepared, estimated.beam, estimated.grid
     unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
     picture = grid_intensity(beam, prepared.intensity, grid, unlocated)
+    field_notes = check_field(picture, estimated.motion, options.allow_outside)
     if not picture.coverage.any():
-        raise DeviceInvalid(
-            "no sample lies in the field of view", channel="scan", hint="check half_angle_x and half_angle_y"
-        )
+        raise BadInput("no sample was mapped: the angle is known nowhere", channel="intensity")
     defective = to_sample_ranges(((defect.start, defect.stop) for defect in prepared.defects), prepared.intensity)
     affected = find_visited_pixels(beam, subtract_ranges(defective, unlocated), grid)
     affected |= mark_path_during_jumps(beam, prepared.clock_jumps, grid)
-    return GriddedScan(estimated, picture, unlocated, affected)
+    return GriddedScan(estimated, picture, unlocated, affected, field_notes)
 
 
 def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Reconstruction:
@@ -342,7 +348,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         affected=gridded.affected,
         notes=[
             *estimated.field_notes,
-            *describe_outside(gridded.picture, motion),
+            *gridded.field_notes,
             *prepared.unknown_entries,
             *estimated.motion_notes,
             *describe_ambiguous_signs(motion),

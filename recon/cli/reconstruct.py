@@ -70,6 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="fill holes up to PX pixels wide, marked in fill.tif (0: none)",
     )
     parser.add_argument(
+        "--allow-outside", action="store_true", help="make the picture although most samples lie outside the field"
+    )
+    parser.add_argument(
         "--sense-only", action="store_true", help="do not correct the phase by the error that the picture shows"
     )
     parser.add_argument(
@@ -97,6 +100,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         fill_radius=args.fill,
         spot=args.spot,
         sense_only=args.sense_only,
+        allow_outside=args.allow_outside,
         intensity_drift=args.intensity_drift,
         frames=args.frames,
         frame_time=args.frame_time,
@@ -188,8 +192,10 @@ def reconstruct_file(
             write_scan_frames(folder, result, options)
         write_motion(folder / "motion.h5", result.motion, grid)
         write_json(folder / "summary.json", summary)
-        save_picture(folder / "image.png", result.picture, result.affected)
-        (folder / "report.html").write_text(reconstruction_report(result, summary), encoding="utf-8")
+        save_picture(folder / "image.png", result.picture, result.affected, options.fill_radius)
+        (folder / "report.html").write_text(
+            reconstruction_report(result, summary, options.fill_radius), encoding="utf-8"
+        )
     return summary
 
 

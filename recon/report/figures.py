@@ -94,15 +94,21 @@ def fill_small_holes(picture: Picture) -> NDArray[np.float32]:
     return fill_holes(picture, FILL_RADIUS_PX)[0]
 
 
-def save_picture(path: Path, picture: Picture, affected: NDArray[np.bool_] | None = None) -> None:
-    """Write image.png, the picture for display. The measured values are in image.tif and coverage.tif.
+def shown_image(picture: Picture, fill_radius: int) -> NDArray[np.float32]:
+    """The picture for display: as measured, or with holes filled up to a radius above 0 [px]."""
+    return fill_holes(picture, fill_radius)[0] if fill_radius else picture.image
+
+
+def save_picture(path: Path, picture: Picture, affected: NDArray[np.bool_] | None = None, fill_radius: int = 0) -> None:
+    """Write image.png, the picture for display; pixels never visited are blue unless filling is asked for.
 
     Args:
         path: the file.
         picture: to show.
         affected: pixels to highlight, shape (height, width).
+        fill_radius: holes up to this many pixels are filled; 0 fills none.
     """
-    rgb = to_rgb(fill_small_holes(picture))
+    rgb = to_rgb(shown_image(picture, fill_radius))
     path.write_bytes(encode_png(rgb if affected is None else highlight_pixels(rgb, affected)))
 
 

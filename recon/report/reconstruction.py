@@ -20,9 +20,9 @@ from recon.report.figures import (
     coverage_white_level,
     data_uri,
     encode_png,
-    fill_small_holes,
     highlight_pixels,
     phase_figure,
+    shown_image,
     to_rgb,
 )
 from recon.report.numbers import format_uncertain
@@ -30,21 +30,27 @@ from recon.report.page import Figure, Section, Table, render
 from recon.report.phase_slider import phase_slider_data
 
 
-def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any]) -> str:
-    """The page of one reconstruction; a segment of the intensity is part of it, for the phase sliders."""
+def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fill_radius: int = 0) -> str:
+    """The page of one reconstruction; a segment of the intensity is part of it, for the phase sliders.
+
+    Args:
+        result, summary: of the reconstruction.
+        fill_radius: holes of the picture are shown filled up to this many pixels; 0 fills none.
+    """
     grid = result.picture.grid
     subject = (
         f"{summary['samples']} samples in {result.duration * 1e3:.4g} ms on {grid.width} × {grid.height} pixels, "
         f"{summary['fill']:.1%} of them visited. Estimator: {result.motion.estimator}; computed in "
         f"{result.seconds:.2f} s."
     )
-    filled = fill_small_holes(result.picture)
-    image, limits = to_rgb(filled), contrast_limits(filled)
+    shown = shown_image(result.picture, fill_radius)
+    image, limits = to_rgb(shown), contrast_limits(shown)
+    filling = f"holes up to {fill_radius} pixels wide filled from their neighbours; " if fill_radius else "not filled; "
     bar, unit = scale_bar(grid), result.intensity.unit
     pictures = [
         Figure(
             data_uri(encode_png(image)),
-            "picture; blue: pixels never visited",
+            f"picture, {filling}blue: pixels never visited",
             scale_bar=bar,
             grey_scale=(f"{limits[0]:.3g} {unit}", f"{limits[1]:.3g} {unit}"),
         ),

@@ -1,0 +1,90 @@
+"""Whether the stated field of view fits the motion: a picture that is empty or tiny is refused or explained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi
+
+import numpy as np
+
+from recon.imaging.picture import Grid, Picture
+from scanner.device import AXES
+from scanner.errors import DeviceInvalid
+from scanner.motion import Motion
+
+MAX_OUTSIDE_FRACTION = 0.05
+"""Fraction of the samples outside the field of view from which a note says so. A field that the amplitude fills loses
+samples at the turning points only."""
+
+MAX_OUTSIDE_FRACTION_ALLOWED = 0.5
+"""Fraction from which the picture is refused: most of what was recorded would be missing."""
+
+MIN_AMPLITUDE_FRACTION = 0.2
+"""Amplitude over half angle below which a note says that the motion covers little of the field."""
+
+OTHER_UNITS = {"degrees": pi / 180.0, "mrad": 1e-3}
+"""Units of angle that half angles are stated in by mistake, in rad."""
+
+UNIT_MATCH = 2.5
+"""Factor within which a half angle, read in another unit, has to agree with the amplitude to be taken for that unit.
+Degrees and mrad differ by 17, so that at most one of them agrees."""
+
+
+def check_units(grid: Grid, motion: Motion) -> None:
+    """Check that half angles are no degrees or mrad.
+
+    Raises:
+        DeviceInvalid: a half angle far above the amplitude would agree with it in another unit.
+    """
+    for name, half, amplitude in zip(AXES, grid.reported_half_angles, _amplitudes(grid, motion), strict=True):
+        for unit, in_rad in OTHER_UNITS.items():
+            if half > 1.0 and 1 / UNIT_MATCH < half * in_rad / amplitude < UNIT_MATCH:
+                raise DeviceInvalid(
+                    f"is {half:g} rad and looks like {unit}: the amplitude is {amplitude:.4g} rad, and "
+                    f"{half:g} {unit} are {half * in_rad:.4g} rad",
+                    channel=f"scan.half_angle_{name}",
+                    hint="state it in rad",
+                )
+
+
+def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[str]:
+    """Notes on samples outside the field, and on a field that the motion hardly covers.
+
+    Args:
+        picture: with the count of samples outside.
+        motion: of the beam.
+        allow_outside: accept that most samples lie outside.
+
+    Raises:
+        DeviceInvalid: most samples lie outside.
+    """
+    grid = picture.grid
+    half, amplitude = grid.reported_half_angles, _amplitudes(grid, motion)
+    sizes = _describe_sizes(amplitude, half)
+    share = picture.outside / max(picture.outside + int(picture.coverage.sum()), 1)
+    notes = []
+    if share > MAX_OUTSIDE_FRACTION:
+        what = f"{share:.0%} of the samples lie outside the field of view ({sizes}; {grid.angle} angles)"
+        if share > MAX_OUTSIDE_FRACTION_ALLOWED and not allow_outside:
+            hint = (
+                "correct half_angle_x and half_angle_y, or angle, in [scan]; --allow-outside makes the picture anyway"
+            )
+            raise DeviceInvalid(what, channel="scan", hint=hint)
+        notes.append(f"{what}; check [scan] of the device")
+    if any(a < MIN_AMPLITUDE_FRACTION * h for a, h in zip(amplitude, half, strict=True)):
+        notes.append(
+            f"the motion covers little of the field of view ({sizes}; {grid.angle} angles); check [scan] of the device"
+        )
+    return notes
+
+
+def _describe_sizes(amplitude: Sequence[float], half: Sequence[float]) -> str:
+    return ", ".join(
+        f"{name}: amplitude {a:.4g} rad, half angle {h:.4g} rad"
+        for name, a, h in zip(AXES, amplitude, half, strict=True)
+    )
+
+
+def _amplitudes(grid: Grid, motion: Motion) -> list[float]:
+    """Largest amplitude of x and y as reports state it [rad]."""
+    return [grid.angle_scale * float(np.max(motion.axes[name].amplitude)) for name in AXES]

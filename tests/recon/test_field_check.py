@@ -1,0 +1,70 @@
+"""A field of view that does not fit the motion: refused, or stated in a note."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.cli import main
+from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.report.figures import UNVISITED
+from scanner.device import Scan
+from scanner.errors import DeviceInvalid
+from tests.support.simulated import imaging
+
+
+def with_field(scan: Scan | None, allow_outside: bool = False) -> Reconstruction:
+    recording, _ = imaging()
+    assert recording.device is not None
+    device = replace(recording.device, scan=scan)
+    options = Options(device=device, estimator="constant", pixels=(60, 60), allow_outside=allow_outside)
+    return reconstruct(recording, options, quiet=True)
+
+
+def test_most_samples_outside_are_refused_unless_allowed() -> None:
+    with pytest.raises(DeviceInvalid, match=r"9\d% of the samples lie outside .*half angle 0\.02"):
+        with_field(Scan(0.02, 0.02))
+    result = with_field(Scan(0.02, 0.02), allow_outside=True)
+    assert any("lie outside the field of view" in note for note in result.notes)
+    assert result.picture.outside > result.picture.coverage.sum()
+
+
+def test_some_samples_outside_are_noted() -> None:
+    notes = with_field(Scan(0.18, 0.19)).notes
+    assert any("of the samples lie outside the field of view" in note for note in notes)
+
+
+@pytest.mark.parametrize(("scan", "unit"), [(Scan(10.3, 10.3), "degrees"), (Scan(180.0, 0.18), "mrad")])
+def test_half_angles_in_another_unit_are_recognised(scan: Scan, unit: str) -> None:
+    with pytest.raises(DeviceInvalid, match=rf"half_angle_x: is .* rad and looks like {unit}: the amplitude is"):
+        with_field(scan)
+
+
+def test_a_motion_that_covers_little_of_the_field_is_noted() -> None:
+    assert any("covers little of the field" in note for note in with_field(Scan(1.2, 1.2)).notes)
+
+
+def test_a_missing_field_is_that_of_the_motion() -> None:
+    result = with_field(None)
+    assert any("states no [scan]: the field is the motion's own" in note for note in result.notes)
+    assert result.picture.outside < 0.05 * result.intensity.size
+
+
+@pytest.mark.parametrize("fill", [[], ["--fill", "2"]])
+def test_image_png_shows_unvisited_pixels_unless_filling_is_asked_for(fill: list[str], tmp_path: Path) -> None:
+    imaging()[0].slice(0.0, 0.005).write(tmp_path / "scan.h5")
+    out = tmp_path / "out"
+    arguments = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(out), "--pixels", "200x200", *fill]
+    assert main([*arguments, "--estimator", "constant"]) == 0
+    image = cv2.imread(str(out / "image.png"))[..., ::-1]
+    blue = np.frombuffer(bytes.fromhex(UNVISITED[1:]), np.uint8)
+    unvisited = np.mean((image == blue).all(axis=-1))
+    page = (out / "report.html").read_text(encoding="utf-8")
+    if fill:
+        assert unvisited < 0.1
+        assert "holes up to 2 pixels wide filled" in page
+    else:
+        assert unvisited > 0.3
+        assert "not filled; blue: pixels never visited" in page
