@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 RecordingSource = Recording | str | Path
 """A recording, or the path of a recording or of an instrument's file."""
 
+Arrays = Mapping[str, Any]
+"""Channel -> values in SI units, or (values, unit, sample rate [Hz][, start [s]]) as in ``Recording.from_arrays``."""
+
 DeviceSource = Device | str | Path
 """A device, the name of a device that comes with the program, or the path of a device file."""
 
@@ -168,7 +171,7 @@ def estimate(
 
 
 def reconstruct(
-    recording: RecordingSource,
+    recording: RecordingSource | Arrays,
     device: DeviceSource | None = None,
     estimator: str | None = None,
     *,
@@ -179,14 +182,21 @@ def reconstruct(
     spot: float | None = None,
     sense_only: bool = False,
     allow_outside: bool = False,
+    sample_rate: float | None = None,
     intensity_drift: DriftKind | None = None,
     mapping: MappingSource | None = None,
     truth: Mapping[str, Any] | None = None,
 ) -> Reconstruction:
     """Estimate the motion, map the intensity to pixels and assess the result.
 
+    Example::
+
+        arrays = {"sense_x": volts_x, "sense_y": volts_y, "intensity": light}
+        picture = lissajous.reconstruct(arrays, "device.toml", sample_rate=1e6).picture
+
     Args:
-        recording: a recording or a file.
+        recording: a recording, a file, or arrays by the name of their channel: values in SI units (V, rad), or
+            (values, unit, sample rate[, start]).
         device: in place of the recording's own.
         estimator: ``"tracker"``, ``"ukf"``, ...; chosen by what was recorded where None.
         pixels: width and height of the picture.
@@ -195,6 +205,7 @@ def reconstruct(
         spot: standard deviation of the beam's spot [px], for the account of the blur.
         sense_only: do not correct the phase by the error that the picture shows.
         allow_outside: make the picture although most samples lie outside the field of view.
+        sample_rate: of arrays that are given without one [Hz].
         intensity_drift: drift of the detector to remove, ``"offset"`` or ``"gain"``; None removes none.
         mapping: needed where ``recording`` is an instrument's file.
         truth: of a simulation, for ``evaluation``; a simulated file's own truth is read from the file.
@@ -216,6 +227,10 @@ def reconstruct(
         allow_outside=allow_outside,
         intensity_drift=intensity_drift,
     )
+    if isinstance(recording, Mapping):
+        recording = _recording_of_arrays(recording, sample_rate)
+    elif sample_rate is not None:
+        raise BadInput("is for arrays; a recording has its own rates", channel="sample_rate", hint="leave it out")
     known = truth_from_simulation(truth) if truth is not None else None
     if known is None and not isinstance(recording, Recording) and mapping is None:
         known = load_truth(Path(recording))
@@ -388,6 +403,24 @@ def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: Ma
     if not isinstance(recording, Recording):
         recording = open_any(Path(recording), None if mapping is None else _as_mapping(mapping))
     return recording if device is None else replace(recording, device_toml=load_device(device).to_toml())
+
+
+def _recording_of_arrays(arrays: Arrays, sample_rate: float | None) -> Recording:
+    """A recording of arrays; bare ones are in the unit of their channel at ``sample_rate`` [Hz]."""
+    import numpy as np
+
+    from scanner.channel import CHANNEL_UNITS
+
+    channels = {}
+    for name, values in arrays.items():
+        if isinstance(values, tuple):
+            channels[name] = values
+        elif sample_rate is None:
+            hint = "give sample_rate=, or (values, unit, sample rate)"
+            raise BadInput("is an array without a sample rate", channel=name, hint=hint)
+        else:
+            channels[name] = (np.asarray(values), CHANNEL_UNITS.get(name, ""), sample_rate)
+    return Recording.from_arrays(channels)
 
 
 def _as_mapping(mapping: MappingSource) -> Path | Mapping[str, Any]:

@@ -125,3 +125,20 @@ def test_from_arrays_states_what_it_expects(channel: object, message: str) -> No
         lissajous.Recording.from_arrays({"sense_x": channel})  # type: ignore[dict-item]
     assert "sense_x" in str(raised.value)
     assert message in str(raised.value)
+
+
+def test_arrays_are_reconstructed_without_a_file() -> None:
+    recording, _ = imaging()
+    cut = recording.slice(0.0, 0.004)
+    arrays = {name: channel.read() for name, channel in cut.channels.items()}
+    given = {"estimator": "constant", "pixels": (60, 60)}
+    result = lissajous.reconstruct(arrays, recording.device, sample_rate=5e6, **given)  # type: ignore[arg-type]
+    same = lissajous.reconstruct(cut, **given)  # type: ignore[arg-type]
+    assert np.array_equal(result.picture.image, same.picture.image, equal_nan=True)
+    tuples = {name: (values, "" if name == "intensity" else "V", 5e6) for name, values in arrays.items()}
+    again = lissajous.reconstruct(tuples, recording.device, **given)  # type: ignore[arg-type]
+    assert np.array_equal(again.picture.image, same.picture.image, equal_nan=True)
+    with pytest.raises(lissajous.BadInput, match="drive_x: is an array without a sample rate"):
+        lissajous.reconstruct({"drive_x": arrays["drive_x"]}, recording.device)
+    with pytest.raises(lissajous.BadInput, match="sample_rate: is for arrays"):
+        lissajous.reconstruct(cut, sample_rate=5e6)

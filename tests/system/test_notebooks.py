@@ -62,6 +62,12 @@ def check_missing_physics(output: str) -> None:
     assert re.search(r"^(readout-lag|  or readout-lag)", output, re.MULTILINE)
 
 
+def check_own_arrays(output: str) -> None:
+    assert numbers(r"x: (\d+\.\d+) Hz", output) == [pytest.approx(2003.0, abs=0.1)]
+    assert numbers(r"y: .* amplitude (\d\.\d+) rad", output) == [pytest.approx(0.08, rel=0.01)]
+    assert "intensity: 300000 samples" in output
+
+
 CLAIMS: dict[str, Callable[[str], None]] = {
     "1_first_reconstruction": check_first_reconstruction,
     "2_bound_and_blur": check_bound,
@@ -69,6 +75,7 @@ CLAIMS: dict[str, Callable[[str], None]] = {
     "4_estimators": check_estimators,
     "5_designing_a_scan": check_design,
     "6_missing_physics": check_missing_physics,
+    "7_your_own_arrays": check_own_arrays,
 }
 
 
