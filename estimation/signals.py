@@ -163,3 +163,22 @@ def intensity_clock(recording: Recording, fallback: Channel) -> tuple[float, flo
     if channel.size < 1:
         raise BadInput("holds no samples", file=channel.file, channel=channel.name)
     return channel.sample_rate, channel.start, channel.size
+
+
+def drive_phase_change(
+    recording: Recording, effective: Recording, device: Device, axis: str, time: Array
+) -> Array | float:
+    """Phase of the effective drive minus that of the recorded one; 0.0 if terms do not change the drive of the axis.
+
+    Args:
+        effective: the recording with the effective drive, see ``estimation.term_absorption``.
+        axis: name of the axis.
+        time: shape (n,) [s].
+
+    Returns:
+        shape (n,), or 0.0 [rad].
+    """
+    key = f"drive_{axis}"
+    if key not in effective or effective[key] is recording[key]:
+        return 0.0
+    return phase_reference(effective, device, axis).phase(time) - phase_reference(recording, device, axis).phase(time)

@@ -23,7 +23,7 @@ from estimation.describing_function import (
     describing_function,
     linearised_device,
 )
-from estimation.signals import phase_reference
+from estimation.signals import drive_phase_change
 from estimation.term_absorption import (
     Terms,
     absorb_constants,
@@ -100,7 +100,10 @@ def estimate_with_terms(
         complete = corrected.with_channel(absorbed["intensity"])
         motion = run(complete, linearised_device(bare, functions))
     axes = {name: _with_term_motion(axis, motion, functions, name) for name, axis in motion.axes.items()}
-    axes = {name: _on_recorded_reference(axis, recording, absorbed, bare, name) for name, axis in axes.items()}
+    axes = {
+        name: replace(axis, phase=axis.phase + drive_phase_change(recording, absorbed, bare, name, axis.time))
+        for name, axis in axes.items()
+    }
     return replace(motion, axes=axes, notes=_notes(terms))
 
 
@@ -173,17 +176,6 @@ def _with_term_motion(axis: AxisMotion, motion: Motion, functions: Functions, na
     angles = {key: other.angle.read(0, other.angle.size) for key, other in motion.axes.items()}
     values = add_term_motion(angles, axis.angle.sample_rate, motion, functions, name)
     return replace(axis, angle=SampledAngle(values, axis.angle.sample_rate, axis.angle.start))
-
-
-def _on_recorded_reference(
-    axis: AxisMotion, recording: Recording, absorbed: Recording, device: Device, name: str
-) -> AxisMotion:
-    """The axis with its phase against the drive as recorded, where the effective drive differs from it."""
-    key = f"drive_{name}"
-    if key not in absorbed or absorbed[key] is recording[key]:
-        return axis
-    effective, recorded = (phase_reference(source, device, name).phase(axis.time) for source in (absorbed, recording))
-    return replace(axis, phase=axis.phase + effective - recorded)
 
 
 def _notes(terms: Terms) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from estimation.filters.baselines import resolve_signs
 from estimation.optics.correction import beam_motion
-from estimation.signals import phase_reference
+from estimation.signals import drive_phase_change
 from estimation.term_compensation import estimate_with_terms
 from estimation.tracker import PhaseMeasurement, track
 from estimation.tracker.drive_only import track_drive_only
@@ -117,25 +117,14 @@ def _smooth(
 
     def run(compensated: Recording, nominal: Device) -> Motion:
         referred = {
-            name: _refer_to_effective_drive(measured, name, device, recording, compensated)
-            for name, measured in phases.items()
+            name: phase._replace(
+                phase=phase.phase - drive_phase_change(recording, compensated, device, name, phase.time)
+            )
+            for name, phase in phases.items()
         }
         return resolve_signs(smooth(compensated, nominal, referred), compensated, flips)
 
     return estimate_with_terms(recording, device, run)
-
-
-def _refer_to_effective_drive(
-    measured: PhaseMeasurement, name: str, device: Device, recording: Recording, compensated: Recording
-) -> PhaseMeasurement:
-    """Phases against the effective drive, where a term of the device changes the recorded drive."""
-    key = f"drive_{name}"
-    if key not in compensated or compensated[key] is recording[key]:
-        return measured
-    recorded, effective = (
-        phase_reference(each, device, name).phase(measured.time) for each in (recording, compensated)
-    )
-    return measured._replace(phase=measured.phase + recorded - effective)
 
 
 def registration_windows(motion: Motion, intensity: Channel, periods: int) -> list[tuple[int, int]]:
