@@ -78,7 +78,7 @@ def _diagnose_readout(
     measure_reference: MeasureReference,
     progress: Progress,
 ) -> tuple[tuple[Finding, ...], Device]:
-    """Findings of the readout that the pictures show beside ``diagnosis``, and the nominal device with them."""
+    """Findings of the readout that the pictures show in addition to ``diagnosis``, and the nominal device with them."""
     from estimation.optics.readout_selection import diagnose_readout
 
     known = {

@@ -192,7 +192,7 @@ def drive_input(drive: Channel | None, recording: Recording, clock: Channel) -> 
 
 
 def trajectory(axis: Axis, terms: tuple[ActiveTerm, ...], drive: DriveInput, angle: Array) -> AxisTrajectory:
-    """A known motion as a trajectory; the sample behind its last one is extrapolated linearly."""
+    """A known motion as a trajectory; the sample after its last one is extrapolated linearly."""
     extended = np.append(angle, 2.0 * angle[-1] - angle[-2])
     omega = np.gradient(extended, drive.step)
     return AxisTrajectory(axis, terms, drive, extended, omega, nodes_to_samples(drive.voltage))

@@ -32,7 +32,7 @@ class AmdmCircuit:
     Attributes:
         carrier_volts, carrier_hz: V_c0 [V] and f_c [Hz].
         R_f: feedback resistor of the amplification stage [ohm].
-        C_p: parasitic capacitance beside the comb [F]; the paper prints none.
+        C_p: parasitic capacitance parallel to the comb [F]; the paper prints none.
         hpf_hz: corner of the first-order high-pass [Hz].
         a_d, b_d: envelope detector a_d v + b_d v^2 (eq 23), [1] and [1/V]; the paper prints neither. The default is the
             second-order expansion of a diode's law, b_d / a_d = 1 / (2 n V_T), with n V_T = 39 mV.

@@ -146,7 +146,7 @@ def new_device(
 
 
 def _aligned(text: str) -> str:
-    """The text with the comments behind values in one column."""
+    """The text with the comments after values aligned in one column."""
     lines = (line.partition("  # ") for line in text.splitlines())
     return "".join((f"{left.rstrip():<28}# {comment}" if mark else left) + "\n" for left, mark, comment in lines)
 

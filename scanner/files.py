@@ -47,7 +47,8 @@ def check_writable(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to. It replaces ``path`` when the block ends and is deleted when it fails.
+    """Yield a temporary path in the folder of ``path`` to write to. It replaces ``path`` when the block ends and is
+    deleted when it fails.
 
     Raises:
         BadInput: as :func:`check_place`.

@@ -74,7 +74,7 @@ def measure_by_ldv(angle: Array, noise: float, vibration: float, rng: np.random.
 def cw1012(seed: int, duration: float = 0.05) -> Record:
     """14510 Hz at +-5 deg with a slow axis of 200 Hz in the same bridge, kept apart by a band-pass (eq 3, 6).
 
-    Noise gives the printed variance behind the band-pass. The resonance moves by 10 ppm.
+    Noise gives the printed variance after the band-pass. The resonance moves by 10 ppm.
     """
     from scipy.signal import butter, sosfiltfilt
 

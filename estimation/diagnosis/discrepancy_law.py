@@ -26,7 +26,7 @@ contribution, one exceeds it in a recording out of forty."""
 LENGTH = "T: duration of the recording"
 STATE = "x = θ/A, y = θ'/(A ω)"
 VARIABLES = {
-    "free-mechanics": ("f/(k A)", f"{STATE}, H_s: x² + y² behind a low-pass with time constant s T, {LENGTH}"),
+    "free-mechanics": ("f/(k A)", f"{STATE}, H_s: x² + y² after a low-pass with time constant s T, {LENGTH}"),
     "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
     "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
     "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),

@@ -56,7 +56,7 @@ def fast_transform_length(n: int) -> int:
 
 
 def decimate(values: Array, factor: int) -> Array:
-    """Decimate by ``factor`` behind a zero-phase low-pass, flat to 1e-5 in the lower 70 % of the new band."""
+    """Decimate by ``factor`` after a zero-phase low-pass, flat to 1e-5 in the lower 70 % of the new band."""
     from scipy.signal import firwin, resample_poly
 
     mean = values.mean()

@@ -1,6 +1,6 @@
-"""The catalogue of estimators: one file, one estimator, which states what it is, what it needs and when to use it.
+"""The catalogue of estimators: each file defines one estimator, what it needs and when to use it.
 
-What the estimators compute with may not be in here; a file imports that when its estimator runs.
+The algorithms do not belong here; a file imports them when its estimator runs.
 """
 
 from __future__ import annotations

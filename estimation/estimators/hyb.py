@@ -17,7 +17,7 @@ def run(recording: Recording, device: Device) -> Motion:
 ESTIMATOR = Estimator(
     name="hyb",
     summary="extended Kalman filter that also measures the angle at each crossing of the threshold angle",
-    needs="sense channels behind transimpedance readouts; drive, mechanics, capacitance and readout of the device",
+    needs="sense channels with transimpedance readouts; drive, mechanics, capacitance and readout of the device",
     use_when="a transimpedance readout, whose signal gives the rate well and the angle only at crossings",
     run=run,
     source="chen2019, table I",

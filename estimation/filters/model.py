@@ -118,7 +118,7 @@ class FilterModel:
 def filter_model(
     device: Device, axes: tuple[str, ...], readout: Readout, step: float, offset: float | None = None
 ) -> FilterModel:
-    """The model of ``axes`` behind one ``readout``, sampled every ``step`` seconds.
+    """The model of ``axes`` with one ``readout``, sampled every ``step`` seconds.
 
     Args:
         step: sampling interval [s].

@@ -2,7 +2,7 @@
 
 The state is [theta, theta'] of each axis and the readout's low-pass sections; both axes are in one filter where they
 share an electrode. The process noise is a white torque (chen2020 eq 12). Its variance is tuned by maximum likelihood:
-with the published one, 1e11 (rad/s2)^2, the filter falls behind a drifting resonance by degrees.
+with the published one, 1e11 (rad/s2)^2, the filter lags a drifting resonance by degrees.
 """
 
 from __future__ import annotations

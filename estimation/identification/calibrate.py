@@ -92,7 +92,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
     if not values:
         what = "no recording shows a rest, a free decay or a driven motion with a reference angle"
         names = ", ".join(sorted({name for recording in recordings for name in recording.channels}))
-        hint = f"record angle_x beside sense_x; there is {names or 'nothing'}"
+        hint = f"record angle_x together with sense_x; the recording contains {names or 'nothing'}"
         raise BadInput(what, file=recordings[0].path if recordings else None, hint=hint)
     return Identification(replace(device, axes=axes), values, used, notes)
 

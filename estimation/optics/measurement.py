@@ -25,7 +25,7 @@ MEASURED_PARAMETERS = (
     "drift_x", "drift_y",
 )  # fmt: skip
 """Parameters that are fitted together; m is their number. Delay and lag of the intensity are not included: the delay is
-the common part of both axes' delays, and a lag has no linear effect beside that of a delay."""
+the common part of both axes' delays, and the linear effect of a lag is that of a delay."""
 
 FLICKER_SD = 0.01
 """Standard deviation of the apparent relative change of the light over the recording that is caused by detail of the

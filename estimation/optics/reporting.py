@@ -185,7 +185,7 @@ def build_finding(
 
     Args:
         evidence_gain: fall of -2 log evidence by the effect.
-        rivals: (distance behind in -2 log evidence, effect) of what could stand in its place.
+        rivals: (difference in -2 log evidence, effect) of every effect that may explain the data instead.
         heldout: reduced chi-square of samples left out, before and after.
     """
     weights: dict[str, float] = {}

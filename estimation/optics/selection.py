@@ -123,7 +123,7 @@ class GaussianLikelihood:
 
 
 Rivals = dict[tuple[str, str], list[tuple[float, OpticsEffect]]]
-"""(effect, axis) -> (distance behind in -2 log evidence, rival) of each effect that acts on the same parameters."""
+"""(effect, axis) -> (difference in -2 log evidence, rival) of each effect that acts on the same parameters."""
 
 
 def diagnose_optics(motion: Motion, intensity: Channel, device: Device) -> OpticsDiagnosis:

@@ -90,7 +90,7 @@ def _interpolate_knots(time, knots, phase, phase_rate, log, log_rate, harmonics)
 
 @njit(cache=True)
 def _interpolate_cubic(values, slopes, k, s, step):  # type: ignore[no-untyped-def]
-    """Cubic Hermite polynomial at fraction ``s`` of the interval behind knot ``k``; linear beyond the ends."""
+    """Cubic Hermite polynomial at fraction ``s`` of the interval after knot ``k``; linear beyond the ends."""
     inside = min(max(s, 0.0), 1.0)
     rest = 1.0 - inside
     a, b = values[k], values[k + 1]

@@ -21,7 +21,7 @@ WINDOW_BLOCKS = 4096
 """Blocks that are smoothed at a time: bounds the memory of their covariances to some 50 MB."""
 
 LOOKAHEAD_BLOCKS = 512
-"""Blocks behind a window from which its last blocks are smoothed: many correlation times of the estimate."""
+"""Blocks after a window from which its last blocks are smoothed: many correlation times of the estimate."""
 
 MAX_EXPANSIONS = 30
 """Most iterations of expanding clipped blocks about the track; 3 to 10 are usual."""
@@ -39,7 +39,7 @@ class StateTrack:
         log_likelihood: of the projections, up to a constant.
         mean_nis: mean normalised innovation squared; 1 where model and noise are right.
         acquired: whether the motion of each axis was detected, shape (axes,).
-        next_prior: estimate before the block behind the last one, if there is one.
+        next_prior: estimate before the block after the last one, if there is one.
     """
 
     states: Array

@@ -21,7 +21,8 @@ SWITCH_VARIANCE_RATIO = 10.0
 """Residual variance of a block, over the median one, above which a switch is searched in it."""
 
 MIN_SWITCH_VARIANCE_RATIO = 1e-6
-"""The same over the drive's power, for drives without noise, whose median residual is rounding error."""
+"""Residual variance of a block relative to the power of the drive, above which a switch is searched in it. It applies
+to drives without noise, whose median residual is rounding error."""
 
 MAX_RESIDUAL_RATIO = 0.2
 """Largest ratio of the squared residuals with a switch to those without, at which the switch is accepted."""

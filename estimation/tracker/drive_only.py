@@ -49,7 +49,8 @@ MAX_STEADY_CHANGE = 1e-5
 """Change of phase [rad] and ln A over the last step at which the motion counts as steady."""
 
 INITIAL_SD = (0.01, 0.005)
-"""Standard deviations of phase [rad] and ln A about the steady motion, beside those from stiffness and damping."""
+"""Standard deviations of phase [rad] and ln A about the steady motion, in addition to those from stiffness and
+damping."""
 
 STIFFNESS_RATE_DENSITIES = 10.0 ** np.arange(-1.5, 2.0)
 """Spectral densities of the stiffness rate that are compared [1/s^3]. The least one is 0.05 % in 30 ms.

@@ -18,10 +18,11 @@ from scanner.arrays import Array
 from scanner.device import Amdm, Device, MotionSensor
 
 RELATIVE_STIFFNESS_SD = 0.003
-"""Change of stiffness since the calibration, beside its tolerance: that of silicon for 50 K (-60 ppm/K)."""
+"""Change of stiffness since the calibration, in addition to its tolerance: that of silicon for 50 K (-60 ppm/K)."""
 
 RELATIVE_DAMPING_SD = 0.05
-"""Change of damping since the calibration, beside its tolerance: air damping varies with temperature and pressure."""
+"""Change of damping since the calibration, in addition to its tolerance: air damping varies with temperature and
+pressure."""
 
 STIFFNESS_RATE_SD_PER_S = 0.3
 """Rate of the relative stiffness at the beginning [1/s]: 0.3 % within 10 ms, a fast warming-up."""

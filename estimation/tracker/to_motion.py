@@ -122,7 +122,7 @@ def motion_of_knots(
 
 
 def _knots_at_switch(observations: BlockObservations, states: Array, a: int, k: int) -> tuple[NDArray[Any], ...]:
-    """Time, phase, rate, ln A, harmonics and flag before and after the switch of axis ``a`` behind block k."""
+    """Time, phase, rate, ln A, harmonics and flag before and after the switch of axis ``a`` after block k."""
     signal, law = observations.signal, unpack_parameters(observations.parameter_rows[a])
     reference = observations.references[observations.sense.axes[a]]
     delay = signal.drive_share[k, a] * signal.step

@@ -112,7 +112,7 @@ class SectionResult(NamedTuple):
 def section_ranges(drive_share: Array) -> Iterator[tuple[int, int]]:
     """First and stop block of the sections that are tracked one after the other.
 
-    No section ends with a block behind which the drive switches. drive_share: see ``BlockSignal``, (blocks, axes).
+    No section ends with a block after which the drive switches. drive_share: see ``BlockSignal``, (blocks, axes).
     """
     first, blocks = 0, len(drive_share)
     steady = (drive_share == 0.5).all(axis=1)
@@ -152,7 +152,7 @@ def tune_section(
     External phases are not used: a few of them would be fitted by an increased process noise.
 
     Args:
-        prior: estimate behind the section before, None for the first section.
+        prior: estimate at the end of the previous section, None for the first section.
         densities: at which the tuning starts, shape (axes, 4).
     """
     start, signs = resolve_signs(observations, initial_estimate(observations, device))

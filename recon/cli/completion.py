@@ -63,7 +63,7 @@ def bash(commands: Mapping[str, str], options: Mapping[str, Options]) -> str:
 
 
 def zsh(commands: Mapping[str, str], options: Mapping[str, Options]) -> str:
-    """The same with the help beside each word."""
+    """The same with a help text for each word."""
     described = [f"    {quote(f'{name}:{text}')}" for name, text in commands.items()]
     cases = []
     for name in commands:

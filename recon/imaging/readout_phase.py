@@ -53,7 +53,8 @@ MAX_ROUNDS = 3
 CONVERGENCE_SD = 0.5
 """Change of the phase in standard deviations at which the rounds end."""
 POSTERIOR_TIMES = 200
-"""Times at which the posterior is evaluated beside those of the measurements: 0.3 ms apart in a scan of 60 ms."""
+"""Times at which the posterior is evaluated in addition to those of the measurements: 0.3 ms apart in a scan of 60
+ms."""
 
 
 @dataclass(frozen=True)

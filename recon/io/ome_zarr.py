@@ -55,7 +55,8 @@ def write_ome_zarr(
 
 
 def _metadata(picture: Picture, detectors: int, frame_time: float) -> dict[str, Any]:
-    """Attributes of the group by the specification; an angle has no unit there and is stated beside."""
+    """Attributes of the group by the specification; the specification has no unit for angles, which is therefore a
+    separate attribute."""
     width, height, unit = pixel_size(picture.grid)
     length = {"unit": "micrometer"} if unit == "um" else {}
     numbered = [f"detector {k + 1}" for k in range(detectors)] if detectors > 1 else ["intensity"]

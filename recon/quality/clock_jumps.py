@@ -45,7 +45,7 @@ DETECTION_SIGMA = 12.0
 a part of the recording."""
 
 ISOLATION_RATIO = 4.0
-"""Smallest jump relative to the steps beside it. A transient changes those too, a jump does not."""
+"""Smallest jump relative to the neighbouring steps. A transient changes those too, a jump does not."""
 
 MIN_RELATIVE_AMPLITUDE = 0.3
 """Amplitude of the line relative to its median below which its phase is not used."""
@@ -110,7 +110,7 @@ def mark_path_during_jumps(motion: Motion, jumps: Sequence[Defect], grid: Grid) 
 
 
 def _extrapolated_angle(axis: AxisMotion, time: Array) -> Array:
-    """Angles [rad] before the first or behind the last sample of a motion, by a sine fitted to the nearest cycles."""
+    """Angles [rad] before the first or after the last sample of a motion, by a sine fitted to the nearest cycles."""
     track, behind = axis.angle, time[0] > axis.angle.start
     omega = 2 * np.pi * axis.frequency[-1 if behind else 0]
     count = min(track.size, round(CYCLES_PER_PHASE * 2 * np.pi / omega * track.sample_rate))

@@ -131,7 +131,7 @@ def register_slices_separately(motion: Motion, intensity: Channel, grid: Grid, s
 def first_late_slice(phase_errors: Sequence[PhaseError], motion: Motion) -> int | None:
     """Return the first slice from which on none is aligned while all before it are; None where there is no such slice.
 
-    The last slice alone is not accepted, because the location needs a whole slice behind it.
+    The last slice alone is not accepted, because the location needs a whole slice after it.
     """
     late = ~slices_aligned(phase_errors, motion)
     first = int(np.argmax(late))
@@ -141,7 +141,7 @@ def first_late_slice(phase_errors: Sequence[PhaseError], motion: Motion) -> int 
 def locate_dropped_samples(
     motion: Motion, intensity: Channel, grid: Grid, slices: int, late_slice: int
 ) -> DroppedSamples | None:
-    """Return the samples dropped between the slices before and behind ``late_slice``.
+    """Return the samples dropped between the slices before and after ``late_slice``.
 
     Args:
         motion: its angles on the intensity's clock.
@@ -151,14 +151,14 @@ def locate_dropped_samples(
         late_slice: see :func:`first_late_slice`.
 
     Returns:
-        None where the picture of the time before predicts the intensity behind at no lag, or at several.
+        None where the picture of the time before predicts the later intensity at no lag, or at several.
     """
     edges = _slice_edges(intensity, slices)
     coarse = Grid(
         max(1, grid.width // COARSENING), max(1, grid.height // COARSENING), grid.half_angle_x, grid.half_angle_y
     )
     begin = edges[late_slice + 1]
-    end = (edges[late_slice + 1] + edges[late_slice + 2]) // 2  # half a slice, so that later lags fit behind it
+    end = (edges[late_slice + 1] + edges[late_slice + 2]) // 2  # half a slice, so that later lags fit after it
     values = intensity.read(0, end)
     values = values if values.ndim == 1 else values.mean(axis=1)
     values[~np.isfinite(values)] = np.nan
@@ -216,7 +216,7 @@ def _locate_loss(predicted: Array, values: Array, first: int, stop: int, lag: in
 def restore_timing(recording: Recording, dropped: DroppedSamples) -> Recording:
     """Return the recording with an intensity in time again.
 
-    Samples behind the loss are shifted; the range in which the loss lies becomes a gap (NaN).
+    Samples after the loss are shifted; the range in which the loss lies becomes a gap (NaN).
     """
     channel = recording["intensity"]
     unshifted_end = min(dropped.first, dropped.stop + dropped.missing)

@@ -239,7 +239,7 @@ def plan_report(plan: Mapping[str, Any], effects: Sequence[Detectability]) -> st
 
     Args:
         plan: content of plan.json.
-        effects: behind its table.
+        effects: detectability of every effect, listed in its table.
     """
     runs = [[run["name"], f"{1e3 * run['duration']:.4g}", ", ".join(run["channels"])] for run in plan["excitations"]]
     ambiguous = [

@@ -154,7 +154,7 @@ def detectability_figure(effects: Sequence[Detectability]) -> Figure:
         place = np.arange(len(effects))
         axes.barh(place, [max(e.sigma, 0.1) for e in effects], color=AFTER, alpha=0.35, label="detectability")
         distances = [max(e.distance, 0.1) for e in effects]
-        axes.barh(place, distances, color=AFTER, height=0.4, label="left beside the nearest confounder")
+        axes.barh(place, distances, color=AFTER, height=0.4, label="after a fit of the nearest confounder")
         axes.axvline(DISCRIMINATION_SIGMA, color=BEFORE, lw=1, label=f"needed: {DISCRIMINATION_SIGMA:g} σ")
         axes.set_yticks(place, [f"{e.candidate.key}  (as {e.nearest.key})" for e in effects], fontsize=8)
         axes.set_ylim(len(effects) - 0.4, -0.6)

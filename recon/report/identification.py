@@ -1,4 +1,4 @@
-"""The report of ``identify``: every identified constant beside its nominal value."""
+"""The report of ``identify``: every identified constant with its nominal value."""
 
 from __future__ import annotations
 

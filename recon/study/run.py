@@ -57,7 +57,7 @@ def run_study(
     if parquet:
         require_parquet()
     all_jobs = list(plan_jobs(study))
-    # The pool comes first: a scheduler that does not answer leaves no folder behind.
+    # The pool comes first: a scheduler that does not answer must not cause an empty folder.
     pool = open_executor(scheduler, workers)
     with _explain_interruption(output), pool as executor, _journal(_create_folder(output) / JOURNAL) as (file, done):
         before = len(done)

@@ -47,7 +47,8 @@ lane; 1.0 for an electrostatic drive and 0.0 for another; number of hidden state
 _COMPILER_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
 _MIN_EXPONENT = -700.0
-"""Exponents below are taken as this: exp(-700) = 1e-304 is zero beside any capacitance and still a normal number."""
+"""Exponents below are taken as this: exp(-700) = 1e-304 is negligible against any capacitance and still a normal
+number."""
 
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 """ln 2 in two parts. The last bits of the first are zero, so its product with an exponent is exact (Cody & Waite)."""

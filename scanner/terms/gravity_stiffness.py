@@ -9,7 +9,8 @@ from scanner.integrator.abi import TORQUE_LAW
 from scanner.terms.term import Parameter, Term
 
 MIN_AMPLITUDE_RAD = 0.3
-"""Least swing at which sine and angle differ by more than 1 %: below it nothing distinguishes the law from a cubic."""
+"""Smallest amplitude at which sine and angle differ by more than 1 %: below it nothing distinguishes the law from a
+cubic."""
 
 
 @njit(TORQUE_LAW, cache=True)

@@ -125,7 +125,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class SignalContext:
-    """What a law on arrays receives beside its signal.
+    """Arguments of a law on arrays in addition to its signal.
 
     Attributes:
         time: of the samples, from the start of the recording, shape (n,) [s].

@@ -201,7 +201,7 @@ def _tektronix_beside(head: list[str]) -> Layout:
 
 
 def _rohde_schwarz(path: Path, width: int) -> Layout:
-    """``NAME.Wfm.csv`` holds values only; unit and clock are in ``NAME.csv`` or ``NAME.bin`` beside it.
+    """``NAME.Wfm.csv`` holds values only; unit and clock are in ``NAME.csv`` or ``NAME.bin`` in the same folder.
 
     The values are those on the screen or all that were recorded; the number of rows decides which.
     """
@@ -225,7 +225,7 @@ def _rohde_schwarz(path: Path, width: int) -> Layout:
 
 
 def _read_header_beside(path: Path) -> dict[str, str]:
-    """Header beside ``NAME.Wfm.csv``: lines ``key:value:`` in NAME.csv, else XML in NAME.bin."""
+    """Header of ``NAME.Wfm.csv`` in a separate file: lines ``key:value:`` in NAME.csv, else XML in NAME.bin."""
     if not path.name.lower().endswith(".wfm.csv"):
         return {}
     name = path.name[: -len(".Wfm.csv")]
