@@ -184,7 +184,7 @@ def test_only_mechanics_are_identified_on_a_shared_electrode(moving):
     ]
     found = identify(recordings, DRIVEN)
     assert {"J", "b", "k"} <= set(found.values["x"])
-    assert any(note.startswith("sense: of an electrode that both axes share") for note in found.notes)
+    assert any(note.startswith("sense: the electrode is shared by both axes") for note in found.notes)
 
 
 def calibration(folder) -> list:
