@@ -11,6 +11,7 @@ from estimation.optics.correction import correct_intensity
 from estimation.signals import require_device
 from recon.quality.clock_jumps import detect_clock_jumps, longest_segment
 from recon.quality.defects import Defect, find_defects
+from recon.quality.drive_check import check_drives
 from scanner import devices
 from scanner.channel import CHANNEL_UNITS, Channel, check_signal
 from scanner.device import AXES, Device
@@ -56,7 +57,8 @@ def prepare(recording: Recording, device: DeviceSource | None = None) -> Prepare
         device: in place of the recording's own.
 
     Raises:
-        BadInput: no intensity, or one that is not a signal; no device, or a device without an x or a y axis.
+        BadInput: no intensity, or one that is not a signal; no device, a device without an
+            x or a y axis, or drives that do not fit it.
     """
     check_signal(recording.require("intensity", "a picture needs it"), gaps_ok=True)
     device = select_device(recording, device)
@@ -65,6 +67,7 @@ def prepare(recording: Recording, device: DeviceSource | None = None) -> Prepare
         recording = recording.slice(*longest_segment(recording, clock_jumps))
     for axis in AXES:
         device.axis(axis)
+    check_drives(recording, device)
     return prepare_segment(recording, device, clock_jumps)
 
 

@@ -1,0 +1,259 @@
+"""Wrong inputs as users make them: each ends in one line with the cause, or in a picture with a stated warning."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from recon.cli import main
+
+RATE = 1e6
+SAMPLES = 20_000
+DEVICE = """
+[x.readout]
+kind = "position"
+gain = 1.0
+noise_sd = 1e-4
+[y.readout]
+kind = "position"
+gain = 1.0
+noise_sd = 1e-4
+[scan]
+half_angle_x = 0.11
+half_angle_y = 0.11
+"""
+MECHANICS = """
+[x.mechanics]
+J = 1e-10
+b = 1.2566e-8
+k = 1.5791e-2
+[x.drive]
+kind = "linear"
+torque_per_volt = 1e-6
+[y.mechanics]
+J = 1e-10
+b = 5e-9
+k = 2.5266e-3
+[y.drive]
+kind = "linear"
+torque_per_volt = 1e-6
+"""
+Change = Callable[[h5py.File], None]
+
+
+def signals() -> dict[str, np.ndarray]:
+    """Positions [V] at 2000 and 800 Hz, an intensity and drives [V]."""
+    time = np.arange(SAMPLES) / RATE
+    x, y = 0.1 * np.sin(2 * np.pi * 2000 * time), 0.1 * np.sin(2 * np.pi * 800 * time)
+    light = 100.0 + 50.0 * np.cos(30 * x) * np.cos(20 * y)
+    return {
+        "sense_x": x,
+        "sense_y": y,
+        "intensity": light,
+        "drive_x": 5.0 * np.cos(2 * np.pi * 2000 * time),
+        "drive_y": 5.0 * np.cos(2 * np.pi * 800 * time),
+    }
+
+
+def write(path: Path, device: str = DEVICE, change: Change | None = None, leave_out: tuple[str, ...] = ()) -> None:
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"format": "lissajous-recording", "version": 1, "name": "wrong"})
+        for name, values in signals().items():
+            if name not in leave_out:
+                dataset = file.create_dataset(f"channels/{name}", data=values)
+                dataset.attrs.update({"unit": "V", "sample_rate": RATE, "start": 0.0})
+        file.create_group("device").attrs["toml"] = device
+        if change is not None:
+            change(file)
+
+
+DRIVES = ("drive_x", "drive_y")
+
+
+def attribute(channel: str, key: str, value: object) -> Change:
+    def change(file: h5py.File) -> None:
+        if value is None:
+            del file[f"channels/{channel}"].attrs[key]
+        else:
+            file[f"channels/{channel}"].attrs[key] = value
+
+    return change
+
+
+def values(channel: str, new: Callable[[np.ndarray], np.ndarray]) -> Change:
+    def change(file: h5py.File) -> None:
+        dataset = file[f"channels/{channel}"]
+        attributes, data = dict(dataset.attrs), new(dataset[:])
+        del file[f"channels/{channel}"]
+        file.create_dataset(f"channels/{channel}", data=data).attrs.update(attributes)
+
+    return change
+
+
+def without(channel: str) -> Change:
+    def change(file: h5py.File) -> None:
+        del file[f"channels/{channel}"]
+
+    return change
+
+
+def field(x: float, y: float) -> str:
+    return DEVICE.replace("half_angle_x = 0.11", f"half_angle_x = {x}").replace(
+        "half_angle_y = 0.11", f"half_angle_y = {y}"
+    )
+
+
+def swapped_drives(file: h5py.File) -> None:
+    x, y = (file[f"channels/drive_{axis}"][:] for axis in "xy")
+    file["channels/drive_x"][:], file["channels/drive_y"][:] = y, x
+
+
+REFUSED_RECORDINGS: dict[str, tuple[str, Change | None, str]] = {
+    "field in degrees": (field(6.3, 6.3), None, "looks like degrees"),
+    "field in mrad": (field(110.0, 110.0), None, "looks like mrad"),
+    "field far too small": (field(0.005, 0.005), None, "lie outside the field of view (x: amplitude 0.1"),
+    "negative field": (field(-0.1, 0.1), None, "scan.half_angle_x: is -0.1 and must be a number greater than 0"),
+    "unknown kind of angle": (DEVICE + 'angle = "beam"', None, "scan.angle: 'beam' is unknown"),
+    "gain of zero": (DEVICE.replace("gain = 1.0", "gain = 0.0", 1), None, "x.readout.gain: is 0.0"),
+    "gain as text": (DEVICE.replace("gain = 1.0", 'gain = "1 V/rad"', 1), None, "must be a number"),
+    "readout missing": (DEVICE.replace("[y.readout]", "[y.sensor]"), None, "sense_y is no position readout"),
+    "one axis": (DEVICE.partition("[y.readout]")[0], None, "y: is missing and needed here"),
+    "device is no TOML": ("[x.readout", None, "is not TOML"),
+    "no intensity": (DEVICE, without("intensity"), "intensity: is not in the recording"),
+    "intensity all NaN": (DEVICE, values("intensity", lambda v: v * np.nan), "holds no sample that can be used"),
+    "intensity constant": (DEVICE, values("intensity", lambda v: 0 * v), "intensity: is constant, 0 V"),
+    "intensity empty": (DEVICE, values("intensity", lambda v: v[:0]), "holds no samples"),
+    "intensity of three dimensions": (DEVICE, values("intensity", lambda v: v.reshape(-1, 10, 10)), "has shape"),
+    "intensity complex": (DEVICE, values("intensity", lambda v: v + 0j), "not real numbers"),
+    "no sense of y": (DEVICE, without("sense_y"), "y"),
+    "sense constant": (DEVICE, values("sense_x", lambda v: 0 * v + 1), "sense_x: is constant, 1 V"),
+    "sense infinite": (DEVICE, values("sense_x", lambda v: np.append(v[:-1], np.inf)), "sense_x: sample 19999"),
+    "rate negative": (DEVICE, attribute("sense_x", "sample_rate", -1e6), "sense_x: sample_rate is -1e+06 Hz"),
+    "rate zero": (DEVICE, attribute("intensity", "sample_rate", 0.0), "intensity: sample_rate is 0 Hz"),
+    "rate missing": (DEVICE, attribute("sense_y", "sample_rate", None), "sense_y: sample_rate is missing"),
+    "rate as text": (DEVICE, attribute("sense_y", "sample_rate", "1 MHz"), "sense_y: sample_rate is '1 MHz'"),
+    "unit missing": (DEVICE, attribute("sense_x", "unit", None), "sense_x: unit is missing"),
+    "unit unknown": (DEVICE, attribute("sense_x", "unit", "Volts DC"), "sense_x: unit 'Volts DC' is unknown"),
+    "channels that do not overlap": (DEVICE, attribute("intensity", "start", 5.0), "intensity"),
+    "newer format": (DEVICE, lambda file: file.attrs.update({"version": 99}), "version"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED_RECORDINGS)
+def test_a_wrong_recording_or_device_is_refused_in_one_line(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    device, change, words = REFUSED_RECORDINGS[case]
+    write(tmp_path / "scan.h5", device, change, DRIVES)
+    refused(["reconstruct", str(tmp_path / "scan.h5"), "--pixels", "40x40"], tmp_path, words, capsys)
+
+
+def refused(arguments: list[str], folder: Path, words: str, capsys: pytest.CaptureFixture) -> None:
+    capsys.readouterr()
+    assert main([*arguments, "-o", str(folder / "out")]) == 2
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.startswith("lissajous ")]
+    assert len(lines) == 1, captured.err
+    assert words in lines[0]
+    assert "Traceback" not in captured.err
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("drive", "words"),
+    [
+        ("swapped", "drive_x: and drive_y are swapped: they move x at 800"),
+        ("rate ten times too large", "as if the sample rate were 10 times the true one"),
+        ("rate in kHz", "as if the sample rate were 0.001 times the true one"),
+    ],
+)
+def test_wrong_drives_are_refused_in_one_line(
+    drive: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    def change(file: h5py.File) -> None:
+        if drive == "swapped":
+            swapped_drives(file)
+        else:
+            for channel in file["channels"].values():
+                channel.attrs["sample_rate"] = RATE * (10.0 if "ten" in drive else 1e-3)
+
+    write(tmp_path / "scan.h5", DEVICE + MECHANICS, change)
+    refused(
+        ["reconstruct", str(tmp_path / "scan.h5"), "--pixels", "40x40", "--estimator", "tracker"],
+        tmp_path,
+        words,
+        capsys,
+    )
+
+
+WARNED: dict[str, tuple[str, Change | None, str]] = {
+    "field a little small": (field(0.09, 0.11), None, "of the samples lie outside the field of view"),
+    "field far too large": (field(0.9, 0.9), None, "the motion covers little of the field of view"),
+    "no field": (DEVICE.partition("[scan]")[0], None, "the field is the motion's own"),
+    "misspelt key": (DEVICE.replace("noise_sd = 1e-4", "noise_sd = 1e-4\noffest = 1.0", 1), None, "x.readout.offest"),
+    "misspelt channel": (DEVICE, lambda file: file.copy("channels/sense_x", "channels/sense_z"), "sense_z"),
+    "millivolts stated as volts": (DEVICE.replace("gain = 1.0", "gain = 1000.0"), None, "covers little of the field"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WARNED)
+def test_a_doubtful_input_makes_a_picture_with_a_warning(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    device, change, words = WARNED[case]
+    write(tmp_path / "scan.h5", device, change, DRIVES)
+    arguments = [str(tmp_path / "scan.h5"), "--pixels", "40x40", "-o", str(tmp_path / "out"), "--json"]
+    assert main(["reconstruct", *arguments]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert any(words in note for note in notes), notes
+
+
+FILES: dict[str, tuple[str, bytes, str]] = {
+    "empty recording": ("scan.h5", b"", "scan.h5"),
+    "text named h5": ("scan.h5", b"Time,CH1\n0,1\n", "scan.h5"),
+    "beginning of a recording": ("scan.h5", b"\x89HDF\r\n\x1a\n" + bytes(40), "scan.h5"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_a_damaged_file_is_refused_in_one_line(case: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    name, content, words = FILES[case]
+    (tmp_path / name).write_bytes(content)
+    refused(["reconstruct", str(tmp_path / name)], tmp_path, words, capsys)
+
+
+def csv(times: list[float], head: str = "Time (s),CH1 (V),CH2 (V)") -> str:
+    return head + "\n" + "".join(f"{t:.9g},{k},{2 * k}\n" for k, t in enumerate(times))
+
+
+EVEN = [k * 1e-6 for k in range(30)]
+TABLES: dict[str, tuple[str, list[str], str]] = {
+    "missing column": (csv(EVEN), ["sense_x=CH7"], "there is no variable 'CH7'; scope.csv holds Time (30,), CH1 (30,)"),
+    "uneven times": (csv([t + 3e-6 * (t > 1e-5) for t in EVEN]), ["sense_x=CH1"], "times are not uniform: sample"),
+    "falling times": (csv(EVEN[::-1]), ["sense_x=CH1"], "its times do not rise"),
+    "equal times": (csv([0.0] * 30), ["sense_x=CH1"], "its times do not rise"),
+    "no times": (csv(EVEN, "A,CH1,CH2"), ["sense_x=CH1"], "no sample_rate"),
+    "current as voltage": (csv(EVEN, "Time (s),CH1 (A),CH2 (V)"), ["sense_x=CH1"], "unit 'A' is unknown"),
+    "names only": ("Time (s),CH1 (V)\n", ["sense_x=CH1"], "holds no table of numbers"),
+    "a word in the table": (csv(EVEN).replace("\n5e-06,5,", "\n5e-06,five,"), ["sense_x=CH1"], "line 7: 'five' is no"),
+    "a short line": (csv(EVEN).replace("\n5e-06,5,10\n", "\n5e-06,5\n"), ["sense_x=CH1"], "line 7 ends after 2 of 3"),
+    "one channel twice": (csv(EVEN), ["sense_x=CH1", "sense_x=CH2"], "repeats a channel"),
+    "detectors of two units": (csv(EVEN, "Time (s),CH1 (V),CH2 (mV)"), ["intensity=CH1,CH2"], "differ in unit"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_a_wrong_table_is_refused_in_one_line(case: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    text, channels, words = TABLES[case]
+    (tmp_path / "scope.csv").write_text(text, encoding="utf-8")
+    options = [word for channel in channels for word in ("--channel", channel)]
+    refused(["convert", str(tmp_path / "scope.csv"), *options], tmp_path, words, capsys)
+
+
+def test_there_are_forty_wrong_inputs() -> None:
+    assert len(REFUSED_RECORDINGS) + len(WARNED) + len(FILES) + len(TABLES) >= 40
