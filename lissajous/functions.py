@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from estimation.diagnosis.predict import Predicted
     from estimation.identification.calibrate import Identification
     from recon.imaging.intensity_drift import DriftKind
+    from recon.imaging.picture_estimate import PictureKind
     from recon.pipeline import Reconstruction
     from recon.scan_design import ScanCandidate, SustainedBand
     from scanner.motion import Motion
@@ -176,6 +177,7 @@ def reconstruct(
     estimator: str | None = None,
     *,
     pixels: tuple[int, int] = (400, 400),
+    picture: PictureKind = "mean",
     p: float = 1.0,
     flip_x: bool = False,
     flip_y: bool = False,
@@ -200,6 +202,8 @@ def reconstruct(
         device: in place of the recording's own.
         estimator: ``"tracker"``, ``"ukf"``, ...; chosen by what was recorded where None.
         pixels: width and height of the picture.
+        picture: value of a pixel: ``"mean"`` of its samples, ``"kernel"``-weighted mean with the samples around, or
+            ``"posterior"`` mean under a smoothness prior.
         p: pixels of displacement that are tolerated; the phase bound is p/m with m half the pixels across.
         flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
         spot: standard deviation of the beam's spot [px], for the account of the blur.
@@ -220,6 +224,7 @@ def reconstruct(
     options = Options(
         estimator=estimator,
         pixels=pixels,
+        picture=picture,
         p=p,
         flips={"x": flip_x, "y": flip_y},
         spot=spot,

@@ -24,7 +24,9 @@ from estimation.estimate import estimate
 from recon.imaging import blur
 from recon.imaging.bidirectional_phase import slow_period
 from recon.imaging.intensity_gridding import grid_intensity
-from recon.imaging.picture import Grid, Picture
+from recon.imaging.picture import Grid
+from recon.imaging.picture_estimate import EstimatedPicture, estimate_picture
+from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, apply_readout_phase, update_readout_phase
 from recon.interrupts import acknowledge_stop
 from recon.io.convert import convert
@@ -54,6 +56,9 @@ LEAD_IN_PERIODS = 30.0
 
 MAX_REPEAT_PERIODS = 4000
 """Periods of the slower axis within which the figure has to repeat."""
+
+NOISE_SAMPLES = 1 << 17
+"""Samples of a frame from which its noise is measured, in some 10 ms: 10^4 pairs determine a variance to 1.5 %."""
 
 SIGN_TEST_SAMPLES = 4096
 """Samples over which the signs of two motions are compared."""
@@ -122,7 +127,9 @@ def follow_recording(
     quiet_time: float = 5.0,
     quiet: bool = False,
 ) -> FollowSummary:
-    """Write the frames of a growing recording as image.tif and image.png into ``output``, each over the previous one.
+    """Write the frames of a growing recording into ``output``, each over the previous one.
+
+    The files are image.tif, image_sd.tif and image.png.
 
     It ends when the writer closes the file, when the file's attribute ``finished`` is true, when the file did not grow
     for ``quiet_time``, or at an interrupt.
@@ -235,8 +242,11 @@ def reconstruct_frame(
     intensity = prepared.intensity
     first = max(0, round((start - intensity.start) * intensity.sample_rate))
     unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), intensity)
-    picture = grid_intensity(estimated.beam, intensity, estimated.grid, unlocated, first)
-    _replace_pictures(output, picture)
+    means = grid_intensity(estimated.beam, intensity, estimated.grid, unlocated, first)
+    noise = measure_noise(estimated.beam, intensity, estimated.grid, NOISE_SAMPLES)
+    _replace_pictures(
+        output, estimate_picture(options.picture, means, noise, estimated.beam, intensity, unlocated, first)
+    )
     if wants_readout_phase(sensed, options):  # after the picture, which therefore comes no later
         known = update_readout_phase(sensed, estimated.motion, measure_phase_errors(estimated), known)
     return PreviousFrame(sensed, estimated.grid, known)
@@ -306,11 +316,13 @@ def _is_opposite(old: AxisMotion, new: AxisMotion) -> bool:
     return float(np.nansum(old.angle.read(first, first + shared) * new.angle.read(0, shared))) < 0.0
 
 
-def _replace_pictures(output: Path, picture: Picture) -> None:
-    """Replace image.tif and image.png, and remove the summary.json of an older run."""
+def _replace_pictures(output: Path, estimate: EstimatedPicture) -> None:
+    """Replace image.tif, image_sd.tif and image.png, and remove the summary.json of an older run."""
     output.mkdir(exist_ok=True)
     (output / "summary.json").unlink(missing_ok=True)
     with replacing(output / "image.tif") as path:
-        write_tiff(path, picture.image, picture.grid)
+        write_tiff(path, estimate.picture.image, estimate.picture.grid)
+    with replacing(output / "image_sd.tif") as path:
+        write_tiff(path, estimate.sd, estimate.picture.grid)
     with replacing(output / "image.png") as path:
-        save_picture(path, picture)
+        save_picture(path, estimate.picture)

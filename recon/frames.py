@@ -13,7 +13,7 @@ import numpy as np
 
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, fill_holes
-from recon.imaging.pixel_noise import pixel_sd
+from recon.imaging.picture_estimate import EstimatedPicture, estimate_picture
 from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
 from recon.pipeline import Options, Reconstruction
@@ -46,14 +46,23 @@ class ScanFrames:
         return len(self.edges) - 1
 
     def __iter__(self) -> Iterator[Picture]:
-        for begin, end in pairwise(self.edges):
-            yield grid_intensity(
-                self.result.beam, self.result.intensity, self.result.picture.grid, self.unlocated, begin, end
-            )
+        for frame in self.estimates():
+            yield frame.picture
 
-    def sd(self, picture: Picture) -> Picture:
-        """The standard deviations of a frame's pixels, as a picture."""
-        return replace(picture, image=pixel_sd(picture, self.result.sample_noise))
+    def estimates(self) -> Iterator[EstimatedPicture]:
+        """Yield the frames with their standard deviations, in the kind of the reconstruction's picture.
+
+        A frame with too few samples for a picture of this kind is NaN.
+        """
+        result = self.result
+        for begin, end in pairwise(self.edges):
+            means = grid_intensity(result.beam, result.intensity, result.picture.grid, self.unlocated, begin, end)
+            data = result.beam, result.intensity, self.unlocated, begin, end
+            try:
+                yield estimate_picture(result.picture_kind, means, result.sample_noise, *data)
+            except BadInput:
+                nothing = np.full(means.image.shape, np.nan, np.float32)
+                yield EstimatedPicture(replace(means, image=nothing), nothing)
 
     @property
     def times(self) -> list[float]:
@@ -71,8 +80,8 @@ class ScanFrames:
 
         xr = import_extra("xarray", "xarray")
         parts = []
-        for picture, time in zip(self, self.times, strict=True):
-            part = picture.to_xarray().assign(image_sd=self.sd(picture).to_xarray()["image"])
+        for frame, time in zip(self.estimates(), self.times, strict=True):
+            part = frame.picture.to_xarray().assign(image_sd=frame.sd_picture.to_xarray()["image"])
             parts.append(part.expand_dims(time=[time]))
         frames: xarray.Dataset = xr.concat(parts, "time")
         frames["time"].attrs = {"units": "s", "long_name": "beginning of the frame"}
@@ -124,11 +133,11 @@ def write_scan_frames(folder: Path, result: Reconstruction, options: Options) ->
             yield replace(picture, image=fill_holes(picture, options.fill_radius)[0])
 
     write_frames(folder / "frames.ome.tif", own, count, frame_time)
-    write_frames(folder / "frames_sd.ome.tif", (own.sd(picture) for picture in own), count, frame_time)
+    write_frames(folder / "frames_sd.ome.tif", (frame.sd_picture for frame in own.estimates()), count, frame_time)
     if options.fill_radius:
         write_frames(folder / "frames_filled.ome.tif", filled(), count, frame_time)
     if options.zarr:
-        pairs = ((picture, own.sd(picture).image) for picture in own)
+        pairs = ((frame.picture, frame.sd) for frame in own.estimates())
         write_ome_zarr(folder / "frames.ome.zarr", pairs, count, frame_time)
     if options.movie:
         shown = filled() if options.fill_radius else iter(own)

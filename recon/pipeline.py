@@ -25,6 +25,7 @@ from recon.imaging.intensity_correction import correct_drift, describe_drift, me
 from recon.imaging.intensity_drift import DriftKind, IntensityDrift
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
 from recon.imaging.picture import Grid, Picture, grid_of_scan
+from recon.imaging.picture_estimate import PictureKind, estimate_picture
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
 from recon.notes import describe_ambiguous_signs, describe_clock_jumps
@@ -59,6 +60,8 @@ class Options:
         pixels: width and height of the picture.
         p: tolerated displacement [px], for the phase bound p/m.
         flips: axes whose sign is inverted.
+        picture: how a pixel's value is found: "mean" of its samples, "kernel"-weighted mean with the samples around, or
+            "posterior" mean under a smoothness prior.
         fill_radius: holes up to this many pixels are filled and marked as filled; 0 fills none.
         spot: standard deviation of the beam's spot [px] for the account of the blur. A recording does not contain it.
         allow_outside: make the picture although most samples lie outside the field of view.
@@ -75,6 +78,7 @@ class Options:
     pixels: tuple[int, int] = (400, 400)
     p: float = 1.0
     flips: Mapping[str, bool] = field(default_factory=dict)
+    picture: PictureKind = "mean"
     fill_radius: int = 0
     spot: float | None = None
     sense_only: bool = False
@@ -93,7 +97,11 @@ class Reconstruction:
     Attributes:
         motion: of the mirror.
         beam: motion of the beam over the sample, which the picture is made with.
-        picture: mean intensity and sample count of each pixel.
+        picture: intensity and sample count of each pixel.
+        picture_kind: as ``picture`` in ``Options``.
+        picture_sd: standard deviation of each pixel, of the shape of the picture; NaN where it is unknown.
+        data_share: weight of the pixel's own samples in its value; None for a picture of means.
+        resolution_px: distance between independent values [px]; None for a picture of means.
         sample_noise: noise of a sample by detector; None where too few pixels were visited twice to measure it.
         p, spot: as in ``Options``.
         phase_errors: phase error of each time slice that forward and backward half-periods show.
@@ -114,6 +122,10 @@ class Reconstruction:
     motion: Motion
     beam: Motion
     picture: Picture
+    picture_kind: PictureKind
+    picture_sd: NDArray[np.float32]
+    data_share: NDArray[np.float32] | None
+    resolution_px: float | None
     sample_noise: Sequence[SampleNoise | None]
     p: float
     spot: float | None
@@ -329,11 +341,17 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
     """Compare the motion with the truth if there is one, and collect the notes."""
     estimated, prepared = gridded.estimated, gridded.estimated.prepared
     motion, intensity = estimated.motion, prepared.intensity
+    noise = measure_noise(estimated.beam, intensity, estimated.grid)
+    estimate = estimate_picture(options.picture, gridded.picture, noise, estimated.beam, intensity, gridded.unlocated)
     return Reconstruction(
         motion=motion,
         beam=estimated.beam,
-        picture=gridded.picture,
-        sample_noise=measure_noise(estimated.beam, intensity, estimated.grid),
+        picture=estimate.picture,
+        picture_kind=options.picture,
+        picture_sd=estimate.sd,
+        data_share=estimate.data_share,
+        resolution_px=estimate.resolution_px,
+        sample_noise=noise,
         p=options.p,
         spot=options.spot,
         phase_errors=estimated.phase_errors or [],
@@ -353,6 +371,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *estimated.motion_notes,
             *describe_ambiguous_signs(motion),
             *describe_defects(prepared.defects),
+            *estimate.notes,
         ],
         intensity=intensity,
         name=prepared.recording.name,

@@ -63,6 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--flip-y", action="store_true", help="turn the sign of y")
     parser.add_argument(
+        "--picture",
+        choices=("mean", "kernel", "posterior"),
+        default="mean",
+        help="value of a pixel: mean of its samples, kernel-weighted mean, or posterior mean (mean)",
+    )
+    parser.add_argument(
         "--fill",
         type=int,
         default=0,
@@ -97,6 +103,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         pixels=args.pixels,
         p=args.p,
         flips={"x": args.flip_x, "y": args.flip_y},
+        picture=args.picture,
         fill_radius=args.fill,
         spot=args.spot,
         sense_only=args.sense_only,
@@ -112,6 +119,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise BadInput("needs frames", channel=option, hint="add --frames or --frame-time")
     if args.zarr:
         import_extra("zarr", "zarr")
+    if args.fill and args.picture != "mean":
+        raise BadInput(f"a {args.picture} picture has no holes", channel="--fill", hint="leave out --fill or --picture")
     if len(args.recordings) > 1 or args.scheduler or args.workers:
         return _run_many(args, options)
     live = None
@@ -163,7 +172,6 @@ def reconstruct_file(
     from recon.evaluation import load_truth
     from recon.frames import write_scan_frames
     from recon.imaging.picture import fill_holes
-    from recon.imaging.pixel_noise import pixel_sd
     from recon.io.convert import open_any
     from recon.io.output import finite, replacing_folder, write_json, write_motion, write_tiff
     from recon.pipeline import reconstruct
@@ -180,8 +188,10 @@ def reconstruct_file(
         summary["conclusion"] = conclude_reconstruction(summary)
         grid, detectors = result.picture.grid, result.picture.detectors
         write_tiff(folder / "image.tif", result.picture.image, grid, detectors)
-        write_tiff(folder / "image_sd.tif", pixel_sd(result.picture, result.sample_noise), grid, detectors)
+        write_tiff(folder / "image_sd.tif", result.picture_sd, grid, detectors)
         write_tiff(folder / "coverage.tif", result.picture.coverage, grid)
+        if result.data_share is not None:
+            write_tiff(folder / "data_share.tif", result.data_share, grid)
         if options.fill_radius:
             image, mask = fill_holes(result.picture, options.fill_radius)
             write_tiff(folder / "filled.tif", image, grid, detectors)

@@ -62,20 +62,25 @@ def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> S
     by_level = [part for part in np.array_split(np.argsort(mean), LEVELS) if part.size]
     level = np.array([mean[part].mean() - dark for part in by_level])
     found = np.array([variance[part].mean() for part in by_level])
+    if not found.any():
+        return SampleNoise(0.0, 0.0, dark)
     sd = np.maximum(found, found.mean() * 1e-6) / np.sqrt([part.size for part in by_level])
     (floor, slope), _ = nnls(np.column_stack([np.ones_like(level), level]) / sd[:, None], found / sd)
     return SampleNoise(float(floor), float(slope), dark)
 
 
-def measure_noise(beam: Motion, intensity: Channel, grid: Grid) -> tuple[SampleNoise | None, ...]:
+def measure_noise(
+    beam: Motion, intensity: Channel, grid: Grid, samples: int = MAX_NOISE_SAMPLES
+) -> tuple[SampleNoise | None, ...]:
     """Noise of a sample of each detector; None where too few pixels were visited twice.
 
     Args:
         beam: motion whose angles are on the intensity's clock.
         intensity: shape (n,) or (n, detectors).
         grid: the pixels.
+        samples: number of samples from the start that are used.
     """
-    count = min(intensity.size, MAX_NOISE_SAMPLES)
+    count = min(intensity.size, samples)
     x, y = (beam.axes[axis].angle.read(0, count) for axis in AXES)
     pixel = find_sample_pixels(x, y, grid)
     values = intensity.read(0, count).reshape(count, -1)

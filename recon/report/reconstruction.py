@@ -54,6 +54,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fi
             scale_bar=bar,
             grey_scale=(f"{limits[0]:.3g} {unit}", f"{limits[1]:.3g} {unit}"),
         ),
+        *uncertainty_figures(result, bar),
         coverage_figure(result.picture.coverage, bar),
     ]
     if result.affected.any():
@@ -94,6 +95,21 @@ def scale_bar(grid: Grid, part: float = 1.0) -> tuple[str, float]:
     power = 10.0 ** math.floor(math.log10(width / 4.0))
     length = max(step * power for step in (1.0, 2.0, 5.0) if step * power <= width / 4.0)
     return f"{length:g} {unit}", length / width
+
+
+def uncertainty_figures(result: Reconstruction, bar: tuple[str, float]) -> list[Figure]:
+    """Standard deviation of each pixel, and the share of its own samples in its value; none where unknown."""
+    figures = []
+    if np.isfinite(result.picture_sd).any():
+        limits = 0.0, contrast_limits(result.picture_sd)[1]
+        image, unit = data_uri(encode_png(to_rgb(result.picture_sd, limits))), result.intensity.unit
+        caption = "standard deviation of each pixel; blue: unknown"
+        figures.append(Figure(image, caption, scale_bar=bar, grey_scale=("0", f"{limits[1]:.3g} {unit}")))
+    if result.data_share is not None:
+        image = data_uri(encode_png(to_rgb(result.data_share, (0.0, 1.0))))
+        caption = "share of a pixel's own samples in its value; black: the value follows from other pixels only"
+        figures.append(Figure(image, caption, scale_bar=bar, grey_scale=("0", "1")))
+    return figures
 
 
 def coverage_figure(coverage: NDArray[Any], bar: tuple[str, float]) -> Figure:

@@ -121,6 +121,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         **axes,
         "detectors": list(result.picture.detectors),
         "fill": fill_factor(result.picture.coverage),
+        "resolution_px": result.resolution_px,
         "seconds_to_fill": seconds_to_fill(result),
         "samples": int(result.picture.coverage.sum()),
         "outside": result.picture.outside,

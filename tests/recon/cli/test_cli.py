@@ -36,6 +36,31 @@ def changed(scan: Path, folder: Path, change) -> Path:
     return path
 
 
+@pytest.mark.parametrize("kind", ["kernel", "posterior"])
+def test_a_picture_of_another_kind_comes_with_its_uncertainty(kind: str, scan: Path, tmp_path: Path) -> None:
+    command = ["reconstruct", str(scan), "-o", str(tmp_path / "out"), "--pixels", "120x100", "--estimator", "ekf"]
+    assert main([*command, "--picture", kind, "--frames", "4"]) == 0
+    image, sd, share = (
+        tifffile.imread(tmp_path / "out" / f"{name}.tif") for name in ("image", "image_sd", "data_share")
+    )
+    visited = tifffile.imread(tmp_path / "out" / "coverage.tif") > 0
+    assert image.shape == sd.shape == share.shape == (100, 120)
+    assert np.isfinite(image).mean() > 0.99
+    assert (sd[np.isfinite(image)] > 0).all()
+    assert np.array_equal(share > 0, visited)
+    frames, deviations = (tifffile.imread(tmp_path / "out" / name) for name in ("frames.ome.tif", "frames_sd.ome.tif"))
+    assert frames.shape == deviations.shape == (4, 100, 120)
+    assert np.nanmedian(deviations) > np.nanmedian(sd)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["resolution_px"] > 1.0
+    assert "share of a pixel" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_posterior_picture_has_no_holes_to_fill(scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["reconstruct", str(scan), "-o", str(tmp_path / "out"), "--picture", "posterior", "--fill", "2"]) == 2
+    assert "--fill" in capsys.readouterr().err
+
+
 def test_reconstruct_writes_the_documented_files_and_keys(
     scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -1,0 +1,95 @@
+"""Sums and counts of the samples by pixel, with a tenth of the samples held out to choose widths and judge errors."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.arrays import Array
+
+HELD_OUT_FRACTION = 0.1
+"""Fraction of the samples that are held out: enough to judge a picture by, few enough to leave it as it is."""
+
+HELD_OUT_SAMPLES = 32
+"""Consecutive samples that are held out together. Their pixels then have no neighbour of the same pass, and errors in
+them are as large as in pixels that the scan did not visit."""
+
+MAX_HELD_OUT_SEGMENTS = 512
+"""Segments that are held out at most: 32 768 samples judge a picture to 1 %, and the cost remains bounded."""
+
+GOLDEN_RATIO = 0.618
+"""Step of the segments' position within their part of the scan, which no period of the scan is in step with."""
+
+
+class SplitSums(NamedTuple):
+    """Samples of one detector by pixel.
+
+    Attributes:
+        sums, counts: of all samples, shape (height, width).
+        held_sums, held_counts: of the samples held out, which are part of ``sums`` and ``counts``.
+    """
+
+    sums: Array
+    counts: Array
+    held_sums: Array
+    held_counts: Array
+
+    @property
+    def kept_sums(self) -> Array:
+        """Sums of the samples that are not held out."""
+        return self.sums - self.held_sums
+
+    @property
+    def kept_counts(self) -> Array:
+        """Counts of the samples that are not held out."""
+        return self.counts - self.held_counts
+
+
+def held_out_ranges(first: int, stop: int) -> list[tuple[int, int]]:
+    """Return the samples that are held out of ``first`` up to ``stop``, in segments spread over all of them."""
+    size = stop - first
+    count = min(int(HELD_OUT_FRACTION * size / HELD_OUT_SAMPLES), MAX_HELD_OUT_SEGMENTS)
+    free = size / count - HELD_OUT_SAMPLES if count else 0.0
+    begins = [first + int(k * size / count + free * (GOLDEN_RATIO * k % 1.0)) for k in range(count)]
+    return [(begin, begin + HELD_OUT_SAMPLES) for begin in begins]
+
+
+def pixel_means(sums: Array, counts: Array) -> Array:
+    """Return the mean of each pixel, 0 where there is no sample."""
+    return np.divide(sums, counts, out=np.zeros(sums.shape), where=counts > 0)
+
+
+def log_average(values: Array, misfits: Array) -> tuple[float, Array]:
+    """Return the average of a positive setting under its likelihood, and the weights of its values.
+
+    An average changes less than the best value does where the samples hardly distinguish the values.
+
+    Args:
+        values: of the setting, evenly spaced in its logarithm, shape (n,).
+        misfits: sum of squares of the held-out samples in units of their variance, shape (n,).
+    """
+    weights = np.exp(-0.5 * (misfits - misfits.min()))
+    weights /= weights.sum()
+    return float(np.exp(weights @ np.log(values))), weights
+
+
+def excess_variance(
+    residual: Array, noise: Array, predicted: Array, density: NDArray[np.floating]
+) -> tuple[float, float]:
+    """Return the error variance of held-out pixels as a multiple of the predicted one, and its standard deviation.
+
+    Pixels where samples are dense count less, so that all parts of the picture count alike.
+
+    Args:
+        residual: mean of the held-out samples less the picture without them, shape (n,).
+        noise: variance of that mean, shape (n,).
+        predicted: variance of the picture, shape (n,).
+        density: fraction of visited pixels around, shape (n,).
+    """
+    weight = 1.0 / (density * (noise + predicted.mean()) ** 2)
+    total = weight @ predicted
+    ratio = float(weight @ (residual**2 - noise) / total)
+    scatter = 2.0 * weight * (noise + max(ratio, 0.5) * predicted)  # twice: neighbours in a segment err together
+    return ratio, float(np.sqrt(scatter @ scatter) / total)

@@ -1,0 +1,154 @@
+"""The picture of a scan in one of three kinds: mean of each pixel, kernel-weighted mean, or posterior mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.imaging.held_out import SplitSums, held_out_ranges
+from recon.imaging.intensity_gridding import grid_intensity
+from recon.imaging.kernel_picture import PictureEstimate, kernel_picture
+from recon.imaging.picture import Picture
+from recon.imaging.pixel_noise import SampleNoise, pixel_sd
+from recon.imaging.posterior_picture import posterior_picture
+from recon.sample_ranges import SampleRanges, subtract_ranges
+from scanner.channel import Channel
+from scanner.errors import BadInput
+from scanner.motion import Motion
+
+PictureKind = Literal["mean", "kernel", "posterior"]
+"""How a pixel's value is found."""
+
+PICTURE_KINDS: tuple[str, ...] = get_args(PictureKind)
+"""The names of the kinds."""
+
+ESTIMATORS: Mapping[str, Callable[[SplitSums, SampleNoise], PictureEstimate]] = {
+    "kernel": kernel_picture,
+    "posterior": posterior_picture,
+}
+"""Estimators that use the neighbours of a pixel."""
+
+MIN_SPREAD_PX = 1.0
+"""Smallest standard deviation of the visited pixels across any direction. Below it the samples lie on one line."""
+
+MAX_FLAT_EXCESS_SD = 4.0
+"""Scatter of the pixels' means beyond their noise, in its standard deviations, up to which a scene is called flat."""
+
+
+@dataclass(frozen=True)
+class EstimatedPicture:
+    """A picture with its uncertainty.
+
+    Attributes:
+        picture: image, and the sample count of each pixel.
+        sd: standard deviation of the image, of its shape; NaN where there is no value or no measured noise.
+        data_share: weight of the pixel's own samples in its value, 0 where it was not visited, of the shape of the
+            image; None for a picture of means.
+        resolution_px: distance between independent values [px]; None for a picture of means.
+        notes: limits of the picture, a line each.
+    """
+
+    picture: Picture
+    sd: NDArray[np.float32]
+    data_share: NDArray[np.float32] | None = None
+    resolution_px: float | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def sd_picture(self) -> Picture:
+        """The standard deviations as a picture."""
+        return replace(self.picture, image=self.sd)
+
+
+def estimate_picture(
+    kind: str,
+    means: Picture,
+    noise: Sequence[SampleNoise | None],
+    beam: Motion,
+    intensity: Channel,
+    unlocated: SampleRanges,
+    first: int = 0,
+    stop: int | None = None,
+) -> EstimatedPicture:
+    """Return the picture of the samples ``first`` up to ``stop`` in the wanted kind.
+
+    Args:
+        kind: one of ``PICTURE_KINDS``.
+        means: picture of the means of these samples.
+        noise: of a sample, by detector.
+        beam, intensity, unlocated, first, stop: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
+
+    Raises:
+        BadInput: no such kind, or the samples determine no picture of this kind.
+    """
+    if kind not in PICTURE_KINDS:
+        raise BadInput(f"no picture is called {kind!r}", channel="picture", hint=f"give {', '.join(PICTURE_KINDS)}")
+    if kind == "mean":
+        return EstimatedPicture(means, pixel_sd(means, noise))
+    _require_spread(means)
+    stop = intensity.size if stop is None else stop
+    kept = subtract_ranges([(first, stop)], subtract_ranges(held_out_ranges(first, stop), unlocated))
+    held = grid_intensity(beam, intensity, means.grid, kept, first, stop)
+    estimates = [
+        _estimate_detector(kind, samples, detector_noise)
+        for samples, detector_noise in zip(_split_sums(means, held), noise, strict=True)
+    ]
+    image, sd, share = (
+        np.stack([getattr(each, name) for each in estimates], -1).astype(np.float32).reshape(means.image.shape)
+        for name in ("image", "sd", "data_share")
+    )
+    resolution = max(each.resolution for each in estimates)
+    notes = [
+        f"the picture is a {kind} estimate: detail finer than {resolution:.1f} pixels is not data but assumed to be "
+        f"smooth; {np.mean(means.coverage == 0):.0%} of the pixels hold no sample, and their values follow from others"
+    ]
+    if not np.isfinite(image).all():
+        notes.append(f"{np.mean(np.isnan(image)):.1%} of the pixels are too far from any sample and have no value")
+    if any(_is_flat(samples, each) for samples, each in zip(_split_sums(means, held), noise, strict=True)):
+        notes.append("intensity: no structure beyond the noise was found; the picture is flat within its uncertainty")
+    return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes)
+
+
+def _estimate_detector(kind: str, samples: SplitSums, noise: SampleNoise | None) -> PictureEstimate:
+    means = samples.sums[samples.counts > 0] / samples.counts[samples.counts > 0]
+    hint = "use --picture mean"
+    if np.ptp(means) == 0.0:
+        raise BadInput(f"every sample is {means[0]:g}: there is nothing to estimate", channel="intensity", hint=hint)
+    if noise is None or not samples.held_counts.any():
+        what = f"the scan is too short for --picture {kind}: too few pixels were visited twice to measure the noise"
+        raise BadInput(what, channel="intensity", hint=f"record longer, ask for fewer pixels or {hint}")
+    return ESTIMATORS[kind](samples, noise)
+
+
+def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:
+    """Sums and counts by detector."""
+    parts = []
+    for picture in (means, held):
+        images = picture.image.reshape(*picture.coverage.shape, -1).astype(np.float64)
+        counts = picture.coverage.astype(np.float64)
+        parts.append((np.moveaxis(np.nan_to_num(images) * counts[..., None], -1, 0), counts))
+    (sums, counts), (held_sums, held_counts) = parts
+    return [SplitSums(each, counts, other, held_counts) for each, other in zip(sums, held_sums, strict=True)]
+
+
+def _require_spread(means: Picture) -> None:
+    """Require samples that spread over the picture in every direction."""
+    places = np.argwhere(means.coverage > 0).astype(float)
+    spread = np.linalg.eigvalsh(np.cov(places.T))[0] if len(places) > 2 else 0.0
+    if not spread > MIN_SPREAD_PX**2:
+        what = "all samples lie on one line, which determines no picture"
+        raise BadInput(what, channel="intensity", hint="check the motion of both axes or use --picture mean")
+
+
+def _is_flat(samples: SplitSums, noise: SampleNoise | None) -> bool:
+    """Whether the means of the pixels scatter as the noise of the samples lets expect."""
+    counts = samples.counts[samples.counts > 0]
+    means, mean = samples.sums[samples.counts > 0] / counts, samples.sums.sum() / counts.sum()
+    if noise is None or not (variance := float(noise.variance(np.asarray(mean)))) > 0:
+        return False
+    excess = float(np.mean(counts * (means - mean) ** 2)) / variance - 1.0
+    return excess < MAX_FLAT_EXCESS_SD * float(np.sqrt(2.0 / counts.size))
