@@ -34,7 +34,8 @@ def default_estimator(recording: Recording, device: Device) -> str:
         f"drive_{name}" in recording or (axis.drive is not None and axis.drive.frequency is not None)
         for name, axis in device.axes.items()
     )
-    measured = any(f"{kind}_{axis}" in recording for axis in device.axes for kind in ("sense", "angle"))
+    kinds = ("sense", "angle", "amplitude")
+    measured = any(f"{kind}_{axis}" in recording for axis in device.axes for kind in kinds)
     return "picture" if driven and not measured else "sensor"
 
 

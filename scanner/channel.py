@@ -36,6 +36,7 @@ CHANNEL_UNITS = {
     "angle_x": "rad", "angle_y": "rad",
     "velocity_x": "rad/s", "velocity_y": "rad/s",
     "acceleration_x": "rad/s2", "acceleration_y": "rad/s2",
+    "phase_x": "rad", "phase_y": "rad",
     "range": "m",
 }  # fmt: skip
 """Unit of the samples that a channel returns, by its name. Other channels keep the unit that they were recorded in."""
@@ -48,6 +49,13 @@ CONVERSIONS = {
     "rad/s2": {"rad/s2": 1.0, "rad/s²": 1.0, "rad/s^2": 1.0, "mrad/s2": 1e-3, "deg/s2": pi / 180},
 }
 """Accepted units for each unit of ``CHANNEL_UNITS``, with the factor that converts to it."""
+
+
+AMPLITUDE_CHANNELS = ("amplitude_x", "amplitude_y")
+"""Amplitudes of a lock-in amplifier or an envelope detector: an angle, or a voltage behind the device's readout."""
+
+DBM_LEVEL_V = float(np.sqrt(2.0 * 50.0 * 1e-3))
+"""Amplitude of a sine of 1 mW in 50 ohm [V]: 0 dBm as spectrum analysers and lock-in amplifiers state it."""
 
 
 class SampleSource(Protocol):
@@ -98,6 +106,7 @@ class Channel:
         gain, offset: conversion of raw samples to the unit.
         file: where the channel came from, for messages.
         detectors: names of the columns, where they are stated.
+        reference: of a lock-in amplifier's output, its frequency [Hz] or the name of the channel that holds it.
     """
 
     name: str
@@ -111,6 +120,7 @@ class Channel:
     offset: float = 0.0
     file: str | None = None
     detectors: tuple[str, ...] = ()
+    reference: float | str | None = None
 
     @property
     def size(self) -> int:
@@ -173,6 +183,8 @@ def make_channel(
     offset: object = 0.0,
     file: str | None = None,
     detectors: object = (),
+    reference: object = None,
+    level: object = None,
 ) -> Channel:
     """Return a channel after checking everything stated about it, in the unit that belongs to its name.
 
@@ -185,6 +197,8 @@ def make_channel(
         gain, offset: conversion of raw samples to ``unit``.
         file: for messages.
         detectors: names of the columns: a sequence of texts, or one text with commas; none if empty.
+        reference: of ``amplitude_x`` and ``phase_x``: frequency [Hz] or the name of the channel that holds it.
+        level: amplitude at 0 dB, of ``amplitude_x`` in dB or dBm [V]; ``DBM_LEVEL_V`` by default for dBm.
 
     Raises:
         UnitUnknown: the unit is missing or cannot be converted to that of the channel.
@@ -217,13 +231,29 @@ def make_channel(
         raise bad(f"starts at {first_time:g} s, where its samples have one and the same time", "state start near 0")
     if slope == 0:
         raise bad("gain is 0, which leaves nothing of the samples", "state value = gain * raw + offset")
+    if reference is not None and not isinstance(reference, str) and not (_is_number(reference) and reference > 0.0):  # type: ignore[operator]
+        raise bad(f"reference is {reference!r}", "state a frequency in Hz, or the name of the channel that holds it")
+    if name in AMPLITUDE_CHANNELS and unit in ("dB", "dBm"):
+        level = DBM_LEVEL_V if level is None and unit == "dBm" else level
+        if not _is_number(level) or not level > 0.0:  # type: ignore[operator]
+            raise bad("level is missing for an amplitude in dB", "state level, the amplitude in V at 0 dB")
+        raw, unit, slope, zero = _linear_samples(raw, slope, zero, float(level)), "V", 1.0, 0.0  # type: ignore[arg-type]
     channel_unit, factor = _channel_unit(name, unit, file)
     names = _detector_names(detectors)
     columns = raw.shape[1] if raw.ndim == 2 else 1
     if names and (len(names) != columns or len(set(names)) != len(names) or not all(names)):
         raise bad(f"names the detectors {', '.join(names)}", f"give {columns} different names, one for each detector")
     gain, offset = slope * factor, zero * factor
-    return Channel(name, channel_unit, rate, first_time, raw, 0, raw.shape[0], gain, offset, file, names)
+    return Channel(name, channel_unit, rate, first_time, raw, 0, raw.shape[0], gain, offset, file, names, reference)  # type: ignore[arg-type]
+
+
+def _linear_samples(raw: SampleSource, gain: float, offset: float, level: float) -> LazySamples:
+    """Samples ``level * 10^((gain raw + offset) / 20)`` of an amplitude in dB, computed when they are read."""
+
+    def fetch(first: int, stop: int) -> NDArray[Any]:
+        return level * 10.0 ** ((gain * np.asarray(raw[first:stop], np.float64) + offset) / 20.0)
+
+    return LazySamples(raw.shape, np.dtype(np.float64), fetch)
 
 
 def _detector_names(stated: object) -> tuple[str, ...]:
@@ -283,6 +313,13 @@ def _is_number(value: object) -> bool:
 
 def _channel_unit(name: str, unit: object, file: str | None) -> tuple[str, float]:
     """The unit of the samples that the channel returns, and the factor that converts to it."""
+    if name in AMPLITUDE_CHANNELS:
+        for channel_unit in ("rad", "V"):
+            if unit in CONVERSIONS[channel_unit]:
+                return channel_unit, CONVERSIONS[channel_unit][str(unit)]
+        what = "unit is missing" if unit is None else f"unit {unit!r} is unknown"
+        hint = f"accepted units: {', '.join((*CONVERSIONS['rad'], *CONVERSIONS['V'], 'dB', 'dBm'))}"
+        raise UnitUnknown(what, file=file, channel=name, hint=hint)
     if name not in CHANNEL_UNITS:
         return (unit if isinstance(unit, str) else ""), 1.0
     channel_unit = CHANNEL_UNITS[name]

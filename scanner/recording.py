@@ -108,7 +108,8 @@ class Recording:
             channels: name -> (values, unit, sample rate [Hz]) or (values, unit, sample rate [Hz], start [s]). Values
                 have the shape (n,), or (n, detectors) for ``intensity``; start is the time of the first sample, 0
                 where it is left out. Channels may differ in sample rate, start and length. ``sync_x`` and ``sync_y``
-                are (edge times, unit, attributes), as ``(times, "s", {"event": "both-edges", "angle": 0.01})``.
+                are (edge times, unit, attributes), as ``(times, "s", {"event": "both-edges", "angle": 0.01})``. After
+                start, ``amplitude_x`` and ``phase_x`` may have {"reference": ..., "level": ...} as well.
             device: the nominal device.
             name: of the recording.
             detectors: names of the columns of ``intensity``.
@@ -125,15 +126,18 @@ class Recording:
             if key in EDGE_CHANNELS:
                 edges[key] = _edges_from_tuple(key, channel)
                 continue
-            if not isinstance(channel, tuple) or len(channel) not in (3, 4):
+            if not isinstance(channel, tuple) or len(channel) not in (3, 4, 5):
                 raise BadInput(
                     "is not a tuple of 3 or 4 items", channel=key, hint="give (values, unit, sample rate[, start])"
                 )
-            values, unit, sample_rate, *start = channel
+            stated = channel[-1] if isinstance(channel[-1], Mapping) else {}
+            values, unit, sample_rate, *start = channel[: len(channel) - bool(stated)]
             raw = _as_numbers(values, key).view()
             raw.flags.writeable = False
             first, names = start[0] if start else 0.0, detectors if key == "intensity" else ()
-            made[key] = make_channel(key, raw, unit=unit, sample_rate=sample_rate, start=first, detectors=names)
+            made[key] = make_channel(
+                key, raw, unit=unit, sample_rate=sample_rate, start=first, detectors=names, **stated
+            )
         attrs = ({} if name is None else {"name": name}) | attrs
         text = None if device is None else device.to_toml()
         return cls(MappingProxyType(made), MappingProxyType(attrs), device_toml=text, edges=MappingProxyType(edges))
@@ -308,7 +312,9 @@ def _open_channel(group: h5py.Group, name: str, path: Path) -> Channel:
         raise BadInput("is listed and not there", file=path, channel=name, hint="copy the file again")
     stated = attributes(dataset)
     required = {key: stated.get(key) for key in ("unit", "sample_rate")}
-    optional = {key: stated[key] for key in ("start", "gain", "offset", "detectors") if key in stated}
+    optional = {
+        key: stated[key] for key in ("start", "gain", "offset", "detectors", "reference", "level") if key in stated
+    }
     return make_channel(name, dataset, file=str(path), **required, **optional)
 
 
@@ -335,6 +341,8 @@ def _write_channel(group: h5py.Group, channel: Channel) -> None:
         else:
             dataset[first:stop] = channel.read(first, stop)
     dataset.attrs.update({"unit": channel.unit, "sample_rate": channel.sample_rate, "start": channel.start})
+    if channel.reference is not None:
+        dataset.attrs["reference"] = channel.reference
     if channel.detectors:
         dataset.attrs["detectors"] = list(channel.detectors)
     if whole and not plain:

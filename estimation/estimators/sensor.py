@@ -17,7 +17,7 @@ def run(recording: Recording, device: Device) -> Motion:
 ESTIMATOR = Estimator(
     name="sensor",
     summary="angles as the angle channels or the position readouts give them, without a filter",
-    needs="an angle channel or a position readout of every axis",
+    needs="an angle channel, a position readout, or `amplitude_x` with `phase_x`, of every axis",
     use_when="a position sensor whose noise is smaller than a pixel, or a motion that is not a sine",
     run=run,
     source="none",

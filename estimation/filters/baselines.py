@@ -9,6 +9,7 @@ import numpy as np
 
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
 from estimation.initial import fit_initial_motion
+from estimation.lock_in_channels import lock_in_angle
 from estimation.reference import PhaseReference, absolute_reference, dominant_frequency
 from estimation.signals import (
     NOISE_SAMPLES,
@@ -19,7 +20,7 @@ from estimation.signals import (
     white_noise_sd,
 )
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal
+from scanner.channel import Channel, check_signal, make_channel
 from scanner.device import Axis, Device, Position
 from scanner.errors import BadInput, ChannelMissing
 from scanner.lock_in import block_length, block_phasors, unwrap_phase
@@ -78,6 +79,13 @@ def estimate_from_sensor(recording: Recording, device: Device) -> Motion:
 
 def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> AxisMotion:
     """Motion of one axis; as :func:`estimate_from_sensor`."""
+    measured = any(f"{kind}_{name}" in recording for kind in ("sense", "angle"))
+    if f"amplitude_{name}" in recording and "intensity" in recording and not measured:
+        light = recording["intensity"]
+        angle = lock_in_angle(recording, device.axis(name), light.time())
+        channel = make_channel(f"phase_{name}", angle, unit="rad", sample_rate=light.sample_rate, start=light.start)
+        reference = reference_of_any_waveform(recording, device, name, channel)
+        return axis_motion_from_angle(angle, channel, reference, None, intensity_clock(recording, channel))
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel)
     angle = (channel.read() - zero) / scale

@@ -43,7 +43,7 @@ from scanner.recording import Recording
 
 TEXT_KEYS = ("format", "name", "notes", "acquired")
 MAPPING_KEYS = (*TEXT_KEYS, "channels", "device")
-CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "offset", "row")
+CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "offset", "row", "reference", "level")
 EDGE_KEYS = ("variable", "unit", "event", "angle", "hysteresis")
 
 Plan = Mapping[str, Any]
@@ -221,7 +221,10 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
             raise bad(f"there is no row {spec['row']!r} of {spec['variable']!r}", f"count from 0; {holds}")
         raw = matrix_row(raw, spec["row"])
     file = f"{source} by {plan_source}"
-    return make_channel(name, raw, unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file)
+    lock_in = {key: spec.get(key) for key in ("reference", "level")}
+    return make_channel(
+        name, raw, unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file, **lock_in
+    )
 
 
 def _edges(name: str, spec: Any, contents: Contents, source: Path, plan_source: object) -> Edges:

@@ -25,7 +25,7 @@ from recon.cli import COMMANDS, main
 from recon.io import convert
 from recon.io.readers import readers
 from recon.study import plan, table
-from scanner.channel import CHANNEL_UNITS
+from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS
 from scanner.device import READOUTS, Capacitance, Device, Drive, Mechanics, Scan
 from scanner.edges import EDGE_CHANNELS
 from tests.support.simulated import imaging
@@ -88,7 +88,7 @@ def test_every_key_of_a_device_is_in_the_reference(tables: ModuleType) -> None:
 
 
 def test_every_channel_format_and_mapping_key_is_in_the_reference() -> None:
-    assert missing((*CHANNEL_UNITS, *EDGE_CHANNELS, "intensity"), page("recording")) == []
+    assert missing((*CHANNEL_UNITS, *EDGE_CHANNELS, *AMPLITUDE_CHANNELS, "intensity"), page("recording")) == []
     assert (
         missing((*readers(), *convert.TEXT_KEYS, *convert.CHANNEL_KEYS, *convert.EDGE_KEYS), page("instrument_files"))
         == []

@@ -1,0 +1,132 @@
+"""Decays diagnosed by their amplitude: simulated laws, measured membranes, long waveforms; lock-in channels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.diagnosis.diagnose import Diagnosis
+from estimation.estimate import default_estimator, estimate
+from estimation.slow.decay import solve_decay
+from phantoms.forward import InitialState, Plan, simulate
+from phantoms.waveforms import Constant
+from recon.cli import main
+from scanner.channel import DBM_LEVEL_V
+from scanner.device import Axis, Device, Mechanics, Position
+from scanner.errors import BadInput, UnitUnknown
+from scanner.recording import Recording
+
+W = 2 * np.pi * 5000.0
+DEVICE = Device(
+    "beam", {"x": Axis(Mechanics(1e-10, 1e-10 * W / 2e4, 1e-10 * W**2), readout=Position(10.0, 1e-3), name="x")}
+)
+
+
+def diagnosed(coefficient: float, power: float, seed: int = 1, unit: str = "rad") -> Diagnosis:
+    """A decay over 8 s from 0.1 rad; ``coefficient``: rate that a law adds at the first amplitude [1/s]."""
+    rng, time = np.random.default_rng(seed), np.arange(0.0, 8.0, 0.01)
+    rate = 8.0 * W / 2e4 / 2.0
+    log_a = np.interp(
+        time / 8.0, np.linspace(0, 1, 2001), solve_decay(0.0, rate, 8.0 * coefficient, power, 0.0, 1.0, 2000)
+    )
+    amplitude = 0.1 * np.exp(log_a) * (1.0 + 1e-4 * rng.normal(size=time.size))
+    values = amplitude if unit == "rad" else 10.0 * amplitude if unit == "V" else 20.0 * np.log10(10.0 * amplitude)
+    extra = {"reference": 5000.0} | ({"level": 1.0} if unit == "dB" else {})
+    return diagnose_with_optics([Recording.from_arrays({"amplitude_x": (values, unit, 100.0, 0.0, extra)}, DEVICE)])
+
+
+@pytest.mark.parametrize("unit", ["rad", "V", "dB"])
+def test_cubic_damping_is_named_with_its_size_in_every_unit(unit: str) -> None:
+    found = diagnosed(0.5, 2.0, unit=unit)
+    (finding,) = found.findings
+    assert finding.effect == "cubic-damping"
+    assert finding.share is not None
+    assert finding.share > 0.99
+    true = 8.0 * 1e-10 * 0.5 / 0.1**2  # b3 = 8 J c / A0²
+    (b3,) = finding.parameters
+    assert b3.value == pytest.approx(true, rel=0.1)
+    assert found.device.axes["x"].terms["cubic-damping"]["b3"] == b3.value
+    assert [rival.effect for rival in finding.rivals][-1] == "gain-drift"
+    assert "record another amplitude" in str(finding.advice)
+
+
+@pytest.mark.parametrize(("effect", "power"), [("quadratic-drag", 1.0), ("coulomb-friction", -1.0)])
+def test_other_laws_are_named(effect: str, power: float) -> None:
+    assert [finding.effect for finding in diagnosed(0.2, power).findings] == [effect]
+
+
+def test_constant_damping_is_consistent_and_takes_its_value() -> None:
+    found = diagnosed(0.0, 1.0)
+    assert (found.verdict, found.findings) == ("consistent", ())
+    mechanics = found.device.axes["x"].mechanics
+    assert mechanics is not None
+    assert mechanics.b == pytest.approx(1e-10 * W / 2e4, rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_improved_device_decays_as_the_recording() -> None:
+    device = Device.from_toml(DEVICE.with_terms({"x": {"cubic-damping": {"b3": 8e-8}}}).to_toml())
+    plan = Plan({"x": Constant(0.0)}, 1.5, 1e5)
+    recording, _ = simulate(device, plan, start={"x": InitialState(0.1, 0.0)}, nominal=DEVICE, seed=3)
+    channels = {"sense_x": (recording["sense_x"].read(), "V", 1e5)}
+    found = diagnose_with_optics([Recording.from_arrays(channels, DEVICE)])  # 7500 turns, by their amplitude
+    (finding,) = found.findings
+    assert finding.effect == "cubic-damping"
+    assert finding.parameters[0].value == pytest.approx(8e-8, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("number", "effects"), [(3716, ["cubic-damping"]), (1448, ["cubic-damping"]), (505, []), (1721, [])]
+)
+def test_measured_membranes(measured_data: Path, number: int, effects: list[str]) -> None:
+    (file,) = (measured_data / "membranes").glob(f"measID_{number}_*.txt")
+    time, power = np.loadtxt(file, comments="%", delimiter=",").T
+    channels = {"amplitude_x": (power, "dBm", 1.0 / (time[1] - time[0]), time[0], {"reference": 1.4e6})}
+    found = diagnose_with_optics([Recording.from_arrays(channels, DEVICE)])
+    assert [finding.effect for finding in found.findings] == effects
+    assert all(finding.share is not None and finding.share > 0.9 for finding in found.findings)
+
+
+def test_the_command_diagnoses_an_envelope(tmp_path: Path) -> None:
+    time = np.arange(0.0, 8.0, 0.01)
+    channels = {"amplitude_x": (-10.0 - 8.0 * time, "dBm", 100.0, 0.0, {"reference": 5000.0})}
+    Recording.from_arrays(channels, DEVICE).write(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["channels/amplitude_x"].attrs["reference"] == 5000.0
+    with Recording.open(tmp_path / "a.h5") as made:
+        assert made["amplitude_x"].read()[0] == pytest.approx(DBM_LEVEL_V * 10**-0.5)
+    assert main(["diagnose", str(tmp_path / "a.h5"), "-o", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out/report.html").is_file()
+
+
+def test_amplitudes_without_level_or_with_another_unit_are_refused() -> None:
+    with pytest.raises(BadInput, match="level is missing for an amplitude in dB"):
+        Recording.from_arrays({"amplitude_x": (np.ones(9), "dB", 1.0)})
+    with pytest.raises(UnitUnknown, match="unit 'm' is unknown"):
+        Recording.from_arrays({"amplitude_x": (np.ones(9), "m", 1.0)})
+    with pytest.raises(BadInput, match="reference is -1"):
+        Recording.from_arrays({"phase_x": (np.ones(9), "rad", 1.0, 0.0, {"reference": -1})})
+    with pytest.raises(BadInput, match="shows no free decay"):
+        diagnose_with_optics([Recording.from_arrays({"amplitude_x": (np.arange(1.0, 99), "V", 1.0)}, DEVICE)])
+
+
+@pytest.mark.parametrize("reference", [700.0, "frequency"])
+def test_lock_in_channels_are_a_sensor(reference: float | str) -> None:
+    slow, time = np.arange(0.0, 0.2, 1e-3), np.arange(20_000) / 1e5
+    extra = {"reference": reference}
+    channels = {
+        "intensity": (time, "V", 1e5),
+        "amplitude_x": (0.1 - 0.1 * slow, "rad", 1e3, 0.0, extra),
+        "phase_x": (np.angle(np.exp(1j * 20.0 * slow)), "rad", 1e3, 0.0, extra),
+        "frequency": (np.full(slow.size, 700.0), "Hz", 1e3),
+    }
+    recording = Recording.from_arrays(channels, Device.from_toml("[x]\n"))
+    assert default_estimator(recording, recording.device) == "sensor"
+    axis = estimate(recording).axes["x"]
+    true = (0.1 - 0.1 * time) * np.sin(2 * np.pi * 700.0 * time + 20.0 * time)
+    assert np.abs(axis.angle.read() - true)[: 199 * 100].max() < 1e-6
+    assert axis.sign == "known: phase_x"
