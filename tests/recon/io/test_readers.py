@@ -21,24 +21,9 @@ from recon.io.readers import detect_format, read, readers
 from scanner.errors import BadInput
 from scanner.files import parse_toml
 from scanner.recording import Recording
+from tests.support.instrument_files import TEKTRONIX, stated_metadata, write_text
 
 VALUES = np.array([0.25, -1.5, 3.0, 0.125, 7.0, -0.5])
-
-
-def text(path: Path, content: str) -> Path:
-    path.write_text(content)
-    return path
-
-
-def stated_metadata(path: Path) -> dict[str, tuple]:
-    """Variable -> unit, sample rate, start and the first two samples, as the file states them."""
-    contents = read(path)
-    try:
-        return {
-            name: (v.unit, v.sample_rate, v.start, list(np.ravel(v.raw[:2]))) for name, v in contents.variables.items()
-        }
-    finally:
-        contents.close()
 
 
 # --- real files ---------------------------------------------------------------------------------------------------
@@ -191,99 +176,6 @@ def test_hdf5_files_keep_dimensions_and_external_links_are_refused(tmp_path: Pat
         read(tmp_path / "b.h5")
 
 
-TEKTRONIX = """\
-Model,MDO4014B-3
-Firmware Version,3.22
-
-Horizontal Units,s
-Sample Interval,4e-10
-Record Length,3
-Vertical Units,V,mV
-Label,,
-TIME,CH2,CH3
--4.0000000e-03,3.34,1
--3.9999996e-03,3.3,2
--3.9999992e-03,3.28,3
-"""
-TDS = """\
-"Record Length",3,"Points",-0.002,1.5
-"Sample Interval",0.001,s,-0.001,2.5
-"Source",CH2,,0.000,3.5
-"Vertical Units",V,,0.001,4.5
-"Horizontal Units",s,,0.002,5.5
-,,,0.003,6.5
-"""
-LVM = """\
-LabVIEW Measurement
-Separator	Tab
-Decimal_Separator	,
-X_Columns	One
-Time_Pref	Relative
-***End_of_Header***
-Channels	2
-Samples	2	1
-Y_Unit_Label	Volts	Degree
-X_Dimension	Time	Time
-X0	0,0	0,5
-Delta_X	0,25	0,5
-***End_of_Header***
-X_Value	V	slow	Comment
-0,00	1,5	7	warm
-0,25	2,5\t
-0,50	3,5	8
-0,75	4,5\t
-"""
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "expected"),
-    [
-        ("tek.csv", TEKTRONIX, {"CH2": ("V", 2.5e9, -4e-3, [3.34, 3.3]), "CH3": ("mV", 2.5e9, -4e-3, [1, 2])}),
-        ("old.csv", TDS, {"CH2": ("V", 1000.0, -0.002, [1.5, 2.5])}),
-        (
-            "key.csv",
-            "x-axis,1,2\nsecond,Volt,Ampere\n-1.0E-03,+1.5,2\n-995.0E-06,2.5,\n-990.0E-06,2.5,4\n",
-            {"1": ("V", 2e5, -1e-3, [1.5, 2.5]), "2": ("A", 2e5, -1e-3, [2, np.nan])},
-        ),
-        (
-            "plain.csv", "t;v\n0,0;1,5\n0,1;2,5\n",
-            {"t": (None, None, None, [0, 0.1]), "v": (None, None, None, [1.5, 2.5])},
-        ),
-        ("a.lvm", LVM, {"V": ("V", 4.0, 0.0, [1.5, 2.5]), "slow": ("deg", 2.0, 0.5, [7, 8])}),
-    ],
-)  # fmt: skip
-def test_text_files_of_instruments_are_read(tmp_path: Path, name: str, content: str, expected: dict) -> None:
-    variables = stated_metadata(text(tmp_path / name, content))
-    assert variables.keys() == expected.keys()
-    for variable, (unit, rate, start, values) in expected.items():
-        assert variables[variable][0] == unit
-        assert variables[variable][1:3] == (pytest.approx(rate), pytest.approx(start))
-        np.testing.assert_array_equal(variables[variable][3], values)
-
-
-def test_the_clock_of_rohde_schwarz_files_is_read_from_the_second_file(tmp_path: Path) -> None:
-    path = text(tmp_path / "pulse.Wfm.csv", "0.1\n0.2\n0.3\n")
-    assert stated_metadata(path) == {"column 1": (None, None, None, [0.1, 0.2])}
-    text(tmp_path / "pulse.csv", "RecordLength:3:\nHardwareXStart:-1.12e-8:\nSignalResolution:2e-11:\n")
-    assert stated_metadata(path) == {"column 1": (None, 5e10, -1.12e-8, [0.1, 0.2])}
-
-
-@pytest.mark.parametrize(("rows", "start"), [(3, -2e-6), (5, -2.5e-6), (4, None)])
-def test_the_number_of_values_selects_the_start_of_rohde_schwarz_files(
-    tmp_path: Path, rows: int, start: float | None
-) -> None:
-    properties = {
-        "SignalResolution": "5e-07", "BaseUnit": "eRS_UNIT_LEVEL_V", "XStart": "-2e-06", "RecordLength": "3",
-        "HardwareXStart": "-2.5e-06", "SignalHardwareRecordLength": "5",
-    }  # fmt: skip
-    lines = [
-        f'<Prop Avail="0" Name="{key}" Version="2" Value="{value}" UserValue="7"/>' for key, value in properties.items()
-    ]
-    path = text(tmp_path / "pulse.Wfm.csv", rows * "0.1\n")
-    text(tmp_path / "pulse.bin", "\n".join(["<Database>", *lines, "</Database>"]))
-    assert stated_metadata(path) == {"column 1": ("V", 2e6, start, [0.1, 0.1])}
-
-
 def test_a_single_row_is_read_as_a_channel(tmp_path: Path) -> None:
     rows = np.arange(7.0)[None, :]
     np.savez(tmp_path / "a.npz", row=rows)
@@ -295,44 +187,6 @@ def test_a_single_row_is_read_as_a_channel(tmp_path: Path) -> None:
             assert recording["sense_x"].read().tolist() == list(range(7))
             assert recording["sense_x"].read(2, 5).tolist() == [2.0, 3.0, 4.0]
             assert recording["sense_x"].sample_rate == 1.0
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (("1,3.3", "1,3.3"), None),
-        (("-3.9999996e-03", "-3.9999986e-03"), "its times are not uniform: sample 1"),
-        (("3.3,2", "3.3"), "line 11 ends after 2 of 3 columns"),
-        (("3.3,2", "3.3,two"), "line 11: 'two' is no number"),
-        (("3.3,2", "1_000,2"), "line 11: '1_000' is no number"),
-        (("3.3,2", "3.3," + 70000 * "2"), "line 11 is no line of a table"),
-        (("Sample Interval,4e-10", "Sample Interval,-1"), None),
-    ],
-)
-def test_damaged_text_is_refused_with_its_line(tmp_path: Path, change: tuple[str, str], words: str | None) -> None:
-    path = text(tmp_path / "tek.csv", TEKTRONIX.replace(*change))
-    plan = {"channels": {"sense_x": {"variable": "CH2"}}}
-    if words is None:
-        with convert(path, plan) as recording:  # the rate follows from the times if not from the header
-            assert recording["sense_x"].sample_rate == pytest.approx(2.5e9)
-    else:
-        with pytest.raises(BadInput, match=words):
-            convert(path, plan)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (("Channels\t2", "Channels\t9"), "says Channels 9 over 4 columns"),
-        (("0,25\t2,5", "***End_of_Header***\n0,25\t2,5"), "more than one segment"),
-        (("Delta_X\t0,25\t0,5\n***End", "Delta_X\t0,25\t0,5\n**End"), "a header is not closed"),
-        (("LabVIEW", "LabView"), "is not a LabVIEW Measurement file"),
-    ],
-)
-def test_damaged_lvm_files_are_refused(tmp_path: Path, change: tuple[str, str], words: str) -> None:
-    assert change[0] in LVM
-    with pytest.raises(BadInput, match=words):
-        read(text(tmp_path / "a.lvm", LVM.replace(*change)), "lvm")
 
 
 @pytest.mark.parametrize("kind", ["u1", "<i2", "<i4", "<f4"])
@@ -381,7 +235,7 @@ def test_a_missing_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(BadInput, match=rf"pip install 'lissajous\[{extra}\]'"):
-        read(text(tmp_path / name, "x"))
+        read(write_text(tmp_path / name, "x"))
 
 
 # --- format detection and contents ------------------------------------------------------------------------------------
@@ -391,22 +245,22 @@ def test_the_format_is_detected_from_the_content_before_the_name(tmp_path: Path)
     np.savez(tmp_path / "a.npz", v=VALUES)
     (tmp_path / "a.npz").rename(tmp_path / "a.csv")
     assert detect_format(tmp_path / "a.csv") == "npz"
-    assert detect_format(text(tmp_path / "b.CSV", "1\n")) == "csv"
+    assert detect_format(write_text(tmp_path / "b.CSV", "1\n")) == "csv"
     with pytest.raises(BadInput, match="is of no format that is known"):
-        detect_format(text(tmp_path / "c.dat", "1\n"))
+        detect_format(write_text(tmp_path / "c.dat", "1\n"))
     assert read(tmp_path / "c.dat", "csv").variables["column 1"].raw[:].tolist() == [1.0]
 
 
 @pytest.mark.parametrize("name", readers())
 def test_missing_and_empty_files_are_refused(tmp_path: Path, name: str) -> None:
-    for path in (tmp_path / "gone", tmp_path, text(tmp_path / "empty", "")):
+    for path in (tmp_path / "gone", tmp_path, write_text(tmp_path / "empty", "")):
         with pytest.raises(BadInput) as caught:
             read(path, name)
         assert str(path) in str(caught.value)
 
 
 def test_the_suggested_mapping_is_complete_if_the_file_states_everything(tmp_path: Path) -> None:
-    path = text(tmp_path / "a.csv", TEKTRONIX)
+    path = write_text(tmp_path / "a.csv", TEKTRONIX)
     description = info(path)
     assert description["about"] == {"device": "MDO4014B-3"}
     assert description["variables"]["CH3"] == {
@@ -414,7 +268,7 @@ def test_the_suggested_mapping_is_complete_if_the_file_states_everything(tmp_pat
     }  # fmt: skip
     with convert(path, parse_toml(description["suggestion"], "suggestion")) as recording:
         assert set(recording.channels) == {"CH2", "CH3"}
-    bare = info(text(tmp_path / "b.csv", 't,"a]b"\n0,1\n1,2\n'))["suggestion"]
+    bare = info(write_text(tmp_path / "b.csv", 't,"a]b"\n0,1\n1,2\n'))["suggestion"]
     with pytest.raises(BadInput, match="says no sample_rate"):  # the file does not state it
         convert(tmp_path / "b.csv", parse_toml(bare, "suggestion"))
 
