@@ -24,7 +24,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 
 def test_the_wheel_contains_every_file_of_the_packages(wheel: zipfile.ZipFile) -> None:
-    suffixes = {".py", ".toml", ".html", ".js", ".typed"}
+    suffixes = {".py", ".toml", ".yaml", ".html", ".js", ".typed"}
     expected = {path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.suffix in suffixes}
     names = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert names == {path.relative_to(ROOT).as_posix() for path in expected}

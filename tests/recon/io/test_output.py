@@ -88,7 +88,7 @@ def test_a_frame_is_the_picture_of_its_time_interval(
 ) -> None:
     intensity = imaging()[0]["intensity"]
     path = tmp_path / "frames.ome.tif"
-    write_scan_frames(path, result, options)
+    write_scan_frames(tmp_path, result, options)
     frames = tifffile.imread(path)
     assert frames.shape == (len(times) - 1, 60, 80)
     assert frames.dtype == np.float32
