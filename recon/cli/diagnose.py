@@ -12,13 +12,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from recon.cli.argument_types import parse_count
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="recordings of one device (.h5)")
-    parser.add_argument(
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument(
         "--plan",
         action="store_true",
         help="no diagnosis: which effects such recordings could show; REC may be an excitation (.toml)",
+    )
+    kinds.add_argument(
+        "--each",
+        action="store_true",
+        help="every recording by itself, a folder and a line of table.csv each; REC may be a folder of recordings",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
     parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
@@ -27,9 +35,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE",
         help="a named device or TOML file in place of the recording's own",
     )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--scheduler", metavar="ADDRESS", help="each: on the Dask cluster of this scheduler")
+    where.add_argument("--workers", type=parse_count, metavar="N", help="each: processes here (one a core)")
+    parser.add_argument("--overwrite", action="store_true", help="each: also what an earlier run has completed")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
+    if args.each:
+        from recon.cli.diagnose_each import diagnose_each
+
+        where = {"scheduler": args.scheduler, "workers": args.workers, "overwrite": args.overwrite}
+        return diagnose_each(args.recordings, args.output, args.device, args.mapping, **where)
     from recon.experiment_planning import plan_files
 
     work = plan_files if args.plan else diagnose_files
@@ -85,6 +102,10 @@ def diagnose_files(
 
 
 def format_summary(summary: dict[str, Any]) -> str:
+    if "table" in summary:
+        from recon.cli.diagnose_each import format_each
+
+        return format_each(summary)
     return _format_plan(summary) if "excitations" in summary else _format_diagnosis(summary)
 
 

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="REC",
-        help="the recording (.h5), or an instrument's file with --mapping; several at once go to a folder each",
+        help="recording (.h5), or an instrument's file with --mapping; several, or a folder of them: a folder each",
     )
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for pictures, motion, report"
@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     several = parser.add_mutually_exclusive_group()
     several.add_argument("--scheduler", metavar="ADDRESS", help="several: on the Dask cluster of this scheduler")
     several.add_argument("--workers", type=parse_count, metavar="N", help="several: processes here (one a core)")
+    parser.add_argument("--overwrite", action="store_true", help="several: also what an earlier run has completed")
     several.add_argument(
         "--follow", action="store_true", help="show the frames of a recording that is still being written, then all"
     )
@@ -121,7 +122,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         import_extra("zarr", "zarr")
     if args.fill and args.picture != "mean":
         raise BadInput(f"a {args.picture} picture has no holes", channel="--fill", hint="leave out --fill or --picture")
-    if len(args.recordings) > 1 or args.scheduler or args.workers:
+    if len(args.recordings) > 1 or args.recordings[0].is_dir() or args.scheduler or args.workers:
         return _run_many(args, options)
     live = None
     if args.follow and args.intensity_drift:
@@ -143,7 +144,7 @@ def _run_many(args: argparse.Namespace, options: Options) -> dict[str, Any]:
     if args.follow:
         raise BadInput("follows one recording", channel="--follow", hint="start one command for each")
     where = {"scheduler": args.scheduler, "workers": args.workers}
-    return reconstruct_files(args.recordings, args.output, options, args.mapping, **where)
+    return reconstruct_files(args.recordings, args.output, options, args.mapping, **where, overwrite=args.overwrite)
 
 
 def reconstruct_file(

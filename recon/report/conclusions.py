@@ -208,6 +208,24 @@ def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
     )
 
 
+def conclude_fleet(summary: Mapping[str, Any]) -> str:
+    """How many recordings show an effect, and which is the most frequent."""
+    rows: Sequence[Mapping[str, Any]] = [row for row in summary["table"] if not row.get("failed")]
+    diagnosed = len({row["recording"] for row in rows})
+    effects: dict[str, set[str]] = {}
+    for row in rows:
+        if row.get("effect"):
+            effects.setdefault(f"{row['axis']} {row['effect']}", set()).add(row["recording"])
+    affected = len(set().union(*effects.values()))
+    text = f"{affected} of {_count(diagnosed, 'recording')} show effects that the nominal device omits."
+    if effects:
+        name, where = max(effects.items(), key=lambda item: len(item[1]))
+        text += f" The most frequent is {name}, in {len(where)}."
+    if summary["failed"]:
+        text += f" {_count(summary['failed'], 'recording')} failed; the reasons are listed below."
+    return text
+
+
 def _degrees(value: float) -> str:
     return f"{value:.2g}°" if value < 1.0 else f"{value:.2f}°"
 

@@ -1,0 +1,229 @@
+"""The same work on many recordings: a folder each, continued after an interruption, on this machine or a cluster."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recon.executors import open_executor, picklable_task
+from recon.io.output import check_folder, write_json
+from recon.io.readers import register, registered
+from scanner.errors import BadInput, line_of
+from scanner.files import replacing
+
+JOB_FILE = "job.json"
+"""File of the output folder that states which recordings and options its folders were made with."""
+
+SHARED_ROUNDS = 2
+"""Rounds in which all recordings share the workers. What a killed worker then still left undone gets a worker alone, so
+that a recording that kills its worker (by its size) stops no other."""
+
+Work = Callable[[Path, Path], object]
+"""Work on one recording: its path, and the folder to write into."""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Recordings, their folders, and what is already done.
+
+    Attributes:
+        folders: by recording.
+        done: recordings whose folders an earlier run has completed.
+    """
+
+    folders: Mapping[Path, Path]
+    done: frozenset[Path]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a recording failed, and the exit code that belongs to it."""
+
+    reason: str
+    exit: int
+
+
+def find_recordings(places: Sequence[Path]) -> list[Path]:
+    """Return the files, and the recordings (``*.h5``) in the folders, in the order of their names.
+
+    Raises:
+        BadInput: a folder holds no recording.
+    """
+    found: list[Path] = []
+    for place in places:
+        inside = sorted(place.glob("*.h5")) if place.is_dir() else [place]
+        if not inside:
+            raise BadInput("holds no recording (*.h5)", file=place, hint="name the folder of the recordings")
+        found += inside
+    return list(dict.fromkeys(found))
+
+
+def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, overwrite: bool) -> Fleet:
+    """Assign a folder to each recording, and find those that an earlier run has completed.
+
+    Args:
+        paths: the recordings.
+        output: folder of the folders; it is made.
+        options: of the work, as text. Folders that were made with others are neither used nor replaced.
+        result: file that a completed folder holds.
+        overwrite: do everything anew.
+
+    Raises:
+        BadInput: ``output`` cannot be written, or holds results of other options or of a recording that has changed.
+    """
+    check_folder(output)
+    output.mkdir(exist_ok=True)
+    before = {} if overwrite else _read_job(output)
+    hint = "add --overwrite, or name another folder with -o"
+    if before and before.get("options") != options:
+        raise BadInput("holds results that were made with other options", file=output, hint=hint)
+    known: dict[str, Any] = dict(before.get("recordings", {}))
+    folders: dict[Path, Path] = {}
+    done = set()
+    for path in paths:
+        key, stamp = str(path.absolute()), _stamp(path)
+        if key in known and known[key]["file"] != stamp and (output / known[key]["folder"] / result).is_file():
+            what = f"has changed since its results were written into {known[key]['folder']}"
+            raise BadInput(what, file=path, hint=hint)
+        if key not in known:
+            name = _free_name(path.stem, {entry["folder"] for entry in known.values()})
+            if not overwrite and (output / name / result).is_file():
+                raise BadInput("holds results of another run", file=output / name, hint=hint)
+            known[key] = {"folder": name}
+        known[key]["file"] = stamp
+        folders[path] = output.absolute() / known[key]["folder"]
+        if not overwrite and (folders[path] / result).is_file():
+            done.add(path)
+    with replacing(output / JOB_FILE) as beside:
+        write_json(beside, {"options": options, "recordings": known})
+    return Fleet(folders, frozenset(done))
+
+
+def run_fleet(
+    fleet: Fleet, work: Work, title: str, scheduler: str | None = None, workers: int | None = None
+) -> dict[Path, Failure]:
+    """Do the work on every recording that is not done; return the failures.
+
+    A worker that is killed loses nothing: what was not completed is submitted again.
+
+    Args:
+        fleet: recordings and folders.
+        work: on one recording; picklable.
+        title: of the progress bar.
+        scheduler, workers: see :func:`recon.executors.open_executor`; a cluster reads and writes the same paths.
+
+    Raises:
+        BadInput: no scheduler answers.
+        InterruptedError: by the user. Completed folders remain, and the same call continues.
+    """
+    from tqdm import tqdm
+
+    failures: dict[Path, Failure] = {}
+    left = [path for path in fleet.folders if path not in fleet.done]
+    with tqdm(total=len(fleet.folders), initial=len(fleet.done), desc=title, unit="recording", file=sys.stderr) as bar:
+        try:
+            for _ in range(SHARED_ROUNDS):
+                if left:
+                    left = _run_round(left, fleet, work, scheduler, workers, failures, bar)
+            for path in left:
+                if _run_round([path], fleet, work, scheduler, 1, failures, bar):
+                    failures[path] = Failure(f"{path}: its worker was killed (out of memory?)", 1)
+        except KeyboardInterrupt:
+            reason = f"interrupted; {bar.n} of {len(fleet.folders)} recordings are done, the same command continues"
+            raise InterruptedError(errno.EINTR, reason, str(next(iter(fleet.folders.values())).parent)) from None
+    return failures
+
+
+def _run_round(
+    paths: Sequence[Path],
+    fleet: Fleet,
+    work: Work,
+    scheduler: str | None,
+    workers: int | None,
+    failures: dict[Path, Failure],
+    bar: Any,
+) -> list[Path]:
+    """Submit the work on each recording; return those whose worker was killed, in their order."""
+    lost = []
+    with open_executor(scheduler, workers) as executor:
+        jobs = {}
+        for path in paths:
+            task = picklable_task(_attempt, registered(), work, path.absolute(), fleet.folders[path])
+            jobs[_submit(executor, task)] = path
+        for job in as_completed(jobs):
+            try:
+                failure = job.result()
+            except (BrokenExecutor, CancelledError):
+                lost.append(jobs[job])
+                continue
+            except Exception as error:  # Dask's KilledWorker is no BrokenExecutor; its module is optional
+                if type(error).__name__ != "KilledWorker":
+                    raise
+                lost.append(jobs[job])
+                continue
+            bar.update()
+            if failure is not None:
+                failures[jobs[job]] = failure
+    return [path for path in paths if path in lost]
+
+
+def _attempt(reader_files: Sequence[Path], work: Work, path: Path, folder: Path) -> Failure | None:
+    """Do the work in a worker; an expected error becomes a failure with its reason."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for file in reader_files:
+        register(file)
+    try:
+        work(path, folder)
+    except BadInput as error:
+        return Failure(str(error), 2)
+    except MemoryError:
+        return Failure(f"{path}: needs more memory than there is; cut it into shorter ones", 2)
+    except OSError as error:  # such as a full disk
+        return Failure(line_of(error, folder), 1)
+    return None
+
+
+def _submit(executor: Executor, task: Callable[[], Failure | None]) -> Future[Failure | None]:
+    """Submit a task; return a failed future if a worker was killed before all were submitted."""
+    try:
+        return executor.submit(task)
+    except BrokenExecutor as error:
+        broken: Future[Failure | None] = Future()
+        broken.set_exception(error)
+        return broken
+
+
+def _read_job(output: Path) -> dict[str, Any]:
+    """Content of an earlier run's ``JOB_FILE``; empty without one."""
+    try:
+        content = json.loads((output / JOB_FILE).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        hint = "delete it, or name another folder with -o"
+        raise BadInput(f"cannot be read: {error}", file=output / JOB_FILE, hint=hint) from None
+    return content if isinstance(content, dict) else {}
+
+
+def _stamp(path: Path) -> list[int] | None:
+    """Size and time of change of a file [bytes, ns]; None where it cannot be read, which the work reports."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _free_name(stem: str, taken: set[str]) -> str:
+    """The stem, with a number appended if it is taken."""
+    name, number = stem, 2
+    while name in taken:
+        name, number = f"{stem}-{number}", number + 1
+    return name

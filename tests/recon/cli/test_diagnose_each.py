@@ -1,0 +1,72 @@
+"""``lissajous diagnose --each``: table and page of many recordings; what is done is kept, what is bad is listed."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from recon.cli import main
+from recon.cli.diagnose_each import COLUMNS, diagnose_each
+from recon.fleet import plan_fleet
+
+FINDING = {
+    "axis": "x",
+    "stage": "mechanics",
+    "effect": "cubic-stiffness",
+    "probability": 0.98,
+    "share": 0.7,
+    "parameters": [{"name": "k3", "value": -1.1e-5, "ci95": [-1.15e-5, -1.05e-5], "unit": "N m/rad^3"}],
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three recordings, of which an earlier run has diagnosed two; the third is no recording."""
+    recordings = tmp_path / "recordings"
+    recordings.mkdir()
+    for name in ("a", "b", "c"):
+        (recordings / f"{name}.h5").write_text("no recording", encoding="utf-8")
+    paths = [recordings / "a.h5", recordings / "b.h5"]
+    fleet = plan_fleet(paths, tmp_path / "out", "None mapping=None", "diagnosis.json", False)
+    for path, findings in zip(paths, ([FINDING], []), strict=True):
+        place = fleet.folders[path]
+        place.mkdir()
+        content = {"verdict": "mismatch" if findings else "consistent", "findings": findings}
+        (place / "diagnosis.json").write_text(json.dumps(content), encoding="utf-8")
+        (place / "device.toml").write_text('name = "mirror"\n', encoding="utf-8")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_table_and_page_list_every_device(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    arguments = ["diagnose", "--each", str(folder / "recordings"), "-o", str(folder / "out"), "--workers", "1"]
+    assert main(arguments) == 2
+    out = capsys.readouterr().out
+    assert "1 of 2 recordings show effects" in out
+    assert "c.h5: is not an HDF5 file" in out
+    with (folder / "out" / "table.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert [row["recording"] for row in rows] == ["a.h5", "b.h5", "c.h5"]
+    assert rows[0]["effect"] == "cubic-stiffness"
+    assert float(rows[0]["ci95_high"]) == -1.05e-5
+    assert [row["verdict"] for row in rows] == ["mismatch", "consistent", ""]
+    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert "cubic-stiffness" in page
+    assert "data:image/svg+xml" in page
+
+
+def test_results_of_another_device_are_not_mixed_in(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    arguments = ["diagnose", "--each", str(folder / "recordings"), "-o", str(folder / "out"), "--device", "imaging"]
+    assert main(arguments) == 2
+    assert "other options" in capsys.readouterr().err
+
+
+def test_completed_recordings_are_kept(folder: Path) -> None:
+    (folder / "recordings" / "c.h5").unlink()
+    before = (folder / "out" / "a" / "diagnosis.json").stat().st_mtime_ns
+    summary = diagnose_each([folder / "recordings"], folder / "out")
+    assert summary["kept"] == summary["recordings"] == 2
+    assert summary["exit"] == 0
+    assert (folder / "out" / "a" / "diagnosis.json").stat().st_mtime_ns == before
