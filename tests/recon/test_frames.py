@@ -82,7 +82,7 @@ def test_a_drawn_frame_has_a_bar_and_a_time(result: Reconstruction) -> None:
     assert rgb.shape[0] % 2 == rgb.shape[1] % 2 == 0
     bar = (rgb[-16:-11] == 255).all(axis=2).any(axis=0)
     assert 0.1 * rgb.shape[1] <= bar.sum() <= 0.26 * rgb.shape[1]
-    assert (rgb[:30, :120] == 255).any()
+    assert (rgb[:30, :120] > 200).any()  # the text is smoothed, so that no pixel has to be white
 
 
 def test_xarray_has_coordinates_and_units(result: Reconstruction) -> None:
