@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from estimation.amplitude_calibration import amplitude_calibration_sd
 from estimation.estimate import default_estimator, estimate
 from estimation.optics.correction import beam_motion
 from recon.evaluation import AxisEvaluation, Truth, evaluate_axis
@@ -103,6 +104,8 @@ class Reconstruction:
         data_share: weight of the pixel's own samples in its value; None for a picture of means.
         resolution_px: distance between independent values [px]; None for a picture of means.
         sample_noise: noise of a sample by detector; None where too few pixels were visited twice to measure it.
+        amplitude_calibration: relative standard deviation of the amplitude by the calibration, by axis; None where
+            nothing calibrates it.
         p, spot: as in ``Options``.
         phase_errors: phase error of each time slice that forward and backward half-periods show.
         readout_phase: phase error of the readout that the picture showed and that was removed, by axis; without the
@@ -127,6 +130,7 @@ class Reconstruction:
     data_share: NDArray[np.float32] | None
     resolution_px: float | None
     sample_noise: Sequence[SampleNoise | None]
+    amplitude_calibration: Mapping[str, float | None]
     p: float
     spot: float | None
     phase_errors: list[PhaseError]
@@ -352,6 +356,12 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         data_share=estimate.data_share,
         resolution_px=estimate.resolution_px,
         sample_noise=noise,
+        amplitude_calibration={
+            name: amplitude_calibration_sd(
+                prepared.recording, prepared.device, name, float(np.mean(axis.amplitude)), motion.estimator
+            )
+            for name, axis in motion.axes.items()
+        },
         p=options.p,
         spot=options.spot,
         phase_errors=estimated.phase_errors or [],

@@ -139,6 +139,8 @@ class AxisMotion:
         angle: the angle at the intensity's samples.
         reference: ``"half-drive"``, ``"drive"`` or ``"absolute"``.
         sign: ``"known: <how>"`` or ``"ambiguous"``; an even capacitance fixes the phase modulo pi only.
+        amplitude_sd: shape (n,), standard deviation of ``amplitude`` by the noise, without the calibration's [rad];
+            None from an estimator that states none.
     """
 
     time: Array
@@ -149,6 +151,7 @@ class AxisMotion:
     angle: AngleTrack
     reference: str = "half-drive"
     sign: str = "ambiguous"
+    amplitude_sd: Array | None = None
 
     def __repr__(self) -> str:
         sd = np.degrees(np.sqrt(np.mean(np.square(self.phase_sd))))

@@ -32,7 +32,7 @@ class AxisKnots(NamedTuple):
     Attributes:
         time, phase, phase_rate, log_amplitude, log_amplitude_rate, harmonics: as in ``PhasorMotion``.
         at_switch: which knots belong to a switch, shape (knots,).
-        frequency, phase_sd: of the motion in every block, shape (blocks,) [Hz, rad].
+        frequency, phase_sd, log_amplitude_sd: of the motion in every block, shape (blocks,) [Hz, rad, 1].
     """
 
     time: Array
@@ -44,6 +44,7 @@ class AxisKnots(NamedTuple):
     at_switch: NDArray[np.bool_]
     frequency: Array
     phase_sd: Array
+    log_amplitude_sd: Array
 
 
 def axis_knots(observations: BlockObservations, states: Array, sds: Array, a: int) -> AxisKnots:
@@ -79,6 +80,7 @@ def axis_knots(observations: BlockObservations, states: Array, sds: Array, a: in
         at_switch,
         (w + rate.imag) / (2 * np.pi),
         sds[:, at + PHASE].copy(),
+        sds[:, at + LOG_AMPLITUDE].copy(),
     )
 
 
@@ -118,6 +120,7 @@ def motion_of_knots(
         angle=PhasorAngle(motion, *clock),
         reference=reference.kind,
         sign=sign,
+        amplitude_sd=np.exp(log) * knots.log_amplitude_sd,
     )
 
 

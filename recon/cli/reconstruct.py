@@ -235,6 +235,9 @@ def _format_axis(name: str, axis: Mapping[str, Any]) -> str:
     measured = axis["picture_phase_error_deg"]
     if measured["sd"] is not None:
         line += f", phase error measured in the picture {measured['value']:+.3f}° ± {measured['sd']:.3f}°"
+    line += f", amplitude {axis['amplitude_rad']:.4g} rad"
+    sd, calibration = axis["amplitude_sd_rad"], axis["amplitude_sd_calibration_rad"]
+    line += " (scale not known)" if sd is None else f" ± {sd:.2g} (calibration {calibration:.2g})"
     return f"{line}; sign {axis['sign']}"
 
 

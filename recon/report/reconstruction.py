@@ -146,6 +146,10 @@ def axis_table(summary: Mapping[str, Any]) -> Table:
         ["phase error measured in the picture", *measured],
         ["drift of the phase over the scan [°]", *(f"{summary[a]['phase_drift_deg']:.3g}" for a in AXES)],
         [f"amplitude [mrad {summary['angle']}]", *(f"{1e3 * summary[a]['amplitude_rad']:.2f}" for a in AXES)],
+        [
+            "standard deviation of the amplitude: scale of the picture",
+            *(_format_amplitude_sd(summary[a]) for a in AXES),
+        ],
         ["frequency [Hz]", *(f"{summary[a]['frequency_hz']:.3f}" for a in AXES)],
         ["sign of the angle", *(summary[a]["sign"] for a in AXES)],
     ]
@@ -170,6 +174,15 @@ def phase_figures(results: Mapping[str, Reconstruction]) -> list[Figure]:
 def blur_figure_of(parts: Mapping[str, Mapping[str, float]], p: float) -> Figure:
     """Bars of blur by cause."""
     return Figure(blur_figure(parts, p), "blur by cause; dashed: the tolerated p pixels")
+
+
+def _format_amplitude_sd(axis: Mapping[str, Any]) -> str:
+    """Relative standard deviation of the amplitude, with the part from the calibration."""
+    sd, calibration = axis["amplitude_sd_rad"], axis["amplitude_sd_calibration_rad"]
+    if sd is None:
+        return "not known: nothing calibrates it"
+    percent = 100.0 / axis["amplitude_rad"]
+    return f"{percent * sd:.2g} % (calibration {percent * calibration:.2g} %)"
 
 
 def _fill_text(summary: Mapping[str, Any]) -> str:

@@ -67,6 +67,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
         else blur.within_bound(bound, error=error.phase),
         "sign": own.sign,
         "amplitude_rad": scale * float(np.mean(own.amplitude)),
+        **amplitude_uncertainty(result, axis),
         "frequency_hz": float(np.mean(own.frequency)),
         "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
         "picture_phase_error_deg": picture_phase_error(result.phase_errors, axis),
@@ -82,6 +83,20 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
             "mirrored": error.mirrored,
         }
     return summary
+
+
+def amplitude_uncertainty(result: Reconstruction, axis: str) -> dict[str, float | None]:
+    """Standard deviation of the amplitude, by noise and calibration together and by calibration alone [rad].
+
+    None where nothing calibrates the amplitude.
+    """
+    own, relative = result.motion.axes[axis], result.amplitude_calibration[axis]
+    if relative is None:
+        return {"amplitude_sd_rad": None, "amplitude_sd_calibration_rad": None}
+    scale = result.picture.grid.angle_scale
+    calibration = scale * relative * float(np.mean(own.amplitude))
+    noise = 0.0 if own.amplitude_sd is None else scale * float(np.sqrt(np.mean(own.amplitude_sd**2)))
+    return {"amplitude_sd_rad": math.hypot(noise, calibration), "amplitude_sd_calibration_rad": calibration}
 
 
 def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEvaluation | None) -> dict[str, float]:
