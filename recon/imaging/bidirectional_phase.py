@@ -47,6 +47,11 @@ do not resolve fine detail, which then biases the result."""
 PARTS_PER_SLICE = 16
 """Parts of a slice with a phase error each: 1.5 periods of the slower axis, so that each has both directions."""
 
+MIN_FINE_SLOPE_RATIO = 0.9
+"""Slope of the score over the information from which cells finer than the coarsest are used. Below, a tenth of the
+information or more is noise in the gradient, which correlates with the noise of the samples that it is compared with:
+the result is then biased by several standard errors."""
+
 STEP_DAMPING = 0.7
 """Factor on the Gauss-Newton step: the gradient of a smoothed picture is up to a half too flat, so a full step
 overshoots."""
@@ -94,12 +99,14 @@ class _Fit(NamedTuple):
     Attributes:
         value, sd: of each slice, shape (slices, 2).
         clear: whether the features of the picture exceed its noise, shape (slices, 2).
+        unbiased: whether they exceed it so far that noise in the gradient does not bias the result, shape (slices, 1).
         parts: value and sd of each part of each slice, shape (slices, PARTS_PER_SLICE, 2, 2).
     """
 
     value: Array
     sd: Array
     clear: NDArray[np.bool_]
+    unbiased: NDArray[np.bool_]
     parts: Array
 
 
@@ -242,8 +249,9 @@ def _estimate_phase_errors(samples: RegistrationSamples, grid: Grid, slices: int
     for cell in (4 * finest, 2 * finest, finest):  # noisy pictures need large cells, fine detail small ones
         fit = _fit_cells(samples, best, grid, cell)
         clear &= fit.clear  # noise that hides coarse detail also hides fine detail
+        fine_enough = fit.unbiased | (cell == 4 * finest)
         better = (
-            clear & (fit.sd < limit) & (np.abs(fit.value - start) < 2 * SEARCH_RESOLUTION_RAD)
+            clear & fine_enough & (fit.sd < limit) & (np.abs(fit.value - start) < 2 * SEARCH_RESOLUTION_RAD)
         )  # further away is another minimum
         best, limit = np.where(better, fit.value, best), np.where(better, fit.sd, limit)
         best_parts = np.where(better[:, None, :, None], fit.parts, best_parts)
@@ -277,6 +285,7 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     # the other axis that leak in through the pattern of the scan give little information.
     clear = slope_of > 0.5 * expected
     determined = clear & (slope_of < 2 * expected) & (expected > 0.05 * expected.max(1, keepdims=True))
+    unbiased = ((slope_of > MIN_FINE_SLOPE_RATIO * expected) | ~determined).all(axis=1, keepdims=True)
     value, sd, parts = error.copy(), np.full_like(error, np.inf), _undetermined_parts(len(error))
     for s, axes in enumerate(determined):
         if axes.any():
@@ -288,4 +297,4 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
             parts[s][:, axes, 0] = value[s, axes] + by_part / weight
             parts[s][:, axes, 1] = sd[s, axes] / np.sqrt(weight)
             value[s, axes] += shares.sum(0)
-    return _Fit(value, sd, clear, parts)
+    return _Fit(value, sd, clear, unbiased, parts)

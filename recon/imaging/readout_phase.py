@@ -48,6 +48,9 @@ UNDESCRIBED_DELAY_SD_S = 0.5e-6
 converters and amplifiers are late by up to a microsecond."""
 REPORTED_SDS = 3.0
 """Number of standard deviations from which a phase error is reported in a note: 0.3 % of correct readouts exceed it."""
+MAX_SLICE_SPREAD_RAD = 2.0 * DRIFT_SDS_RAD[-1]
+"""Largest difference between the phase errors of two slices: two standard deviations of the largest drift. In a pattern
+that repeats within the reach of the registration, slices agree on no period."""
 MAX_ROUNDS = 3
 """Registrations about an improved motion: an error of 10° needs two, because the picture itself sharpens."""
 CONVERGENCE_SD = 0.5
@@ -160,6 +163,7 @@ def remove_readout_phase(
             times = _posterior_times(axis, measured[0])
             estimate = estimate_readout_phase(*measured, times, len(errors) >= MIN_DRIFT_SLICES)
             if estimate is None:
+                found.pop(name, None)  # an earlier round may have determined one
                 axes[name] = widen_undetermined(axis)
             else:
                 found[name] = estimate
@@ -218,6 +222,8 @@ def measured_phase_error(
 ) -> tuple[Array, Array, Array]:
     """Times [s], phase errors [rad] of ``axis`` and standard deviations [rad] from those of its corrected motion.
 
+    The standard deviations are infinite if the slices contradict each other or most of them determine nothing.
+
     Args:
         errors: of the corrected motion.
         column: 0 for x, 1 for y.
@@ -226,6 +232,10 @@ def measured_phase_error(
     parts = [error.parts for error in errors if error.parts is not None]
     time, value, sd = (np.concatenate(column) for column in zip(*parts, strict=True))
     time = axis.angle.start + time
+    slices = np.array([getattr(error, AXES[column]).value for error in errors])
+    determined = slices[np.isfinite(slices)]
+    if 2 * determined.size < slices.size or np.ptp(determined) > MAX_SLICE_SPREAD_RAD:
+        sd = np.full_like(sd, np.inf)
     return time, value[:, column] + np.interp(time, axis.time, corrected.phase - axis.phase), sd[:, column]
 
 
@@ -251,8 +261,9 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
         found: the error that was removed, by axis.
     """
     notes = [
-        f"the picture determines no phase of {name}: no feature across it, or too few photons. The standard deviation "
-        f"of the phase allows for {UNDESCRIBED_DELAY_SD_S * 1e6:.2g} µs of readout delay that the device file does not "
+        f"the picture determines no phase of {name}: no feature across it, a pattern that repeats, or too few photons. "
+        f"The standard deviation of the phase allows for "
+        f"{UNDESCRIBED_DELAY_SD_S * 1e6:.2g} µs of readout delay that the device file does not "
         "state; a specimen with detail, more light or a longer scan narrows it"
         for name in AXES
         if name not in found

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from phantoms.experiment import Experiment, simulate_experiment
+from phantoms.optics import Detector, detect, sample_scene
+from phantoms.targets import make_target
 from recon.evaluation import truth_from_simulation
 from recon.imaging.readout_phase import correlate_matern32, estimate_readout_phase
 from recon.pipeline import Options, reconstruct
@@ -115,6 +117,42 @@ def test_a_specimen_without_detail_gives_a_wide_interval_and_a_note() -> None:
         sd = result.motion.axes[axis].phase_sd
         assert np.all(sd > 2.0 * np.pi * 3000.0 * 0.3e-6)
     assert sum("determines no phase" in note for note in result.notes) == 2
+
+
+def lit(scene: np.ndarray, creep: float = 0.0, saturation: float = 1.0) -> Recording:
+    """The scan of another scene.
+
+    Args:
+        scene: in place of the tissue.
+        creep: motion of the specimen along x over the scan, relative to the half field.
+        saturation: quantile of the intensity at which the detector saturates.
+    """
+    recording, simulated = imaging()
+    angles, intensity = truth_from_simulation(simulated).angles, recording["intensity"]
+    clocks = {axis: start + np.arange(values.size) / rate for axis, (values, rate, start) in angles.items()}
+    x, y = (np.interp(intensity.time(), clocks[axis], angles[axis][0]) for axis in "xy")
+    light = sample_scene(scene, x - creep * 0.18 * np.linspace(0.0, 1.0, x.size), y, 0.18, 0.18)
+    volts = detect(light, intensity.sample_rate, Detector(photons_per_sample=300.0), np.random.default_rng(0))
+    channels = {k: (c.read(), c.unit, c.sample_rate, c.start) for k, c in recording.channels.items()}
+    channels["intensity"] = (np.minimum(volts, np.quantile(volts, saturation)), *channels["intensity"][1:])
+    return Recording.from_arrays(channels, recording.device)
+
+
+@pytest.mark.parametrize("case", ["repeats", "saturated", "moves"])
+def test_a_difficult_scene_is_not_taken_for_a_readout_error(case: str) -> None:
+    wave = 0.2 * np.sin(2.0 * np.pi * np.arange(800) / 20.0)  # 40 periods: finer than the registration's search
+    recording = {
+        "repeats": lambda: lit(0.5 + wave[:, None] + wave),
+        "saturated": lambda: lit(make_target("immunohistochemistry"), saturation=0.1),
+        "moves": lambda: lit(make_target("immunohistochemistry"), creep=0.01),
+    }[case]()
+    result = reconstruct(recording, Options(), truth_from_simulation(imaging()[1]), quiet=True)
+    for axis in "xy":
+        assert np.degrees(result.evaluation[axis].phase_rmse) < 0.05
+    assert not any("late" in note or "early" in note for note in result.notes)
+    if case == "repeats":
+        assert not result.readout_phase
+        assert sum("a pattern that repeats" in note for note in result.notes) == 2
 
 
 @pytest.mark.parametrize(("target", "pixels"), [("siemens_star", 100), ("immunohistochemistry", 100)])
