@@ -109,13 +109,13 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
 def run_fleet(
     fleet: Fleet, work: Work, title: str, scheduler: str | None = None, workers: int | None = None
 ) -> dict[Path, Failure]:
-    """Do the work on every recording that is not done; return the failures.
+    """Process every recording that has no result yet; return the failures.
 
-    A worker that is killed loses nothing: what was not completed is submitted again.
+    If a worker is killed, the recordings that it did not complete are submitted again.
 
     Args:
         fleet: recordings and folders.
-        work: on one recording; picklable.
+        work: function that processes one recording; picklable.
         title: of the progress bar.
         scheduler, workers: see :func:`recon.executors.open_executor`; a cluster reads and writes the same paths.
 

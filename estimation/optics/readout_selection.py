@@ -42,7 +42,8 @@ from scanner.device import AXES, Device
 from scanner.terms import NaturalScales, Term
 
 TRIAL_SIZE = 0.1
-"""Size of an effect at which its slope is found, in natural sizes: tenths of a degree to a degree."""
+"""Size of an effect, in natural sizes, at which its sensitivity is evaluated: phases of a tenth of a degree to a
+degree."""
 
 MAX_SIZE = 4.0
 """Largest size that is tried, in natural sizes."""

@@ -85,7 +85,7 @@ def _waveform(recording: Recording, axis: Axis) -> tuple[int, float, str | None]
 def diagnose_decay(measured: SlowDecay, device: Device) -> Diagnosis:
     """Diagnose one free decay against the nominal device.
 
-    Where the amplitude is in rad, parameters have SI units and the device is improved.
+    If the amplitude is in rad, the parameters have SI units and the device is updated.
 
     Raises:
         BadInput: too few points of a decay.

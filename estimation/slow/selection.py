@@ -24,7 +24,7 @@ MODEL_ERROR = 0.004
 """Relative error of amplitude that is expected of every model: logarithmic detectors follow their law to 0.05 dB."""
 
 MODEL_ERROR_LENGTH = 1.0 / 6.0
-"""Time over which that error changes, as a fraction of the duration."""
+"""Correlation time of the relative error ``MODEL_ERROR``, as a fraction of the duration."""
 
 RELEASED_FRACTION = 0.97
 """Fraction of the largest amplitude at which the decay is taken to begin: a drive does not end within one sample."""

@@ -63,7 +63,7 @@ class EdgePhase:
     outliers: int
 
     def describe(self, name: str) -> str:
-        """What is wrong with the edges, in one line; empty where nothing is."""
+        """Description of missing, repeated and stray edges in one line; empty if there are none."""
         counts = {
             "missing": self.numbered.missing,
             "repeated and left out": self.numbered.doubled,

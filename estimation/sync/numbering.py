@@ -19,7 +19,7 @@ MAX_DEVIATION_PERIODS = 0.1
 large for a detector, lies ten standard deviations below."""
 
 DOUBLED_PERIODS = 0.04
-"""Distance from the edge before below which an edge is a repetition (a bounce of the comparator)."""
+"""Time after the previous edge, in periods, below which an edge is a repetition (a bounce of the comparator)."""
 
 MIN_DWELL_PERIODS = 0.08
 """Least fraction of a period between the two edges of a detector: below, the beam hardly passes it, and the kinds of

@@ -33,7 +33,7 @@ SECTION_BLOCKS = 16384
 """Blocks whose samples are projected at a time, some 10 s: bounds the memory of a long recording."""
 
 MAX_NOISE_ROUNDS = 5
-"""Most rounds in which process noise and noise level are estimated in turn."""
+"""Largest number of rounds in which process noise and noise level are estimated alternately."""
 
 LOG_NOISE_TOLERANCE = 0.2
 """Change of the log noise variance that ends these rounds: 10 % of a standard deviation, which changes no interval."""

@@ -17,7 +17,7 @@ SEARCH_CELLS = 128
 """Cells of phase across half a period of each axis."""
 
 SEARCH_RESOLUTION_RAD = math.pi / SEARCH_CELLS / 4
-"""Resolution of the search. An error whose standard error is larger counts as undetermined."""
+"""Resolution of the search. A phase error with a larger standard error counts as undetermined."""
 
 MATCH_SMOOTHING_CELLS = 0.7
 """Smoothing of the correlation over phase errors: few pairs of samples fall on exactly one cell."""

@@ -42,7 +42,7 @@ MAX_PHASE_ERROR_PX = 0.1
 """Displacement by the phase's standard deviation, at the middle of a line, up to which an axis is not refined."""
 
 Smoother = Callable[[Recording, Device, Mapping[str, PhaseMeasurement]], Motion]
-"""From a recording, its device and measured phases by axis to a motion."""
+"""Computes the motion from a recording, its device and the measured phases of each axis."""
 
 
 def refine_motion(

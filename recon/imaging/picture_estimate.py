@@ -21,7 +21,7 @@ from scanner.errors import BadInput
 from scanner.motion import Motion
 
 PictureKind = Literal["mean", "kernel", "posterior"]
-"""How a pixel's value is found."""
+"""Method by which the value of a pixel is estimated."""
 
 PICTURE_KINDS: tuple[str, ...] = get_args(PictureKind)
 """The names of the kinds."""

@@ -20,7 +20,7 @@ Row = Mapping[str, Any]
 
 
 def fleet_report(summary: Mapping[str, Any]) -> str:
-    """The page; ``summary`` is that of ``diagnose --each``."""
+    """The report page of ``diagnose --each``, made of its ``summary``."""
     rows = [row for row in summary["table"] if not row.get("failed")]
     groups = _by_parameter(rows)
     head = ["axis and effect", "parameter", "recordings", "median", "smallest", "largest", "unit"]

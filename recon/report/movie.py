@@ -18,7 +18,7 @@ MIN_SIDE_PX = 400
 """Smaller frames are enlarged by a whole factor to this width at least, so that their labels can be read."""
 
 MAX_RATE_HZ = 30.0
-"""Frames a second: a scan that is faster is shown slower, at this rate."""
+"""Largest number of frames per second of a movie. A faster scan is shown in slow motion."""
 
 
 def write_movie(

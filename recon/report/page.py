@@ -32,7 +32,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """A header, and rows whose first cell names them."""
+    """A table: a header, and rows whose first cell is the name of the row."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
