@@ -244,7 +244,7 @@ def _reconstruct_prepared(
     """Estimate, grid and assess, with a progress bar."""
     with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=quiet or None) as progress:
         estimator = options.estimator or default_estimator(prepared.recording, prepared.device)
-        progress.set_postfix_str(f"{estimator} (compiled once, at the first run)")
+        progress.set_postfix_str(estimator)
         estimated = estimate_motion(prepared, replace(options, estimator=estimator))
         progress.update()
         progress.set_postfix_str("registration")

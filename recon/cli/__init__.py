@@ -37,6 +37,10 @@ COMMANDS = {
 """Commands and their one-line help."""
 
 
+COMPILED = ("reconstruct", "simulate", "identify", "predict", "diagnose", "design", "blur-study", "point-cloud")
+"""Commands whose numerical code is compiled at the first run."""
+
+
 class _PrintVersion(argparse.Action):
     """``--version``: print the installed version and exit."""
 
@@ -55,14 +59,20 @@ class _Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit code: 0 done, 2 bad arguments or input, 1 anything else."""
+def main(arguments: Sequence[str] | None = None, announce: bool = False) -> int:
+    """Run one command; return the exit code: 0 done, 2 bad arguments or input, 1 anything else.
+
+    Args:
+        arguments: of the command; None takes those of the process.
+        announce: say on stderr when code is compiled; also done where ``arguments`` is None.
+    """
     # The matrices are small: threads inside BLAS slow them down, on a busy machine several times.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
+    announce = announce or arguments is None
     with handle_interrupts() as stop:
         try:
-            return _run_command(words, stop)
+            return _run_command(words, stop, announce)
         except BaseException as error:
             if not stop.came or isinstance(error, SystemExit):
                 raise
@@ -71,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
 
 
-def _run_command(words: Sequence[str], stop: StopRequest) -> int:
+def _run_command(words: Sequence[str], stop: StopRequest, announce: bool) -> int:
     parser = _Parser(
         prog="lissajous", description="Resonant scanners: motion, pictures and missing physics from recordings."
     )
@@ -83,7 +93,7 @@ def _run_command(words: Sequence[str], stop: StopRequest) -> int:
         if called:
             module = add_command(name, command)
     args = parser.parse_args(words)
-    return _run(module, args, f"{parser.prog} {args.command}", stop)
+    return _run(module, args, f"{parser.prog} {args.command}", stop, announce and args.command in COMPILED)
 
 
 def add_command(name: str, parser: argparse.ArgumentParser) -> ModuleType:
@@ -99,10 +109,10 @@ def add_command(name: str, parser: argparse.ArgumentParser) -> ModuleType:
 
 def reconstruct_main() -> int:
     """``reconstruct-from-recording``: ``lissajous reconstruct`` as a separate command."""
-    return main(["reconstruct", *sys.argv[1:]])
+    return main(["reconstruct", *sys.argv[1:]], announce=True)
 
 
-def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequest) -> int:
+def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequest, announce: bool) -> int:
     from scanner.errors import BadInput, line_of
 
     try:
@@ -118,6 +128,10 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequ
             from recon.io.readers import register as register_readers
 
             register_readers(args.readers)
+        if announce:
+            from recon.compilation import announce_compilation
+
+            announce_compilation()
         summary = module.run(args)
         print(json.dumps(summary, indent=1) if args.json else _printable(module.format_summary(summary)))
         return int(summary.get("exit", 0))  # of several recordings, some may have failed
