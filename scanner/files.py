@@ -8,12 +8,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import IO, Any
 
 from scanner.errors import BadInput
 
 _MAX_DEFLATE_RATIO = 1032
 """Largest compression ratio of deflate (https://zlib.net/zlib_tech.html)."""
+
+WINDOWS_LOCK_OFFSET = 1 << 30
+"""Place of the byte that is locked on Windows: 1 GB, behind the end of any file that is locked here."""
 
 _MIN_CHECKED_BYTES = 1 << 26
 """Sizes below 64 MB are not checked: even if they are wrong, any computer can allocate them."""
@@ -110,3 +113,22 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
         raise BadInput(f"is not TOML: {error}", file=source, hint="correct the line that it names") from None
     except (ValueError, RecursionError) as error:  # thousands of digits, or too deeply nested brackets
         raise BadInput(f"is not TOML that can be read: {error}", file=source, hint="write it simpler") from None
+
+
+def lock_file(file: IO[bytes]) -> None:
+    """Lock an open file against other processes until it is closed. The lock is advisory on POSIX.
+
+    Raises:
+        OSError: another process holds the lock.
+    """
+    try:
+        import fcntl
+    except ModuleNotFoundError:  # Windows
+        import msvcrt
+
+        position = file.tell()
+        file.seek(WINDOWS_LOCK_OFFSET)  # bytes behind the content: a locked byte cannot be read by others
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
+        file.seek(position)
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

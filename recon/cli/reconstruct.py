@@ -126,8 +126,6 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         return _run_many(args, options)
     live = None
     if args.follow and args.intensity_drift:
-        from scanner.errors import BadInput
-
         raise BadInput("needs a whole recording", channel="--intensity-drift", hint="leave out --follow")
     if args.follow:
         from recon.follow import follow_recording

@@ -26,6 +26,7 @@ from recon.study.job import run_job
 from recon.study.plan import Job, cell_key, plan_jobs, read_study, remaining_jobs
 from recon.study.table import estimator_statistics, require_parquet, table_columns, table_rows, write_csv, write_parquet
 from scanner.errors import BadInput
+from scanner.files import lock_file
 
 JOURNAL = "cells.jsonl"
 Record = Mapping[str, Any]
@@ -127,11 +128,9 @@ def _journal(path: Path) -> Iterator[tuple[IO[bytes], dict[str, Record]]]:
     Raises:
         BadInput: another process writes it, or a line before the last one is not a record.
     """
-    import fcntl
-
     with path.open("ab+") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(file)
         except OSError:
             hint = "wait for it, or name another"
             raise BadInput("another run writes into this folder", file=path, hint=hint) from None

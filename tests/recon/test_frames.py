@@ -10,6 +10,7 @@ import pytest
 import tifffile
 
 import lissajous
+from lissajous.napari_reader import get_reader
 from recon.cli import main
 from recon.frames import frames, write_scan_frames
 from recon.pipeline import Options, Reconstruction, reconstruct
@@ -127,13 +128,15 @@ def test_napari_reads_a_recording(tmp_path: Path) -> None:
     assert reader.filename_patterns == ["*.h5"]
     recording, _ = imaging()
     recording.write(tmp_path / "scan.h5")
-    manager = npe2.PluginManager()
+    manager = npe2.PluginManager.instance()
     manager.register(manifest)
-    manager.enable(manifest.name)
     path = str(tmp_path / "scan.h5")
-    layers = manager.commands.execute(reader.command, kwargs={"path": path})(path)
+    try:
+        layers = npe2.read([path], stack=False)
+    finally:
+        manager.unregister(manifest.name)
     assert [(arguments["name"], kind) for _, arguments, kind in layers] == [
-        ("scan", "image"),
+        (recording.name, "image"),
         ("coverage", "image"),
         ("beam", "shapes"),
     ]
@@ -141,4 +144,4 @@ def test_napari_reads_a_recording(tmp_path: Path) -> None:
     scan = Device.from_toml(str(recording.device_toml)).require_scan()
     assert arguments["scale"][1] * picture.shape[1] == pytest.approx(2e3 * scan.half_angle_x)
     (tmp_path / "text.h5").write_text(json.dumps({}), encoding="utf-8")
-    assert manager.commands.execute(reader.command, kwargs={"path": str(tmp_path / "text.h5")}) is None
+    assert get_reader(str(tmp_path / "text.h5")) is None
