@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation.identification.decay_without_angle import fit_decay_without_angle
 from estimation.identification.fits import (
     DrivenRecord,
     IdentifiedValue,
@@ -37,6 +38,8 @@ TORQUE_SCALE = (("capacitance", "C0"), ("capacitance", "theta0"), ("drive", "tor
 Decay = tuple[Array, float, float]
 """Angle of a free decay [rad], shape (n,), its rate [Hz], and the voltage on the combs [V]."""
 
+UNREFERENCED_DECAY = "free decay without a reference angle"
+
 MIN_DRIVE_VARIATION = 1e-3
 """Standard deviation of a drive relative to its largest value below which it counts as constant."""
 
@@ -51,8 +54,8 @@ class Identification:
     Attributes:
         device: the nominal one with the identified values. Tolerances of J, b and k hold at the drive's nominal
             torque: a factor common to them and to the torque changes no motion.
-        values: axis -> name -> value; a name is a key of the device, ``delay``, ``k_over_J`` or ``b_over_J``. The
-            intervals include the uncertainty of the torque.
+        values: axis -> name -> value; a name is a key of the device, ``delay``, ``k_over_J``, ``b_over_J`` or
+            ``amplitude_over_theta0``. The intervals include the uncertainty of the torque.
         used: axis -> recordings and how each was used.
         notes: parameters that could not be determined, and the recording that would determine them.
     """
@@ -118,6 +121,9 @@ class _AxisIdentification:
         if kind == "rest":
             self._rest(recording)
             return
+        if kind == UNREFERENCED_DECAY:
+            self._unreferenced(recording)
+            return
         names = [f"angle_{self.name}", *[n for n in (f"sense_{self.name}", f"drive_{self.name}") if n in recording]]
         clock, values = on_clock(recording, names)
         angle = values[f"angle_{self.name}"]
@@ -139,6 +145,19 @@ class _AxisIdentification:
             found = fit_capacitance_profile(self.axis, angle, sense, clock.rate, frequency).values
             self.values = combine_values([self.values, found])
 
+    def _unreferenced(self, recording: Recording) -> None:
+        """Ratios of the mechanics from a free decay of the readout's signal alone, with a note on the other values."""
+        readout = self.axis.require_readout()
+        found = fit_decay_without_angle(self.axis, recording[f"sense_{self.name}"])
+        self.values = combine_values([self.values, found])
+        open_values = "J, and the gain of the readout"
+        if not isinstance(readout, MotionSensor):
+            open_values = "J, theta0, C0, the gain of the readout, and the sign of the angle"
+        self.notes.append(
+            f"{self.name}: without a reference angle a free decay determines k/J and b/J (resonance and Q) only; "
+            f"{open_values} stay as stated; record angle_{self.name}, and driven motion for J"
+        )
+
     def _rest(self, recording: Recording) -> None:
         sense = recording[f"sense_{self.name}"].read()
         variance = float(sense.var(ddof=1))
@@ -155,6 +174,12 @@ class _AxisIdentification:
 
     def conclude(self) -> None:
         """Determine the mechanics: scaled by driven motion, else by a bias during a decay, else by the nominal J."""
+        if not self.decays and "k_over_J" in self.values:
+            J = self.axis.require_mechanics().J
+            for key in ("k", "b"):
+                ratio = self.values[f"{key}_over_J"]
+                self.values[key] = IdentifiedValue(ratio.value * J, ratio.sd * J)
+                self.by_torque[key] = ratio.value * self.axis.tolerance.get("J", DEFAULT_TOLERANCE) * J
         axis = self.device_axis()  # with the capacitance as identified
         if self.decays:
             self._take(axis, lambda axis: mechanics_from_decays(axis, self.decays))
@@ -228,7 +253,10 @@ def mechanics_from_decays(axis: Axis, decays: Sequence[Decay]) -> dict[str, Iden
 
 
 def classify_recording(recording: Recording, name: str) -> str | None:
-    """``"rest"``, ``"free decay"`` or ``"driven"``: what a recording shows of one axis; None if nothing is of use."""
+    """What a recording shows of one axis; None if nothing is of use.
+
+    ``"rest"``, ``"free decay"`` or ``"driven"`` with a reference angle, or ``UNREFERENCED_DECAY``.
+    """
     drive, angle, sense = (recording.channels.get(f"{kind}_{name}") for kind in ("drive", "angle", "sense"))
     oscillates = False
     if drive is not None:
@@ -239,7 +267,7 @@ def classify_recording(recording: Recording, name: str) -> str | None:
     if sense is None or oscillates:
         return None
     check_signal(sense)
-    return None if shows_motion(sense.read()) else "rest"
+    return UNREFERENCED_DECAY if shows_motion(sense.read()) else "rest"
 
 
 def shows_motion(values: Array) -> bool:

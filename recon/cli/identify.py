@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 UNITS = {
     "J": "kg m²", "b": "N m s", "k": "N m/rad", "k_over_J": "1/s²", "b_over_J": "1/s",
     "C0": "F", "theta0": "rad", "theta_th": "rad", "a_cir": "V/F", "b_cir": "V",
-    "noise_var": "V²", "noise_sd": "V", "delay": "s",
+    "noise_var": "V²", "noise_sd": "V", "delay": "s", "amplitude_over_theta0": "1",
 }  # fmt: skip
 """Units of the constants that can be identified."""
 

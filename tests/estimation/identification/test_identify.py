@@ -243,14 +243,16 @@ def test_a_recording_is_classified_as_rest_free_decay_or_driven(decay):
     assert classify_recording(made(sense=still), "x") == "rest"
     assert classify_recording(made(angle=swinging, sense=swinging), "x") == "free decay"
     assert classify_recording(made(angle=swinging, drive=swinging), "x") == "driven"
-    assert classify_recording(made(sense=swinging), "x") is None
+    assert classify_recording(made(sense=swinging), "x") == "free decay without a reference angle"
+    assert classify_recording(made(sense=swinging, drive=swinging), "x") is None
     assert classify_recording(made(sense=still), "y") is None
 
 
-def test_recordings_without_a_reference_angle_are_refused(tmp_path, capsys):
+def test_driven_recordings_without_a_reference_angle_are_refused(tmp_path, capsys):
     path = tmp_path / "no.h5"
     swinging = np.sin(np.arange(3000) / 50.0)
-    Recording.from_arrays({"sense_x": (swinging, "V", RATE, 0.0)}, DRIVEN).write(path)
+    channels = {"sense_x": (swinging, "V", RATE, 0.0), "drive_x": (swinging, "V", RATE, 0.0)}
+    Recording.from_arrays(channels, DRIVEN).write(path)
     assert main(["identify", str(path), "-o", str(tmp_path / "out")]) == 2
     assert "reference angle" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -1,0 +1,120 @@
+"""Resonance and damping from a free decay without a reference angle: from the readout's own signal.
+
+The angle is A exp(-g t) sin(w t + phase). A sensor of the motion shows a linear function of it. A capacitive readout
+shows the comb's law of theta / theta0, so that the amplitude is determined in units of theta0 only. Gain and offset of
+either readout are eliminated as linear parameters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S, IdentifiedValue
+from scanner.arrays import Array
+from scanner.channel import Channel
+from scanner.device import Amdm, Axis, MotionSensor, Transimpedance
+from scanner.errors import BadInput
+from scanner.lowpass import run_section, section_coefficients
+
+MIN_CYCLES = 8.0
+"""Cycles of a decay that are needed: its frequency and its damping are then distinct in the first fit window."""
+
+LINE_CYCLES = 40.0
+"""Cycles from the start in whose spectrum the frequency is first found."""
+
+SECTION_SAMPLES_PER_CYCLE = 400
+"""Samples a cycle at which low-pass sections are stepped: their input is taken as linear between samples."""
+
+MAX_SAMPLES_PER_CYCLE = 40
+"""Samples a cycle that are fitted: the harmonics of a comb are resolved up to the eighth."""
+
+START_AMPLITUDES = (0.15, 0.5, 1.0)
+"""Starts of the amplitude behind a capacitive readout, in units of theta0."""
+
+
+def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, IdentifiedValue]:
+    """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, behind a capacitive readout, ``amplitude_over_theta0``.
+
+    Raises:
+        BadInput: fewer than ``MIN_CYCLES`` cycles, or the signal does not follow a free decay.
+    """
+    from scipy.optimize import least_squares
+
+    readout, resonance = axis.require_readout(), axis.resonance
+    order = 1 if isinstance(readout, MotionSensor) else 2
+    w0 = 2 * np.pi * _line(channel, order * resonance) / order
+    stride = max(1, int(channel.sample_rate * 2 * np.pi / w0 / MAX_SAMPLES_PER_CYCLE))
+    y = channel.read()[::stride]
+    time = np.arange(y.size) * stride / channel.sample_rate
+    cycles = time[-1] * w0 / (2 * np.pi)
+    if cycles < MIN_CYCLES:
+        hint = f"record {MIN_CYCLES:g} cycles or more"
+        raise BadInput(f"holds {cycles:.3g} cycles of a free decay", file=channel.file, channel=channel.name, hint=hint)
+    sections = readout.lpf_hz if isinstance(readout, Amdm) else ()
+    skip = round(SETTLE_TIME_S / stride * channel.sample_rate) if sections else 0
+    finer = max(1, round(SECTION_SAMPLES_PER_CYCLE * cycles / y.size)) if sections else 1
+    theta_th = 0.0 if order == 1 else axis.require_capacitance().theta_th / axis.require_capacitance().theta0
+
+    def basis(x: Array, n: int) -> Array:
+        """Signals that gain and offset multiply, shape (n, 2 or 3)."""
+        t = np.arange((n - 1) * finer + 1) * (time[1] / finer)
+        rate, decay = w0 * (1.0 + x[0]), np.exp(x[1])
+        envelope, turn = np.exp(-decay * t), rate * t
+        if order == 1:
+            return np.stack([envelope * np.cos(turn), envelope * np.sin(turn), np.ones(n)], axis=1)
+        theta = np.exp(x[2]) * envelope * np.sin(turn + x[3])
+        u = theta - theta_th
+        shape = np.exp(-u * u)
+        if isinstance(readout, Transimpedance):
+            speed = np.exp(x[2]) * envelope * (rate * np.cos(turn + x[3]) - decay * np.sin(turn + x[3])) / w0
+            shape = -2.0 * u * shape * speed
+        for cutoff in sections:
+            run_section(shape, *section_coefficients(cutoff, time[1] / finer), shape[0], shape[0])
+        return np.stack([shape[::finer], np.ones(n)], axis=1)
+
+    def residual(x: Array, n: int) -> Array:
+        columns, part = basis(x, n)[skip:], y[skip:n]
+        return np.asarray(part - columns @ np.linalg.lstsq(columns, part, rcond=None)[0])
+
+    decay = max(-_log_slope(y, time, order), 0.05 / time[-1])
+    starts = [np.array([0.0, np.log(decay)])]
+    if order == 2:
+        phases = np.pi * np.arange(8) / 8
+        starts = [np.array([0.0, np.log(decay), np.log(a), p]) for a in START_AMPLITUDES for p in phases]
+    per_cycle = y.size / cycles
+    windows = [round(per_cycle * c) for c in (6.0, 25.0, 100.0, 400.0, 1600.0, 6400.0) if c < 0.7 * cycles]
+    x = min(starts, key=lambda x: float(np.sum(residual(x, windows[0] if windows else y.size) ** 2)))
+    for n in (*windows, y.size):
+        solution = least_squares(residual, x, args=(n,), x_scale="jac")
+        x = solution.x
+    left = solution.fun
+    if left.std() > MAX_RINGDOWN_RESIDUAL_RATIO * y[: max(y.size // 4, windows[0] if windows else 0)].std():
+        what, hint = "does not follow a free decay", "cut the record to the decay alone, without a bias that changes it"
+        raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
+    variance = float(left @ left) / max(y.size - x.size - basis(x, y.size).shape[1], 1)
+    sd = np.sqrt(variance * np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))
+    rate, decay = w0 * (1.0 + x[0]), float(np.exp(x[1]))
+    values = {
+        "k_over_J": IdentifiedValue(float(rate**2 + decay**2), float(2.0 * rate * w0 * sd[0])),
+        "b_over_J": IdentifiedValue(2.0 * decay, float(2.0 * decay * sd[1])),
+    }
+    if order == 2:
+        values["amplitude_over_theta0"] = IdentifiedValue(float(np.exp(x[2])), float(np.exp(x[2]) * sd[2]))
+    return values
+
+
+def _line(channel: Channel, near: float) -> float:
+    """Frequency of the largest line within a quarter of ``near`` [Hz], in the first ``LINE_CYCLES`` cycles."""
+    values = channel.read(0, round(LINE_CYCLES / near * channel.sample_rate))
+    padded = 1 << (8 * values.size - 1).bit_length()
+    spectrum = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(values.size), padded))
+    frequency = np.fft.rfftfreq(padded, 1.0 / channel.sample_rate)
+    spectrum[(frequency < 0.8 * near) | (frequency > 1.25 * near)] = 0.0
+    return float(frequency[np.argmax(spectrum)])
+
+
+def _log_slope(y: Array, time: Array, order: int) -> float:
+    """Slope of the logarithm of the amplitude, from the size of the signal in four quarters [1/s]."""
+    parts = np.array_split(np.arange(y.size), 4)
+    sizes = np.log([max(float(np.std(y[part])), 1e-300) for part in parts])
+    return float(np.polyfit([time[part].mean() for part in parts], sizes, 1)[0]) / order

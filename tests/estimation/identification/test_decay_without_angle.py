@@ -1,0 +1,74 @@
+"""Free decays without a reference angle: resonance and damping from the readout's signal, also from eight cycles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.identification.calibrate import identify
+from estimation.identification.decay_without_angle import fit_decay_without_angle
+from phantoms.forward import InitialState, Plan, simulate
+from phantoms.waveforms import Constant
+from recon.cli import main
+from scanner import devices
+from scanner.device import Acceleration, Axis, Device, Mechanics, MotionSensor, Position, Velocity
+from scanner.errors import BadInput
+from scanner.recording import Recording
+
+W, QUALITY = 2 * np.pi * 5000.0, 80.0
+SENSORS = [Position(10.0, 0.01), Velocity(10.0 / W, 0.01), Acceleration(10.0 / W**2, 0.01)]
+
+
+def decay(readout: MotionSensor, cycles: float, seed: int) -> tuple[Recording, Device]:
+    """A decay from 0.1 rad, and a nominal device that is 1 % off in resonance and a third in Q."""
+    axis = Axis(Mechanics(1e-10, 1e-10 * W / QUALITY, 1e-10 * W**2), readout=readout, name="x")
+    nominal = replace(axis, mechanics=Mechanics(1e-10, 1e-10 * W / 60.0, 1.02e-10 * W**2))
+    plan = Plan({"x": Constant(0.0)}, cycles / 5000.0, 2e5)
+    recording, _ = simulate(Device("d", {"x": axis}), plan, start={"x": InitialState(0.1, 0.0)}, seed=seed)
+    channels = {"sense_x": (recording["sense_x"].read(), "V", 2e5)}
+    return Recording.from_arrays(channels), Device("d", {"x": nominal})
+
+
+@pytest.mark.parametrize("cycles", [8.3, 100.0])
+@pytest.mark.parametrize("readout", SENSORS, ids=lambda readout: readout.kind)
+def test_sensors_of_the_motion_determine_the_ratios(readout: MotionSensor, cycles: float) -> None:
+    recording, device = decay(readout, cycles, 5)
+    found = identify([recording], device)
+    for key, true in (("k_over_J", W**2), ("b_over_J", W / QUALITY)):
+        value = found.values["x"][key]
+        assert value.value == pytest.approx(true, abs=4.5 * value.sd)
+        assert value.sd < 0.05 * true
+    assert found.device.axes["x"].resonance == pytest.approx(5000.0, rel=2e-3)
+    assert found.device.axes["x"].quality == pytest.approx(QUALITY, rel=0.1)
+    assert any("without a reference angle" in note and "J, and the gain" in note for note in found.notes)
+
+
+def test_a_capacitive_decay_determines_the_ratios_and_names_the_rest(tmp_path: Path) -> None:
+    device = devices.load("chen2020")
+    plan = Plan({"x": Constant(0.0)}, 0.006, 1e6)
+    recording, _ = simulate(device, plan, start={"x": InitialState(0.15, 0.0)}, seed=2)
+    channels = {"sense_x": (recording["sense_x"].read(), "V", 1e6)}
+    found = identify([Recording.from_arrays(channels)], device)
+    mechanics = device.axes["x"].mechanics
+    assert mechanics is not None
+    for key, true in (("k_over_J", mechanics.k / mechanics.J), ("b_over_J", mechanics.b / mechanics.J)):
+        value = found.values["x"][key]
+        assert value.value == pytest.approx(true, abs=4.5 * value.sd)
+        assert value.sd < 0.03 * true
+    assert any("J, theta0, C0, the gain of the readout, and the sign of the angle" in note for note in found.notes)
+    Recording.from_arrays(channels, device).write(tmp_path / "decay.h5")
+    assert main(["identify", str(tmp_path / "decay.h5"), "-o", str(tmp_path / "out")]) == 0
+    assert "amplitude_over_theta0" in (tmp_path / "out/summary.json").read_text(encoding="utf-8")
+
+
+def test_seven_cycles_are_refused_and_so_is_another_motion() -> None:
+    recording, device = decay(SENSORS[0], 7.5, 1)
+    with pytest.raises(BadInput, match=r"holds 7\.\d+ cycles of a free decay; record 8 cycles or more"):
+        fit_decay_without_angle(device.axes["x"], recording["sense_x"])
+    time = np.arange(20_000) / 2e5
+    wrong = Recording.from_arrays({"sense_x": (np.sin(2 * np.pi * 5000 * time + 4.0 * np.sin(60 * time)), "V", 2e5)})
+    with pytest.raises(BadInput, match="does not follow a free decay"):
+        fit_decay_without_angle(device.axes["x"], wrong["sense_x"])
