@@ -166,9 +166,12 @@ def _covariance(
 
 
 def _angle_sd(axis: AxisMotion, angle: Array, when: Array) -> Array:
-    """Standard deviation of the angle that that of the phase causes, shape (n,) [rad]."""
-    amplitude, sd = (np.interp(when, axis.time, values) for values in (axis.amplitude, axis.phase_sd))
-    return sd * np.sqrt(np.maximum(np.square(amplitude) - np.square(angle), 0.0))
+    """Standard deviation of the angle that those of phase and amplitude cause, shape (n,) [rad]."""
+    amplitude, phase_sd = (np.interp(when, axis.time, values) for values in (axis.amplitude, axis.phase_sd))
+    by_phase = phase_sd * np.sqrt(np.maximum(np.square(amplitude) - np.square(angle), 0.0))
+    if axis.amplitude_sd is None:
+        return by_phase
+    return np.hypot(by_phase, angle / amplitude * np.interp(when, axis.time, axis.amplitude_sd))
 
 
 def _notes(geometry: Geometry, assumed: bool, distance: Array, estimated: EstimatedMotion) -> list[str]:
