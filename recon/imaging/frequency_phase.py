@@ -26,7 +26,6 @@ from recon.imaging.amplitude_change import measure_amplitude_changes
 from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
 from recon.imaging.phase_search import MIN_CORRELATION_SD, PhaseFound, search_phases
 from recon.imaging.picture import Grid
-from recon.imaging.readout_phase import measured_phase_error
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES, Device
@@ -87,12 +86,15 @@ def phases_from_picture(
         logs = _corrected_amplitudes(motion, logs, intensity, grid, windows)
         converged = all(_has_converged(before[name], phases[name]) for name in AXES)
         rounds += 1
+    measured = {name: int(np.isfinite([getattr(error, name).sd for error in errors]).sum()) for name in AXES}
     for name, log in logs.items():
         largest = interpolate_curve(log, phases[name].time)[0].max()
         logs[name] = log._replace(value=log.value - largest + field[name])
+    for name in AXES:  # a phase that few slices show may be a wrong minimum
+        if measured[name] < MIN_FOUND_FRACTION * len(errors):
+            phases[name] = phases[name]._replace(sd=np.full(phases[name].time.size, UNKNOWN_PHASE_SD))
     axes = _axes(references, phases, logs, intensity)
     axes = {name: axis.negated() if flips.get(name, False) else axis for name, axis in axes.items()}
-    measured = {name: int(np.isfinite([getattr(error, name).sd for error in errors]).sum()) for name in AXES}
     if not any(measured.values()):
         raise BadInput(_describe_failure(references, found, slices, intensity), channel="intensity", hint=SEARCH_HINT)
     info = {"picture": {"rounds": rounds, "slices": len(errors), "told": measured}}
@@ -214,7 +216,9 @@ def _knots(time: Array, value: Array) -> SlowCurve:
 
 def _smoothed(errors: list[PhaseError], axis: AxisMotion, phase: SlowCurve, name: str) -> SlowCurve:
     """The phase plus its errors in short parts, smoothed; unchanged where the picture determines none."""
-    time, value, sd = measured_phase_error(errors, AXES.index(name), axis, axis)
+    parts = [error.parts for error in errors if error.parts is not None]
+    time, values, sds = (np.concatenate(column) for column in zip(*parts, strict=True))
+    time, value, sd = axis.angle.start + time, values[:, AXES.index(name)], sds[:, AXES.index(name)]
     used = np.isfinite(value) & np.isfinite(sd)
     if used.sum() < 2:
         return phase._replace(sd=np.full(phase.time.size, UNKNOWN_PHASE_SD))
@@ -269,9 +273,9 @@ def _notes(measured: Mapping[str, int], slices: int) -> list[str]:
         "changes during the scan were measured",
     ]
     notes += [
-        f"the picture shows no phase of {name} (no feature across it, or a wrong drive frequency): the samples are "
-        f"mapped to wrong places along {name}"
+        f"the picture shows the phase of {name} in {measured[name]} of {slices} slices only (no feature across it, too "
+        f"few samples, or a wrong drive frequency): the samples may be mapped to wrong places along {name}"
         for name in AXES
-        if measured[name] == 0
+        if measured[name] < MIN_FOUND_FRACTION * slices
     ]
     return notes
