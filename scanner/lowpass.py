@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 from scanner.arrays import Array, Complex
 
+SMALL_STEP = 0.05
+"""Step in units of a section's time constant below which a series is used, because differences lose digits there."""
+
 
 def lowpass_response(frequency: NDArray[Any] | float, cutoffs: Sequence[float]) -> Complex:
     """Return the complex gain of first-order sections in series, in the shape of ``frequency``.
@@ -47,6 +50,21 @@ def section_coefficients(cutoff: float, step: float) -> tuple[float, float, floa
     return e, mean - e, 1.0 - mean
 
 
+def curvature_share(cutoff: float, step: float) -> float:
+    """Return the part of a second difference by which a parabola lies below its chord, as the section weighs it.
+
+    It is the mean of s (1 - s) / 2 over one step with the weight exp(-a (1 - s)), a = 2 pi cutoff step: 1/12 for a
+    cutoff far below the sampling rate, 1 / (2 a) far above, where the samples pass unchanged.
+    """
+    a = 2.0 * math.pi * cutoff * step
+    if a < SMALL_STEP:
+        return (1.0 - a * a / 60.0) / 12.0
+    e, fall = math.exp(-a), -math.expm1(-a)
+    first = (fall - a * e) / a
+    second = (2.0 * fall - a * (a + 2.0) * e) / (a * a)
+    return 0.5 * (first - second) / fall
+
+
 @njit(cache=True)
 def run_section(signal, e, p, q, u, x):  # type: ignore[no-untyped-def]
     """Filter ``signal`` (n,) in place, after an output ``u`` and an input ``x``. Returns the last output and input."""
@@ -61,9 +79,9 @@ def run_section(signal, e, p, q, u, x):  # type: ignore[no-untyped-def]
 def apply_lowpass(signal: Array, cutoff: float, step: float) -> Array:
     """Return a smooth signal after one first-order section that has settled at the signal's first value.
 
-    The exact step is for an input that is linear between samples. It attenuates a tone of angular frequency w by
-    (w step)^2 / 12, which at a few tens of samples a cycle acts like an additional lag. Subtracting a twelfth of the
-    second differences first corrects for that.
+    The exact step is for an input that is linear between samples. Below its cutoff it attenuates a tone of angular
+    frequency w by (w step)^2 / 12, which at a few tens of samples a cycle acts like an additional lag. Subtracting a
+    part of the second differences first corrects for that, see :func:`curvature_share`.
 
     Args:
         signal: shape (n,).
@@ -77,6 +95,6 @@ def apply_lowpass(signal: Array, cutoff: float, step: float) -> Array:
     if not np.isfinite(cutoff):
         return signal
     filtered = signal.copy()
-    filtered[1:-1] -= (signal[2:] - 2.0 * signal[1:-1] + signal[:-2]) / 12.0
+    filtered[1:-1] -= curvature_share(abs(cutoff), step) * (signal[2:] - 2.0 * signal[1:-1] + signal[:-2])
     run_section(filtered, *section_coefficients(abs(cutoff), step), filtered[0], filtered[0])
     return filtered if cutoff > 0 else 2.0 * signal - filtered

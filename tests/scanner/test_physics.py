@@ -204,3 +204,15 @@ def test_drift_starts_at_the_start_of_the_recording() -> None:
     factor = exponential(-0.002, 0.025)
     assert factor(np.array([-1.0, 0.0])).tolist() == [1.0, 1.0]
     assert factor(np.array([0.025]))[0] == pytest.approx(1 - 0.002 * (1 - np.exp(-1)))
+
+
+@pytest.mark.parametrize("cutoff", [100.0, 3e3, 2e4, 1e5, 1e6, 1e8])
+def test_a_section_answers_a_tone_exactly_whatever_its_cutoff(cutoff: float) -> None:
+    rate, f = 1e5, 2000.0
+    time = np.arange(4000) / rate
+    tone = np.exp(2j * np.pi * f * time)
+    shown = apply_lowpass(tone.real, cutoff, 1 / rate)[3000:-1]
+    wanted = (lowpass_response(f, [cutoff]) * tone).real[3000:-1]
+    transient = np.exp(-2 * np.pi * cutoff * 0.03)
+    # relative to what the section changes, so that a corner far above the tone is tested too
+    assert np.std(shown - wanted) < (5e-3 + transient) * np.std(tone.real[3000:-1] - wanted)
