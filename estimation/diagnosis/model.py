@@ -442,3 +442,8 @@ def _truncate(inputs: DriveInput, stop: float) -> DriveInput:
     if stop >= 1.0:
         return inputs
     return replace(inputs, voltage=inputs.voltage[: max(8, int(stop * len(inputs.voltage)))])
+
+
+def uncertain(model: Model) -> list[Candidate]:
+    """The terms of a model that a fit can decide on: those recognised in the samples have no free parameter."""
+    return [each for each in model.candidates if each.term.free_parameters]

@@ -98,6 +98,10 @@ DUPLICATE_DISTANCE_SIGMA2 = 1.0
 """Squared distance [sigma²] of two fits of one candidate below which they have the same motion and one is dropped."""
 
 
+Settles = Callable[[Fit], bool]
+"""Whether a fit of a named term needs no comparison with fits of discrepancy terms."""
+
+
 def satisfies_sign_constraints(fit: Fit) -> bool:
     """Whether every parameter of the terms has a physically possible sign."""
     return all(
@@ -157,14 +161,16 @@ def is_significant(likelihood: Likelihood, before: Fit, after: Fit) -> bool:
     return validation_gain > required_gain
 
 
-def fit_screened_candidates(likelihood: Likelihood, base: Fit, candidates: Sequence[Candidate]) -> list[Fit]:
+def fit_screened_candidates(
+    likelihood: Likelihood, base: Fit, candidates: Sequence[Candidate], settles: Settles = lambda fit: False
+) -> list[Fit]:
     """Fits of the candidates with a predicted gain around ``base``; the best first.
 
     Discrepancy terms, which cost most, are fitted only if they gain beside the best named term.
     """
     promising = sorted(score_candidates(likelihood, base, candidates), key=lambda s: -s.predicted_gain)
     named, free = _split_discrepancy([each for each in promising if each.predicted_gain > MIN_PREDICTED_GAIN])
-    return _fit_named_first(named, free, lambda part, bar: _fit_shortlist(likelihood, base, part))
+    return _fit_named_first(named, free, lambda part, bar: _fit_shortlist(likelihood, base, part), settles)
 
 
 def _split_discrepancy(screened: Sequence[ScoreTest]) -> tuple[list[ScoreTest], list[ScoreTest]]:
@@ -174,16 +180,20 @@ def _split_discrepancy(screened: Sequence[ScoreTest]) -> tuple[list[ScoreTest], 
 
 
 def _fit_named_first(
-    named: list[ScoreTest], free: list[ScoreTest], fitted: Callable[[list[ScoreTest], Fit | None], list[Fit]]
+    named: list[ScoreTest],
+    free: list[ScoreTest],
+    fitted: Callable[[list[ScoreTest], Fit | None], list[Fit]],
+    settles: Settles,
 ) -> list[Fit]:
     """Fits of named terms, and of discrepancy terms if they gain beside the best named term; the best first.
 
     Args:
         fitted: fits a list of candidates, given the best fit so far.
+        settles: whether the best named term leads to laws that need no discrepancy term.
     """
     fits = fitted(named, None)
     best = min(fits, key=lambda fit: fit.neg2_log_evidence, default=None)
-    if free and not (best is not None and _explains(best, [each.candidate for each in free])):
+    if free and not (best is not None and (_explains(best, [each.candidate for each in free]) or settles(best))):
         fits += fitted(free, best)
     return sorted(fits, key=lambda fit: fit.neg2_log_evidence)
 
@@ -226,6 +236,7 @@ def fit_candidates_progressively(
     early: Sequence[Fit],
     stops: Sequence[float],
     candidates: Sequence[Candidate],
+    settles: Settles = lambda fit: False,
 ) -> list[Fit]:
     """Fits of candidates over growing windows, from the last one that the nominal model fits; the worst are dropped.
 
@@ -276,7 +287,7 @@ def fit_candidates_progressively(
             rival = min([*fits, *([rival] if rival else [])], key=lambda fit: fit.neg2_log_evidence, default=None)
         return fits
 
-    return _fit_named_first(named, free, through)
+    return _fit_named_first(named, free, through, settles)
 
 
 def _seed_self_excited(

@@ -20,7 +20,8 @@ from estimation.diagnosis.initial import (
     window_schedule,
 )
 from estimation.diagnosis.interference import strongest_interfering_line
-from estimation.diagnosis.model import MAINS_HZ, Candidate, Model
+from estimation.diagnosis.law_selection import choose_laws
+from estimation.diagnosis.model import MAINS_HZ, Candidate, Model, uncertain
 from estimation.diagnosis.noise import Whitener
 from estimation.diagnosis.progressive_fit import (
     CHI2_ADEQUATE,
@@ -125,6 +126,11 @@ def select_terms(
     states = [SelectionState(likelihood, nominal, select_mains_hum(likelihood, nominal), {})]
     states += _forward_steps(states[0], [*named, *DISCREPANCY_TERMS.values()], early, stops, progress)
     found = states[-1]
+    if not found.settled and len(uncertain(found.best.model)) > 1:
+        pool = all_candidates(device, found.best.model, [*named, *DISCREPANCY_TERMS.values()])
+        chosen = _LawChoice(found.nominal, pool, found.rivals, progress)
+        if chosen.settles(found.best) and chosen.state is not None:
+            found = chosen.state
     if (
         _ends_with_discrepancy(found.best)
         and found.nominal.validation_chi2 > CHI2_LARGE
@@ -147,7 +153,7 @@ def select_terms(
         fewer = prune_by_evidence(found.likelihood, found.best)
         if fewer is not None and fewer.neg2_log_evidence < found.best.neg2_log_evidence:
             found = replace(found, best=fewer)
-    elif len(found.best.model.candidates) > len(clipped):
+    elif len(found.best.model.candidates) > len(clipped) and not found.settled:
         found = _replace_terms_by_discrepancy(found)
     steps = tuple(
         _selection_step(found.likelihood, found.nominal, found.best, each, found.rivals.get(each.key, ()))
@@ -164,6 +170,7 @@ class SelectionState:
         nominal, best: the nominal device and the best fit, under the same noise.
         rivals: of each term, by its key.
         tried: fits of the named terms among which the last was chosen, under the noise before it.
+        settled: whether the terms were chosen beside a discrepancy, so that none may replace them.
     """
 
     likelihood: Likelihood
@@ -171,6 +178,7 @@ class SelectionState:
     best: Fit
     rivals: Mapping[str, RivalFits]
     tried: Sequence[Fit] = ()
+    settled: bool = False
 
 
 def _forward_steps(
@@ -198,17 +206,21 @@ def _forward_steps(
         pool = [each for each in terms if not (adequate and each.effect in DISCREPANCY_TERMS)]
         candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
         progress(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
+        chosen = _LawChoice(nominal, candidates, rivals, progress)
         if tried:
             fits, tried = list(tried), ()
         elif best.chi2 < (CHI2_DIVERGED if taken else CHI2_LINEARISABLE) * best.rows.sum():
-            fits = fit_screened_candidates(likelihood, best, candidates)
+            fits = fit_screened_candidates(likelihood, best, candidates, chosen.settles)
         else:
             if taken:
                 progress(f"refitting windows with {', '.join(sorted(taken))}")
                 early = fit_progressively(
                     likelihood, best.model, best.model.map_parameters_from(early[0].model, early[0].x), stops
                 )
-            fits = fit_candidates_progressively(likelihood, best.model, early, stops, candidates)
+            fits = fit_candidates_progressively(likelihood, best.model, early, stops, candidates, chosen.settles)
+        if chosen.state is not None:
+            yield chosen.state
+            return
         if not fits or best.neg2_log_evidence - fits[0].neg2_log_evidence < DETECTION_THRESHOLD:
             return
         progress(f"refit with {fits[0].model.candidates[-1].key}")
@@ -231,7 +243,10 @@ def _forward_steps(
         named = [each for each in candidates if each.term.effect not in DISCREPANCY_TERMS]
         leads = _rivals_of_newest(found, before, close)
         if _ends_with_discrepancy(found):
-            progress("replacing the discrepancy term by named terms")
+            progress("named laws beside the discrepancy")
+            if chosen.settles(found) and chosen.state is not None:
+                yield chosen.state
+                return
             likelihood, before, found = _replace_discrepancy_by_terms(likelihood, before, found, named)
             close = []  # they were fitted under another noise if terms were exchanged
         if not _ends_with_discrepancy(found) and found.chi2 < CHI2_DIVERGED * found.rows.sum():
@@ -247,6 +262,35 @@ def _forward_steps(
         yield SelectionState(likelihood, nominal, best, rivals, by_name)
         if _ends_with_discrepancy(best):
             return
+
+
+class _LawChoice:
+    """Whether named laws with a small remainder explain the misfit, decided once the best named term is fitted.
+
+    Attributes:
+        state: with the laws, under the noise that they leave; None where they do not.
+    """
+
+    def __init__(
+        self, nominal: Fit, candidates: Sequence[Candidate], rivals: Mapping[str, RivalFits], progress: Progress
+    ):
+        self._nominal, self._candidates, self._rivals, self._progress = nominal, candidates, rivals, progress
+        self.state: SelectionState | None = None
+
+    def settles(self, best: Fit) -> bool:
+        """Whether no discrepancy term has to be fitted beside the best named term.
+
+        Where the nominal device is nearly adequate, the laws also have to be significant without a discrepancy.
+        """
+        choice = choose_laws(best, self._candidates, self._progress)
+        if choice is None:
+            return False
+        before = fit_model(choice.likelihood, self._nominal.model, self._nominal.x)
+        if before.validation_chi2 < CHI2_INADEQUATE and not is_significant(choice.likelihood, before, choice.fit):
+            return False
+        rivals = {**self._rivals, **choice.rivals}
+        self.state = SelectionState(choice.likelihood, before, choice.fit, rivals, settled=True)
+        return True
 
 
 def _accept_while_halving(start: SelectionState, further: Iterator[SelectionState]) -> SelectionState:
@@ -356,11 +400,6 @@ def drop_redundant(likelihood: Likelihood, fit: Fit) -> Fit:
         if not evidence_gain(likelihood, reduced, fit):
             return drop_redundant(likelihood, reduced)
     return fit
-
-
-def uncertain(model: Model) -> list[Candidate]:
-    """The terms of a model that a fit can decide on: those recognised in the samples have no free parameter."""
-    return [each for each in model.candidates if each.term.free_parameters]
 
 
 def refit_without(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Fit:

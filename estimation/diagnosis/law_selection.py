@@ -1,0 +1,388 @@
+"""Named laws beside a small discrepancy: which of them explain a misfit when no model is exactly right.
+
+Around a fit that has the phase of the motion right, every named law and every discrepancy term is linear. All
+hypotheses contain the discrepancy terms of all stages, each with one scale that is estimated by maximum evidence, and
+differ in the named laws beside them. A named law is favoured because the discrepancy that is left to explain is
+smaller: every coefficient of it gains the logarithm of the ratio of the scales. All of it works on one matrix of inner
+products.
+
+Source: model discrepancy, Kennedy & O'Hagan, J. R. Stat. Soc. B 63, 425 (2001); scales by MacKay's fixed point, Neural
+Computation 4, 415 (1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.exchange import MIN_EXCHANGE_GAIN, RivalFit
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model
+from estimation.diagnosis.initial import estimate_whiteners
+from estimation.diagnosis.model import Candidate, Model, uncertain
+from estimation.diagnosis.screening import ScoreTest, amplitude_indices, is_amplitude, score_candidate_starts
+from scanner.arrays import Array
+
+SCALE_ITERATIONS = 12
+"""Fixed-point iterations of the discrepancy's scales. They change a score by less than 1 afterwards."""
+
+MIN_SCALE, MAX_SCALE, INITIAL_SCALE = 1e-4, 1.0, 0.1
+"""Bounds of a discrepancy's scale in units of its prior, and the first value."""
+
+SCREENING_FACTORS = (1.0, 0.1, 0.01)
+"""Factors on the scales with which laws are ranked: beside a law that takes the bulk, the discrepancy is smaller."""
+
+SCREENED_LAWS = 4
+"""Laws whose score is computed with scales of their own, of every ranking."""
+
+MIN_SCORE_GAIN = 10.0
+"""Fall of -2 log evidence from which a law is added: 150 in probability, which leaves a margin for the choice among
+the catalogue."""
+
+MAX_SCALE_BESIDE = 0.3
+"""Scale of a discrepancy, in units of its prior, up to which it is small enough to be linear beside a law."""
+
+MAX_LAWS = 3
+"""Laws that are selected together."""
+
+MAX_STARTS = 3
+"""Values of a law's time constant or frequency that stand for it in the linear model."""
+
+MAX_LINEARISATIONS = 4
+"""Fits around which laws are selected, each with the laws selected before."""
+
+MAX_RESIDUAL_RATIO = 0.3
+"""Residual over signal, both as standard deviations, up to which a fit has the phase of the motion right."""
+
+MAX_CHI2_RATIO = 100.0
+"""Chi-square of the selected laws over that of the fit around which they were selected, above which they were not
+linear."""
+
+MIN_SHARE = 0.03
+"""Share of the misfit below which a law beside others is left to the remainder: unlisted imperfections take as much."""
+
+MIN_BULK = 0.5
+"""Share that a named law has to take of what it and a free correction of its stage take together."""
+
+
+@dataclass(frozen=True)
+class LinearTerm:
+    """A term as the linear model has it.
+
+    Attributes:
+        candidate: the term.
+        columns: of the matrix of inner products, shape (q,).
+        test: where it is linearised, None if the fit contains it.
+        cost: -2 log of the share of its time constants and frequencies that the recording leaves possible.
+    """
+
+    candidate: Candidate
+    columns: NDArray[np.intp]
+    test: ScoreTest | None
+    cost: float = 0.0
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Named laws beside the discrepancy.
+
+    Attributes:
+        laws: indices of the laws.
+        scales: variance of every discrepancy term's coefficients.
+        neg2_log_evidence: lower is better.
+        misfit: part of it that is not the cost of parameters.
+    """
+
+    laws: tuple[int, ...]
+    scales: Array
+    neg2_log_evidence: float
+    misfit: float
+
+
+def _score(hypothesis: Hypothesis) -> float:
+    return hypothesis.neg2_log_evidence + MIN_SCORE_GAIN * len(hypothesis.laws)
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """A misfit, named laws and discrepancies as inner products.
+
+    Attributes:
+        gram: of all columns and, last, of the misfit without any of them, shape (q + 1, q + 1). What every hypothesis
+            contains is projected out.
+        laws: named laws.
+        discrepancies: discrepancy terms of all stages.
+    """
+
+    gram: Array
+    laws: tuple[LinearTerm, ...]
+    discrepancies: tuple[LinearTerm, ...]
+
+    @property
+    def _groups(self) -> list[NDArray[np.intp]]:
+        return [each.columns for each in self.discrepancies]
+
+    def hypothesis(self, laws: Sequence[int], scales: Array | None = None, iterations: int = SCALE_ITERATIONS,
+                   without: Collection[int] = ()) -> Hypothesis:  # fmt: skip
+        """The laws beside the discrepancy, its scales by maximum evidence from ``scales`` on.
+
+        Args:
+            without: discrepancy terms that are left out.
+        """
+        groups = [group for i, group in enumerate(self._groups) if i not in without]
+        own = [c for i in laws for c in self.laws[i].columns]
+        at = np.concatenate([np.array(own, int), *groups])
+        ends = len(own) + np.cumsum([0, *(group.size for group in groups)])
+        normal, gradient, power = self.gram[np.ix_(at, at)], self.gram[at, -1], float(self.gram[-1, -1])
+        start = np.full(len(self._groups), INITIAL_SCALE**2) if scales is None else scales
+        values = np.array([v for i, v in enumerate(start) if i not in without])
+        for turn in range(iterations + 1):
+            precision = np.ones(at.size)
+            for value, (low, high) in zip(values, pairwise(ends), strict=True):
+                precision[low:high] = 1.0 / value
+            factor = np.linalg.cholesky(normal + np.diag(precision))
+            half = np.linalg.solve(factor, np.column_stack([gradient, np.eye(at.size)]))
+            estimate = -half[:, 1:].T @ half[:, 0]
+            if turn == iterations:
+                break
+            variance = np.einsum("ij,ij->j", half[:, 1:], half[:, 1:])
+            new = values.copy()
+            for i, (low, high) in enumerate(pairwise(ends)):
+                determined = (high - low) - float(variance[low:high].sum()) / values[i]
+                new[i] = float(estimate[low:high] @ estimate[low:high]) / max(determined, 1e-3)
+            values = np.clip(new, MIN_SCALE**2, MAX_SCALE**2)
+        misfit = power + float(gradient @ estimate)
+        shapes = sum(self.laws[i].cost for i in laws)
+        cost = 2.0 * float(np.log(np.diag(factor)).sum()) - float(np.log(precision).sum())
+        found = np.array(start, float)
+        found[[i for i in range(len(self._groups)) if i not in without]] = values
+        return Hypothesis(tuple(laws), found, misfit + cost + shapes, misfit)
+
+    def select(self) -> Hypothesis:
+        """The laws that no addition, removal or exchange improves; each has to gain ``MIN_SCORE_GAIN``."""
+        best = self.hypothesis(())
+        while True:
+            better = min(self._moves(best), key=_score, default=best)
+            if _score(better) > _score(best) - MIN_EXCHANGE_GAIN:
+                return best
+            best = better
+
+    def _moves(self, best: Hypothesis) -> Iterator[Hypothesis]:
+        if len(best.laws) < MAX_LAWS:
+            yield from self.beside(best.laws, best.scales)
+        for i in best.laws:
+            rest = tuple(each for each in best.laws if each != i)
+            yield self.hypothesis(rest, best.scales)
+            yield from self.beside(rest, best.scales)
+
+    def beside(self, laws: tuple[int, ...], scales: Array) -> list[Hypothesis]:
+        """The laws with one more, for the most promising of all others."""
+        taken = {self.laws[i].candidate.term.effect for i in laws}
+        others = [i for i, each in enumerate(self.laws) if each.candidate.term.effect not in taken]
+        chosen: set[int] = set()
+        for factor in SCREENING_FACTORS:
+            gains = self._gains(laws, np.maximum(scales * factor**2, MIN_SCALE**2), others)
+            chosen |= {others[i] for i in np.argsort(-gains)[:SCREENED_LAWS]}
+        return [self.hypothesis((*laws, i), scales) for i in sorted(chosen)]
+
+    def _gains(self, laws: Sequence[int], scales: Array, others: Sequence[int]) -> Array:
+        """Fall of -2 log evidence by each of ``others`` beside ``laws``, at fixed scales."""
+        own = [c for i in laws for c in self.laws[i].columns]
+        at = np.concatenate([np.array(own, int), *self._groups])
+        precision = np.concatenate(
+            [np.ones(len(own)), *(np.full(g.size, 1.0 / v) for g, v in zip(self._groups, scales, strict=True))]
+        )
+        inner = self.gram[np.ix_(at, at)] + np.diag(precision)
+        new = np.array([c for i in others for c in self.laws[i].columns])
+        wanted = np.append(new, -1)
+        left = self.gram[np.ix_(wanted, wanted)] - self.gram[np.ix_(wanted, at)] @ np.linalg.solve(
+            inner, self.gram[np.ix_(at, wanted)]
+        )
+        gains, first = [], 0
+        for i in others:
+            last = first + len(self.laws[i].columns)
+            block = left[first:last, first:last] + np.eye(last - first)
+            gradient = left[first:last, -1]
+            gain = float(gradient @ np.linalg.solve(block, gradient)) - np.linalg.slogdet(block)[1]
+            gains.append(gain - self.laws[i].cost)
+            first = last
+        return np.array(gains)
+
+    def share(self, found: Hypothesis, law: int) -> float:
+        """Share of the misfit that only this law of the found ones explains, without a discrepancy."""
+        everything = range(len(self.discrepancies))
+        sets = (), tuple(i for i in found.laws if i != law), found.laws
+        nothing, without, whole = (self.hypothesis(laws, found.scales, 0, everything).misfit for laws in sets)
+        return (without - whole) / max(nothing - whole, 1e-300)
+
+    def without_small(self, found: Hypothesis) -> Hypothesis:
+        """Without laws that explain less than an unlisted imperfection may."""
+        exact = self.hypothesis(found.laws, np.full(len(self.discrepancies), MIN_SCALE**2), 0)
+        if len(found.laws) < 2 or exact.neg2_log_evidence < found.neg2_log_evidence + MIN_SCORE_GAIN:
+            return found
+        smallest = min(found.laws, key=lambda i: self.share(found, i))
+        if self.share(found, smallest) > MIN_SHARE:
+            return found
+        return self.without_small(self.hypothesis(tuple(i for i in found.laws if i != smallest), found.scales))
+
+    def rivals(self, found: Hypothesis, law: int) -> tuple[RivalFit, ...]:
+        """Other laws in the place of one, the best of each first.
+
+        A rival that seems better is one whose evidence rounding spoils, because an exchange has been tried.
+        """
+        rest = tuple(i for i in found.laws if i != law)
+        best: dict[str, RivalFit] = {}
+        for each in sorted(self.beside(rest, found.scales), key=lambda other: other.neg2_log_evidence):
+            candidate = self.laws[each.laws[-1]].candidate
+            gap = each.neg2_log_evidence - found.neg2_log_evidence
+            if candidate.term.effect != self.laws[law].candidate.term.effect and gap > -MIN_EXCHANGE_GAIN:
+                best.setdefault(candidate.key, RivalFit(gap, candidate, each.misfit - found.misfit))
+        return tuple(best.values())
+
+    def bulk(self, found: Hypothesis, law: int) -> float:
+        """Share that a law takes of what it and a free correction of its stage take together, beside all others."""
+        stage = self.laws[law].candidate.term.stage
+        own = [i for i, each in enumerate(self.discrepancies) if each.candidate.term.stage == stage]
+        rest = tuple(i for i in found.laws if self.laws[i].candidate.term.stage != stage)
+        nothing = self.hypothesis(rest, found.scales, 0, own).misfit
+        named = self.hypothesis(found.laws, found.scales, 0, own).misfit
+        free = self.hypothesis(found.laws, None, SCALE_ITERATIONS).misfit
+        return (nothing - named) / max(nothing - min(free, named), 1e-300)
+
+
+def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> LinearModel:
+    """The linear model around a fit, of its own terms and of ``candidates``."""
+    rows, parameters = fit.rows, fit.model.parameters
+    base = [i for i, f in enumerate(parameters) if f.kind not in ("term", "hidden")]
+    residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
+    blocks: list[tuple[Candidate, Array, ScoreTest | None, float]] = []
+    for each in uncertain(fit.model):
+        columns, part = _part_of_fit(fit, each)
+        residual = residual - part
+        blocks.append((each, columns, None, _shape_cost(fit, each)))
+    present = {each.key for each in fit.model.candidates}
+    others = [each for each in candidates if each.key not in present]
+    for tests in score_candidate_starts(likelihood, fit, others):
+        cost = 2.0 * float(np.log(len(tests)))
+        blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
+    whole = np.column_stack([*(columns[rows] for _, columns, *_ in blocks), residual[rows]])
+    nuisance = fit.jacobian[rows][:, base]
+    cross = nuisance.T @ whole
+    inner = nuisance.T @ nuisance + np.diag(fit.model.precision[base])
+    gram = whole.T @ whole - cross.T @ np.linalg.solve(inner, cross)
+    ends = np.cumsum([0, *(columns.shape[1] for _, columns, *_ in blocks)])
+    found = [
+        LinearTerm(candidate, np.arange(low, high), test, cost)
+        for (candidate, _, test, cost), (low, high) in zip(blocks, pairwise(ends), strict=True)
+    ]
+    free = [each.candidate.term.effect in DISCREPANCY_TERMS for each in found]
+    laws = tuple(each for each, discrepancy in zip(found, free, strict=True) if not discrepancy)
+    return LinearModel(gram, laws, tuple(each for each, discrepancy in zip(found, free, strict=True) if discrepancy))
+
+
+def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
+    """The best starts of one candidate that is linear in an amplitude and has an effect."""
+    linear = [each for each in tests if amplitude_indices(each.model, each.candidate) and np.any(each.columns)]
+    most = 1 if tests[0].candidate.term.effect in DISCREPANCY_TERMS else MAX_STARTS
+    return sorted(linear, key=lambda each: -each.predicted_gain)[:most]
+
+
+def _part_of_fit(fit: Fit, candidate: Candidate) -> tuple[Array, Array]:
+    """Sensitivities to the amplitudes of a term of a fit, shape (N, q), and its part of the residual, shape (N,)."""
+    at = [
+        i
+        for i, f in enumerate(fit.model.parameters)
+        if f.owner == candidate.key and f.parameter is not None and is_amplitude(candidate, f.parameter)
+    ]
+    return fit.jacobian[:, at], fit.jacobian[:, at] @ fit.x[at]
+
+
+def _shape_cost(fit: Fit, candidate: Candidate) -> float:
+    """-2 log of posterior over prior volume of the parameters of a term that are no amplitude."""
+    at = [
+        i
+        for i, f in enumerate(fit.model.parameters)
+        if f.owner == candidate.key and f.parameter is not None and not is_amplitude(candidate, f.parameter)
+    ]
+    return -float(np.linalg.slogdet(fit.covariance[np.ix_(at, at)])[1]) if at else 0.0
+
+
+class Choice(NamedTuple):
+    """Named laws that explain a recording but for a small remainder.
+
+    Attributes:
+        likelihood: under the noise that they leave.
+        fit: of the device with them.
+        rivals: other laws in the place of each, by its key.
+    """
+
+    likelihood: Likelihood
+    fit: Fit
+    rivals: dict[str, tuple[RivalFit, ...]]
+
+
+def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable[[str], None]) -> Choice | None:
+    """The named laws that take the bulk of a misfit, None where none do.
+
+    Args:
+        anchor: a fit with any laws.
+        candidates: named laws and discrepancy terms.
+        progress: called with one line of text at every step.
+    """
+    fit = anchor
+    if not _follows(fit) or not all(_is_linear(each) for each in uncertain(fit.model)):
+        return None
+    for _ in range(MAX_LINEARISATIONS):
+        likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
+        fit = fit_model(likelihood, fit.model, fit.x)
+        linear = linear_model(likelihood, fit, candidates)
+        found = linear.without_small(linear.select())
+        laws = [linear.laws[i] for i in found.laws]
+        effects = {each.candidate.term.effect for each in laws}
+        progress(f"beside a discrepancy: {', '.join(sorted(effects)) or 'no named law'}")
+        if not effects:
+            return None
+        if effects == {each.term.effect for each in uncertain(fit.model)}:
+            break
+        with_laws = _fit_laws(likelihood, fit, laws)
+        if with_laws.chi2 > MAX_CHI2_RATIO * fit.chi2:
+            return None
+        fit = with_laws
+    else:
+        return None
+    if np.max(found.scales) > MAX_SCALE_BESIDE**2 or min(linear.bulk(found, i) for i in found.laws) < MIN_BULK:
+        return None
+    keys = {each.term.effect: each.key for each in uncertain(fit.model)}
+    rivals = {keys[linear.laws[i].candidate.term.effect]: linear.rivals(found, i) for i in found.laws}
+    return Choice(likelihood, fit, rivals)
+
+
+def _is_linear(candidate: Candidate) -> bool:
+    """Whether a term is linear in an amplitude."""
+    return any(is_amplitude(candidate, each) for each in candidate.term.free_parameters)
+
+
+def _follows(fit: Fit) -> bool:
+    """Whether a fit has the phase of the motion right in every channel."""
+    return all(
+        np.std(output.data - signal) < MAX_RESIDUAL_RATIO * np.std(output.data)
+        for run, signals in zip(fit.model.runs, fit.model.outputs(fit.x), strict=True)
+        for output, signal in zip(run.outputs, signals, strict=True)
+    )
+
+
+def _fit_laws(likelihood: Likelihood, fit: Fit, laws: Sequence[LinearTerm]) -> Fit:
+    """The fit with these laws and no others."""
+    certain = [each for each in fit.model.candidates if not each.term.free_parameters]
+    model = Model(fit.model.runs, fit.model.device, [*certain, *(each.candidate for each in laws)], fit.model.mains)
+    x = model.map_parameters_from(fit.model, fit.x)
+    for test in (each.test for each in laws if each.test is not None):
+        for i, f in enumerate(model.parameters):
+            if f.kind == "term" and f.owner == test.candidate.key:
+                x[i] = test.x[test.model.index("term", f.owner, f.name)]
+    return fit_model(likelihood, model, x, max_iterations=20)
