@@ -80,7 +80,7 @@ def excess_variance(
 ) -> tuple[float, float]:
     """Return the error variance of held-out pixels as a multiple of the predicted one, and its standard deviation.
 
-    Pixels where samples are dense count less, so that all parts of the picture count alike.
+    Pixels where samples are dense count less, so that all parts of the picture count alike, dark and bright ones too.
 
     Args:
         residual: mean of the held-out samples less the picture without them, shape (n,).
@@ -88,7 +88,7 @@ def excess_variance(
         predicted: variance of the picture, shape (n,).
         density: fraction of visited pixels around, shape (n,).
     """
-    weight = 1.0 / (density * (noise + predicted.mean()) ** 2)
+    weight = 1.0 / density
     total = weight @ predicted
     ratio = float(weight @ (residual**2 - noise) / total)
     scatter = 2.0 * weight * (noise + max(ratio, 0.5) * predicted)  # twice: neighbours in a segment err together
