@@ -10,7 +10,7 @@ import numpy as np
 from recon.imaging.picture import Grid, Picture
 from scanner.device import AXES
 from scanner.errors import DeviceInvalid
-from scanner.motion import Motion
+from scanner.motion import AxisMotion, Motion
 
 MAX_OUTSIDE_FRACTION = 0.05
 """Fraction of the samples outside the field of view from which a note says so. A field that the amplitude fills loses
@@ -24,6 +24,9 @@ MIN_AMPLITUDE_FRACTION = 0.2
 
 OTHER_UNITS = {"degrees": pi / 180.0, "mrad": 1e-3}
 """Units of angle that half angles are stated in by mistake, in rad."""
+
+INSPECTED_PARTS, INSPECTED_SAMPLES = 64, 4096
+"""Parts of a scan and samples of each in which the largest angle is looked for: 0.3 million samples of any scan."""
 
 UNIT_MATCH = 2.5
 """Factor within which a half angle, read in another unit, has to agree with the amplitude to be taken for that unit.
@@ -86,5 +89,15 @@ def _describe_sizes(amplitude: Sequence[float], half: Sequence[float]) -> str:
 
 
 def _amplitudes(grid: Grid, motion: Motion) -> list[float]:
-    """Largest amplitude of x and y as reports state it [rad]."""
-    return [grid.angle_scale * float(np.max(motion.axes[name].amplitude)) for name in AXES]
+    """Largest angle of x and y as reports state it [rad], in samples from all over the scan.
+
+    The amplitude itself is that of a sine, which a spiral or a slow scan is not.
+    """
+    return [grid.angle_scale * _largest_angle(motion.axes[name]) for name in AXES]
+
+
+def _largest_angle(axis: AxisMotion) -> float:
+    firsts = np.linspace(0, max(axis.angle.size - INSPECTED_SAMPLES, 0), INSPECTED_PARTS).astype(int)
+    parts = [axis.angle.read(first, first + INSPECTED_SAMPLES) for first in np.unique(firsts).tolist()]
+    angles = np.abs(np.concatenate(parts))
+    return float(np.nanmax(angles)) if np.isfinite(angles).any() else float(np.max(axis.amplitude))
