@@ -36,6 +36,7 @@ def changed(scan: Path, folder: Path, change) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["kernel", "posterior"])
 def test_a_picture_of_another_kind_comes_with_its_uncertainty(kind: str, scan: Path, tmp_path: Path) -> None:
     command = ["reconstruct", str(scan), "-o", str(tmp_path / "out"), "--pixels", "120x100", "--estimator", "ekf"]
