@@ -25,10 +25,11 @@ from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from scanner import devices
 from scanner.arrays import Array
-from scanner.device import Device, Drive, Transimpedance
+from scanner.device import Device
 from scanner.drift import Drift
 from scanner.laws import capacitance_slope, transimpedance_voltage
 from scanner.recording import Recording
+from scanner.stages import Drive, Transimpedance
 
 RAIL_FRACTIONS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.0)
 """Rails, as fractions of the signal's peak; 0 is a comparator."""

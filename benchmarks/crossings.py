@@ -20,8 +20,8 @@ from scipy.stats import norm
 from estimation.tracker.cramer_rao import censored_information_fraction
 from scanner import devices
 from scanner.arrays import Array
-from scanner.device import Transimpedance
 from scanner.laws import capacitance_slope, transimpedance_voltage
+from scanner.stages import Transimpedance
 
 AMPLITUDE_RAD, SAMPLE_RATE_HZ = 0.15, 5e5
 """Amplitude and sample rate of chen2019 [rad, Hz]."""

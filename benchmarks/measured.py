@@ -20,8 +20,9 @@ import numpy as np
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.predict import predict
 from scanner.arrays import Array
-from scanner.device import Acceleration, Axis, Device, Drive, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.recording import Recording
+from scanner.stages import Acceleration, Drive, Mechanics, Position
 
 Case = tuple[list[Recording], list[Recording], Device]
 """Recordings to diagnose, recordings to predict with the result, nominal device."""

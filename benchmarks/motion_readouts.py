@@ -14,8 +14,9 @@ from estimation.estimate import estimate
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis, truth_from_simulation
-from scanner.device import Acceleration, Axis, Device, Drive, Mechanics, MotionSensor, Position, Velocity
+from scanner.device import Axis, Device
 from scanner.drift import Drift, exponential
+from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position, Velocity
 
 RATE_RAD_S, NOISE_SD_V = 2 * np.pi * 1000.0, 0.1
 SENSORS = (

@@ -33,8 +33,9 @@ from phantoms.experiment import Experiment, simulate_experiment
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
 from recon.pipeline import Options
-from scanner.device import Amdm, Device
+from scanner.device import Device
 from scanner.recording import Recording
+from scanner.stages import Amdm
 
 SAMPLE_RATE_HZ = 5e6
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.slow.decay import LAWS, solve_decay
-from scanner.device import Axis, Device, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.recording import Recording
+from scanner.stages import Mechanics, Position
 
 RATE_RAD_S, QUALITY, DURATION_S = 2 * np.pi * 5000.0, 2e4, 8.0
 DECAY = DURATION_S * RATE_RAD_S / QUALITY / 2.0

@@ -41,8 +41,8 @@ from recon.imaging.phasor_gridding import accumulate_phasors
 from recon.imaging.picture import Grid
 from scanner import devices
 from scanner.channel import make_channel
-from scanner.device import Amdm
 from scanner.recording import Recording
+from scanner.stages import Amdm
 
 RESULTS = Path(__file__).with_name("results.json")
 

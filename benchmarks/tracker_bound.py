@@ -27,9 +27,10 @@ from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis
 from scanner import devices
 from scanner.arrays import Array
-from scanner.device import Amdm, Device
+from scanner.device import Device
 from scanner.drift import Drift, Factor
 from scanner.recording import Recording
+from scanner.stages import Amdm
 
 STIFFNESS_RATE_DENSITY = 0.4
 """Spectral density of the stiffness's rate [1/s^3]: a drift of 0.2 % in 30 ms, as of a scanner that warms up."""

@@ -14,8 +14,8 @@ from dataclasses import MISSING, fields
 
 from estimation.estimators import estimators
 from recon.cli import COMMANDS, add_command
-from scanner.device import READOUTS, Capacitance, Drive, Mechanics, Scan
 from scanner.geometry import Geometry
+from scanner.stages import READOUTS, Capacitance, Drive, Mechanics, Scan
 from scanner.terms import STAGES, Term, catalogue
 
 DEVICE_TABLES: dict[str, type] = {

@@ -6,9 +6,10 @@ from math import hypot
 
 import numpy as np
 
-from scanner.device import Amdm, Capacitance, Device, MotionSensor, Transimpedance
+from scanner.device import Device
 from scanner.harmonics import capacitance_harmonics
 from scanner.recording import Recording
+from scanner.stages import Amdm, Capacitance, MotionSensor, Transimpedance
 
 MODEL_FREE_ESTIMATORS = ("picture",)
 """Estimators that use no readout: the recording does not calibrate their amplitude."""

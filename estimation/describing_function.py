@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scanner.arrays import Array, Complex
-from scanner.device import Axis, Device, Mechanics
+from scanner.device import Axis, Device
 from scanner.forward_model import ActiveTerm
 from scanner.integrator.abi import nominal_values
 from scanner.motion import Motion
+from scanner.stages import Mechanics
 
 POINTS_PER_CYCLE = 64
 """Points of a cycle at which a torque is evaluated: only its harmonics above the 58th alias onto those that are

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 
 from estimation.estimators import find_estimator
 from estimation.signals import require_device
-from scanner.device import Device, Position
+from scanner.device import Device
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.stages import Position
 
 
 def default_estimator(recording: Recording, device: Device) -> str:

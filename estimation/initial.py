@@ -10,10 +10,11 @@ import numpy as np
 from estimation.reference import PhaseReference
 from estimation.signals import SenseChannel, is_capacitive
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, Capacitance, Device
+from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.harmonics import capacitance_harmonics, readout_response
 from scanner.lowpass import lowpass_response
+from scanner.stages import Amdm, Capacitance
 
 WINDOW_CYCLES = 6.0
 """Cycles of the slowest motion that are fitted: enough to separate the harmonics of two axes, short against drift."""

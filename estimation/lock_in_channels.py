@@ -6,9 +6,10 @@ import numpy as np
 
 from scanner.arrays import Array
 from scanner.channel import check_signal
-from scanner.device import Axis, MotionSensor
+from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.stages import MotionSensor
 
 
 def lock_in_amplitude(recording: Recording, axis: Axis) -> tuple[Array, Array, bool]:

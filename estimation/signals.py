@@ -9,9 +9,10 @@ import numpy as np
 from estimation.reference import PhaseReference, absolute_reference, dominant_frequency, drive_reference
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
-from scanner.device import Acceleration, Device, MotionSensor, Readout, Velocity
+from scanner.device import Device
 from scanner.errors import BadInput, ChannelMissing, DeviceInvalid
 from scanner.recording import Recording
+from scanner.stages import Acceleration, MotionSensor, Readout, Velocity
 
 WHITE_NOISE_DIFFERENCE_ORDER = 6
 """Order of the differences by which a sensor's noise is measured: sixth differences suppress an oversampled motion

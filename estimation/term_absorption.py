@@ -16,7 +16,7 @@ import numpy as np
 
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.device import Amdm, Axis, Device
+from scanner.device import Axis, Device
 from scanner.forward_model import (
     ActiveTerm,
     AxisTrajectory,
@@ -27,6 +27,7 @@ from scanner.forward_model import (
 )
 from scanner.integrator.nodes import nodes_to_samples, to_nodes
 from scanner.recording import Recording
+from scanner.stages import Amdm
 
 Terms = Mapping[str, Sequence[ActiveTerm]]
 """Active terms by axis."""

@@ -25,8 +25,9 @@ from estimation.diagnosis.initial import flat_whiteners
 from estimation.diagnosis.model import Candidate, Model
 from recon.io.readers import read
 from scanner.arrays import Array
-from scanner.device import Axis, Device, Drive, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
 from scanner.terms import catalogue
 
 SAMPLE_RATE_HZ = 20e3

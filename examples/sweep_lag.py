@@ -27,8 +27,9 @@ from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.report.figures import new_figure
 from scanner import devices
-from scanner.device import Amdm, Device
+from scanner.device import Device
 from scanner.recording import Recording
+from scanner.stages import Amdm
 
 CALIBRATION = 31420.0, 31470.0, 31520.0  # Hz, drive frequencies of the diagnosed recordings
 SWEEP = 31400.0, 31440.0, 31500.0, 31540.0  # Hz, drive frequencies of the test recordings

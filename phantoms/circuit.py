@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scanner.arrays import Array
-from scanner.device import Amdm, Capacitance
 from scanner.errors import BadInput
 from scanner.laws import capacitance, capacitance_slope
 from scanner.lowpass import run_section, section_coefficients
+from scanner.stages import Amdm, Capacitance
 
 MIN_CLOCK_HZ = 25e6
 """50 samples in a period of the 500 kHz carrier. With fewer, the exact step of the sections, which takes its input as

@@ -19,7 +19,7 @@ from phantoms.optics import Detector, detect, sample_scene
 from phantoms.waveforms import Waveform
 from scanner.arrays import Array
 from scanner.channel import CHANNEL_UNITS
-from scanner.device import Amdm, Axis, Device, MotionSensor, Readout
+from scanner.device import Axis, Device
 from scanner.drift import Drift
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.forward_model import (
@@ -36,6 +36,7 @@ from scanner.integrator.abi import TORQUE_LAW
 from scanner.integrator.nodes import to_nodes
 from scanner.optics import apply_intensity_terms, beam_position
 from scanner.recording import Recording
+from scanner.stages import Amdm, MotionSensor, Readout
 from scanner.terms import Term
 
 CHUNK_S = 0.01

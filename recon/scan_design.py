@@ -21,9 +21,10 @@ from recon.imaging.coverage import largest_gap, time_for_fill
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
-from scanner.device import Axis, Device, Scan
+from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.parametric import sine_drive, steady_state, stiffness_modulation, threshold, tongue_edges
+from scanner.stages import Scan
 
 FrequencyRange = tuple[float, float]
 """Lowest and highest frequency [Hz]."""

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, MotionSensor, Readout
+from scanner.device import Axis
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.integrator.nodes import nodes_to_samples
 from scanner.laws import amdm_voltage, capacitance, capacitance_slope, motion_voltage, transimpedance_voltage
 from scanner.lowpass import apply_lowpass
+from scanner.stages import Amdm, MotionSensor, Readout
 from scanner.terms import STAGES, SignalContext, Term, catalogue
 from scanner.terms.measured_law import EFFECT, measured_law
 

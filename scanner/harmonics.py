@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.device import Amdm, Capacitance, MotionSensor, Readout
 from scanner.laws import capacitance
 from scanner.lowpass import lowpass_response
+from scanner.stages import Amdm, Capacitance, MotionSensor, Readout
 
 _SAMPLES_PER_CYCLE = 256
 """Enough for amplitudes up to five times theta0: harmonics beyond the 128th are then below 1e-16 of C0."""

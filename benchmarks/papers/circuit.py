@@ -19,12 +19,13 @@ from phantoms.circuit import (
 )
 from phantoms.waveforms import Sine
 from scanner.arrays import Array
-from scanner.device import Axis, Capacitance
+from scanner.device import Axis
 from scanner.devices import load
 from scanner.laws import capacitance
 from scanner.lock_in import block_phasors
 from scanner.lowpass import lowpass_response
 from scanner.parametric import DriveShape, sine_drive, steady_state
+from scanner.stages import Capacitance
 
 CLOCK = 5e6 * STEPS_PER_SAMPLE
 F_DR = 31400.0

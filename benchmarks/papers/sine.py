@@ -16,10 +16,11 @@ from estimation.filters.sine_ukf import estimate_delay, measure_noise_and_phase_
 from phantoms.forward import InitialState, Plan, simulate_trajectory
 from phantoms.waveforms import Sine
 from scanner.arrays import Array
-from scanner.device import Axis, Drive, Mechanics
+from scanner.device import Axis
 from scanner.drift import Drift, exponential
 from scanner.integrator.nodes import to_nodes
 from scanner.integrator.trajectories import integrate
+from scanner.stages import Drive, Mechanics
 
 RATE = 1e6  # the oscilloscope's
 SEED = 2019

@@ -27,12 +27,13 @@ from phantoms.amdm import digitise, record_through_circuit
 from phantoms.circuit import AmdmCircuit, envelope_section, match_gain
 from phantoms.waveforms import Sine
 from scanner.arrays import Array
-from scanner.device import Axis, Device, Mechanics
+from scanner.device import Axis, Device
 from scanner.devices import load
 from scanner.errors import BadInput
 from scanner.laws import capacitance
 from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
+from scanner.stages import Mechanics
 
 RATE = 5e6
 SCORED_FROM = 0.008  # s. Twice the mirror's 4 ms, after which the model does not depend on its initial state

@@ -12,13 +12,14 @@ from estimation.diagnosis.drive_lines import drive_lines, is_steady, strongest_l
 from estimation.diagnosis.resampling import decimate, fast_transform_length, resample_drive
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
-from scanner.device import Amdm, Axis, Device, MotionSensor, Readout, Transimpedance
+from scanner.device import Axis, Device
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.forward_model import REFERENCE_ORDERS, DriveInput
 from scanner.integrator.nodes import to_nodes
 from scanner.interpolation import interpolate_cubic
 from scanner.lowpass import lowpass_response
 from scanner.recording import Recording
+from scanner.stages import Amdm, MotionSensor, Readout, Transimpedance
 from scanner.terms import NaturalScales
 
 MIN_STEPS_PER_PERIOD = 52

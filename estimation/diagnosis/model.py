@@ -12,7 +12,7 @@ import numpy as np
 
 from estimation.diagnosis.data import Output, Run, readout_of
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, Device, MotionSensor, Readout
+from scanner.device import Axis, Device
 from scanner.forward_model import (
     ActiveTerm,
     AxisTrajectory,
@@ -26,6 +26,7 @@ from scanner.forward_model import (
     with_constants,
 )
 from scanner.integrator.runge_kutta import LANES
+from scanner.stages import Amdm, MotionSensor, Readout
 from scanner.terms import NaturalScales, Parameter, Term
 
 START_STATE_SD = 3.0

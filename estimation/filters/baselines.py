@@ -21,11 +21,12 @@ from estimation.signals import (
 )
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal, make_channel
-from scanner.device import Axis, Device, Position
+from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.lock_in import block_length, block_phasors, unwrap_phase
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
+from scanner.stages import Position
 
 SIGN_SAMPLES = 100_000
 """Samples from the start over which a motion is compared with a reference to find its sign."""

@@ -17,10 +17,11 @@ from numba import njit
 
 from estimation.filters.fast_capacitance import gaussian_capacitance
 from scanner.arrays import Array
-from scanner.device import Acceleration, Amdm, Axis, Capacitance, Device, MotionSensor, Position, Readout, Velocity
+from scanner.device import Axis, Device
 from scanner.errors import DeviceInvalid
 from scanner.laws import electrostatic_torque
 from scanner.lowpass import section_coefficients
+from scanner.stages import Acceleration, Amdm, Capacitance, MotionSensor, Position, Readout, Velocity
 
 AXIS_PARAMETERS = (
     "m11", "m12", "m21", "m22", "half_step_over_J", "electrostatic", "torque_per_volt", "C0", "Cb", "inverse_theta0",

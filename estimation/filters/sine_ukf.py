@@ -13,10 +13,11 @@ from estimation.filters.baselines import axis_motion_from_angle, find_position_s
 from estimation.signals import intensity_clock
 from scanner.arrays import Array
 from scanner.channel import check_signal
-from scanner.device import Device, Position
+from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.stages import Position
 
 SIGMA_POINT_SPREAD = 3.0
 """n + kappa for n = 1 state: Julier's choice, which is exact to fourth order for a Gaussian."""

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.arrays import Array
-from scanner.device import Axis, Transimpedance
+from scanner.device import Axis
 from scanner.laws import capacitance_slope, transimpedance_voltage
+from scanner.stages import Transimpedance
 
 DETECTION_SIGMA = 4.0
 """Response, in standard deviations of the response to noise, above which a crossing counts: one false crossing in

@@ -22,10 +22,11 @@ from estimation.reference import drive_reference
 from scanner.arrays import Array
 from scanner.channel import check_signal
 from scanner.clock import on_clock
-from scanner.device import DEFAULT_TOLERANCE, Amdm, Axis, Device, MotionSensor
+from scanner.device import DEFAULT_TOLERANCE, Axis, Device
 from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
+from scanner.stages import Amdm, MotionSensor
 
 SEGMENT_CYCLES = 200.0
 """Cycles per segment of a driven recording: a sweep changes little within one, which counts as one frequency."""

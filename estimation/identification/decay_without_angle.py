@@ -12,9 +12,10 @@ import numpy as np
 from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S, IdentifiedValue
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.device import Amdm, Axis, MotionSensor, Transimpedance
+from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.lowpass import run_section, section_coefficients
+from scanner.stages import Amdm, MotionSensor, Transimpedance
 
 MIN_CYCLES = 8.0
 """Cycles of a decay that are needed: its frequency and its damping are then distinct in the first fit window."""

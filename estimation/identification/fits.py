@@ -13,12 +13,13 @@ import numpy as np
 
 from estimation.least_squares import fit_linear
 from scanner.arrays import Array
-from scanner.device import Amdm, Axis, Capacitance, Mechanics, MotionSensor, Transimpedance
+from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.integrator.trajectories import integrate
 from scanner.laws import capacitance, capacitance_slope, electrostatic_torque
 from scanner.lock_in import block_length, block_phasors
 from scanner.lowpass import run_section, section_coefficients
+from scanner.stages import Amdm, Capacitance, Mechanics, MotionSensor, Transimpedance
 
 BLOCK_CYCLES = 20.0
 """Cycles of the motion per block of a driven record, whose phasors are one equation: harmonics and noise average

@@ -17,8 +17,9 @@ from estimation.optics.samples import (
 )
 from estimation.optics.scene import CellVariances
 from scanner.arrays import Array
-from scanner.device import AXES, Amdm, Device
+from scanner.device import AXES, Device
 from scanner.motion import Motion
+from scanner.stages import Amdm
 
 MEASURED_PARAMETERS = (
     "delay_x", "delay_y", "delay_growth_x", "delay_growth_y", "amplitude_growth_x", "amplitude_growth_y", "decay",

@@ -10,9 +10,10 @@ import numpy as np
 from estimation.estimate import estimate
 from estimation.optics.measurement import MAX_PHASE_ERROR_RAD, readout_delay_sd
 from scanner.arrays import Array
-from scanner.device import AXES, Amdm, Device
+from scanner.device import AXES, Device
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.stages import Amdm
 from scanner.terms import NaturalScales, Term, catalogue
 
 READOUT_EFFECTS = ("channel-delay", "readout-lag", "filter-lag", "feedthrough")

@@ -13,10 +13,11 @@ from estimation.lock_in_channels import lock_in_amplitude
 from estimation.slow.decay import LAWS, Law
 from estimation.slow.selection import DecayFit, compress, covariance_root, fit_free_curve, fit_law
 from scanner.arrays import Array
-from scanner.device import Axis, Device, MotionSensor
+from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
+from scanner.stages import MotionSensor
 from scanner.terms import catalogue
 
 MIN_COMPRESSED_TURNS = 5000.0

@@ -23,7 +23,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from estimation.filters.fast_capacitance import gaussian_capacitance
-from scanner.device import Axis, MotionSensor, Readout
+from scanner.device import Axis
+from scanner.stages import MotionSensor, Readout
 
 POINTS_PER_CYCLE = 32
 """Points at which a cycle is evaluated. Fourier coefficients are free of aliasing for harmonics below the 16th."""

@@ -25,10 +25,11 @@ from estimation.tracker.state_space import AXIS_STATES, DAMPING, LOG_AMPLITUDE, 
 from estimation.tracker.to_motion import axis_knots, motion_of_knots
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.device import Device, Position
+from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.stages import Position
 
 BLOCK_CYCLES = 2.0
 """Length of a block in cycles of the axis."""

@@ -15,7 +15,8 @@ from estimation.tracker.observations import BlockObservations
 from estimation.tracker.process_noise import INITIAL_DENSITIES
 from estimation.tracker.state_space import AXIS_STATES, LOG_AMPLITUDE, MIN_AMPLITUDE_THETA0, PHASE
 from scanner.arrays import Array
-from scanner.device import Amdm, Device, MotionSensor
+from scanner.device import Device
+from scanner.stages import Amdm, MotionSensor
 
 RELATIVE_STIFFNESS_SD = 0.003
 """Change of stiffness since the calibration, in addition to its tolerance: that of silicon for 50 K (-60 ppm/K)."""

@@ -28,11 +28,12 @@ from estimation.tracker.demodulation import Projections, project_blocks, residua
 from estimation.tracker.drive_blocks import MAX_LINE_RATE_RATIO, demodulate_drive
 from scanner.arrays import Array, Complex, Index
 from scanner.channel import Channel
-from scanner.device import Amdm, Axis, Device
+from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.harmonics import readout_response
 from scanner.laws import capacitance
 from scanner.recording import Recording
+from scanner.stages import Amdm
 
 MIN_BLOCK_CYCLES = 2.0
 """Least length of a block in cycles of the slowest axis: its harmonics are then separable from the other axis's."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.device import Scan
 from scanner.errors import BadInput
+from scanner.stages import Scan
 
 if TYPE_CHECKING:
     import xarray

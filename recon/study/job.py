@@ -18,8 +18,9 @@ from recon.io.output import finite
 from recon.pipeline import Options, Reconstruction, reconstruct
 from recon.report.summary import axis_summary, summarise
 from recon.study.plan import Job, Scenario, StudyDesign
-from scanner.device import AXES, Amdm, Device, Readout
+from scanner.device import AXES, Device
 from scanner.recording import Recording
+from scanner.stages import Amdm, Readout
 
 CALIBRATION_TIME_S = 2e-3
 """Duration of the noiseless signal whose rms defines the signal-to-noise ratio: dozens of periods of a fast axis."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scanner.arrays import Array
-from scanner.device import Amdm
+from scanner.stages import Amdm
 from scanner.terms.term import Parameter, SignalContext, Term
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from scanner.device import Axis, Mechanics
+from scanner.device import Axis
+from scanner.stages import Mechanics
 from scanner.terms.term import Parameter, Term
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scanner.arrays import Array
-from scanner.device import Amdm
+from scanner.stages import Amdm
 from scanner.terms.term import Parameter, SignalContext, Term
 
 

@@ -27,9 +27,10 @@ from typing import Any
 import numpy as np
 
 from scanner.arrays import Array
-from scanner.device import Axis, Readout
+from scanner.device import Axis
 from scanner.interpolation import shift_samples
 from scanner.lowpass import apply_lowpass
+from scanner.stages import Readout
 
 STAGES = ("drive", "mechanics", "capacitance", "readout", "timing", "optics")
 """Stages of the instrument, in the order in which a signal passes them."""

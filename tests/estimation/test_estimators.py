@@ -17,9 +17,10 @@ from estimation.estimate import estimate
 from estimation.estimators import estimators, register, registered
 from recon.cli import main
 from scanner import terms
-from scanner.device import Axis, Device, Drive, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
 
 DEVICE = "[x]\n[y]\n[scan]\nhalf_angle_x = 0.1\nhalf_angle_y = 0.1\n"
 USER_ESTIMATOR = """

@@ -13,10 +13,11 @@ from estimation.diagnosis.predict import predict
 from estimation.estimate import default_estimator, estimate
 from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant, Sine
-from scanner.device import Acceleration, Axis, Device, Drive, Mechanics, MotionSensor, Position, Velocity
+from scanner.device import Axis, Device
 from scanner.errors import BadInput, DeviceInvalid, UnitUnknown
 from scanner.forward_model import acceleration
 from scanner.recording import Recording
+from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position, Velocity
 
 RESONANCE_HZ, QUALITY = 1000.0, 50.0
 W = 2 * np.pi * RESONANCE_HZ

@@ -16,9 +16,10 @@ from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant
 from recon.cli import main
 from scanner.channel import DBM_LEVEL_V
-from scanner.device import Axis, Device, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.errors import BadInput, UnitUnknown
 from scanner.recording import Recording
+from scanner.stages import Mechanics, Position
 
 W = 2 * np.pi * 5000.0
 DEVICE = Device(

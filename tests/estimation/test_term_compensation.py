@@ -16,9 +16,10 @@ from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis
 from scanner import devices
-from scanner.device import Device, Drive, Position
+from scanner.device import Device
 from scanner.forward_model import ActiveTerm
 from scanner.recording import Recording
+from scanner.stages import Drive, Position
 from scanner.terms import catalogue
 
 DURATION_S = 0.006

@@ -9,12 +9,13 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.forward import InitialState, Plan, settled_state, simulate, simulate_trajectory
 from phantoms.waveforms import Constant, Multisine, Sine
 from scanner import devices
-from scanner.device import Device, Drive, Position
+from scanner.device import Device
 from scanner.drift import Drift, exponential
 from scanner.errors import BadInput
 from scanner.harmonics import capacitance_harmonics, readout_response
 from scanner.laws import capacitance_slope
 from scanner.lock_in import block_phasors
+from scanner.stages import Drive, Position
 from tests.support.simulated import DRIVES, imaging, own_electrodes, separate_electrodes, shared_electrode
 
 

@@ -10,8 +10,8 @@ import pytest
 from recon.cli import main
 from recon.pipeline import Options, Reconstruction, reconstruct
 from recon.report.figures import UNVISITED
-from scanner.device import Scan
 from scanner.errors import DeviceInvalid
+from scanner.stages import Scan
 from tests.support.simulated import imaging
 
 

@@ -11,8 +11,9 @@ import tifffile
 
 from recon.cli import main
 from recon.imaging.picture import grid_of_scan
-from scanner.device import Device, Scan
+from scanner.device import Device
 from scanner.errors import DeviceInvalid
+from scanner.stages import Scan
 from tests.support.simulated import imaging
 
 

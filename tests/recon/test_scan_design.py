@@ -25,8 +25,8 @@ from recon.scan_design import (
     find_sustained_band,
 )
 from scanner import devices
-from scanner.device import Drive
 from scanner.errors import BadInput
+from scanner.stages import Drive
 
 
 def coverage(figure: LissajousFigure, grid: Grid, phase: str) -> np.ndarray:

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scanner.device import (
+from scanner.device import Axis, Device
+from scanner.errors import BadInput, DeviceInvalid
+from scanner.stages import (
     READOUTS,
     Acceleration,
     Amdm,
-    Axis,
     Capacitance,
-    Device,
     Drive,
     Mechanics,
     Position,
@@ -25,7 +25,6 @@ from scanner.device import (
     Transimpedance,
     Velocity,
 )
-from scanner.errors import BadInput, DeviceInvalid
 
 CONTRACT = """
 name = "chen2020"

@@ -9,8 +9,9 @@ import numba
 import numpy as np
 import pytest
 
-from scanner.device import Axis, Capacitance, Drive, Mechanics
+from scanner.device import Axis
 from scanner.integrator.nodes import from_nodes, nodes_to_samples, to_nodes
+from scanner.stages import Capacitance, Drive, Mechanics
 from scanner.terms import catalogue
 
 AXIS = Axis(Mechanics(1e-15, 5.2e-13, 9.6e-6), Capacitance(5.71e-12, 9.79e-12, 0.2, 0.01), Drive("electrostatic"))

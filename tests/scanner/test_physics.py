@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import ive
 
 from scanner import devices
-from scanner.device import Axis, Capacitance, Mechanics
+from scanner.device import Axis
 from scanner.drift import exponential
 from scanner.harmonics import capacitance_harmonics, readout_response
 from scanner.integrator.nodes import to_nodes
@@ -18,6 +18,7 @@ from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, 
 from scanner.lock_in import block_length, block_phasors, unwrap_phase
 from scanner.lowpass import apply_lowpass, lowpass_response, run_section, section_coefficients
 from scanner.parametric import sine_drive, slow_flow, steady_state, stiffness_modulation, threshold, tongue_edges
+from scanner.stages import Capacitance, Mechanics
 
 COMB = Capacitance(C0=5.71e-12, Cb=9.79e-12, theta0=0.2, theta_th=0.01)
 DRIVEN = devices.load("chen2020-driven").axis("x")

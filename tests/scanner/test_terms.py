@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scanner.device import Axis, Capacitance, Drive, Mechanics, Position
+from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.forward_model import ActiveTerm, DriveInput, sense_signal, simulate_axis, stated_terms
 from scanner.integrator.abi import Nominal
 from scanner.integrator.runge_kutta import LANES, negative_exponential
 from scanner.integrator.trajectories import CapacitanceTerm, TorqueTerm, TrajectorySpec, integrate, integrate_batch
+from scanner.stages import Capacitance, Drive, Mechanics, Position
 from scanner.terms import STAGES, NaturalScales, apply_lowpass, catalogue, load_terms, shift_samples
 from tests.support.user_term import USER_TERM
 

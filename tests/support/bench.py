@@ -13,8 +13,9 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from scanner.device import Axis, Device, Drive, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
 
 RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES = 500.0, 40e3, 8000
 STIFFNESS = 1e-12 * (2 * np.pi * RESONANCE_HZ) ** 2

@@ -11,9 +11,10 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.forward import Plan, quantise, simulate
 from phantoms.waveforms import Sine
 from scanner import devices
-from scanner.device import Amdm, Device
+from scanner.device import Device
 from scanner.drift import Drift, exponential
 from scanner.recording import Recording
+from scanner.stages import Amdm
 
 DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
 

@@ -26,8 +26,9 @@ from recon.io import convert
 from recon.io.readers import readers
 from recon.study import plan, table
 from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS
-from scanner.device import READOUTS, Capacitance, Device, Drive, Mechanics, Scan
+from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS
+from scanner.stages import READOUTS, Capacitance, Drive, Mechanics, Scan
 from tests.support.simulated import imaging
 
 ROOT = Path(__file__).parent.parent.parent

@@ -13,8 +13,9 @@ from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.diagnose import Diagnosis, build_diagnosis
 from estimation.diagnosis.predict import predict
 from recon.io.convert import convert
-from scanner.device import Axis, Device, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.recording import Recording
+from scanner.stages import Mechanics, Position
 from scanner.terms import catalogue
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "examples"))

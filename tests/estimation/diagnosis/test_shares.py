@@ -16,9 +16,10 @@ from estimation.diagnosis.initial import flat_whiteners
 from estimation.diagnosis.model import Model
 from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
 from estimation.diagnosis.shares import explained_share, remaining_share
-from scanner.device import Axis, Device, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.stages import Mechanics, Position
 from tests.support.bench import DEVICE, bench_recording
 
 

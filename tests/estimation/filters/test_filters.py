@@ -29,9 +29,10 @@ from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant, Multisine, Sine
 from recon.evaluation import evaluate_axis
 from scanner import devices, laws
-from scanner.device import Amdm, Device, Drive, Position
+from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.stages import Amdm, Drive, Position
 from tests.support.simulated import separate_electrodes, shared_electrode
 
 HEIGHTS = np.array([6e14, 6e12])

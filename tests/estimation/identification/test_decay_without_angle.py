@@ -14,9 +14,10 @@ from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant
 from recon.cli import main
 from scanner import devices
-from scanner.device import Acceleration, Axis, Device, Mechanics, MotionSensor, Position, Velocity
+from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.stages import Acceleration, Mechanics, MotionSensor, Position, Velocity
 
 W, QUALITY = 2 * np.pi * 5000.0, 80.0
 SENSORS = [Position(10.0, 0.01), Velocity(10.0 / W, 0.01), Acceleration(10.0 / W**2, 0.01)]

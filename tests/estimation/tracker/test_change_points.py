@@ -13,7 +13,7 @@ from estimation.tracker import track
 from estimation.tracker.change_points import block_pieces, drive_shares, with_switches
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Constant, Sequence, Waveform
-from scanner.device import Amdm
+from scanner.stages import Amdm
 from tests.support.simulated import DRIVES, own_electrodes, with_sense
 
 STOPS = Sequence(((DRIVES["x"], 0.01), (Constant(0.0), 0.004), (DRIVES["x"], 0.016)))

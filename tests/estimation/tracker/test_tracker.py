@@ -19,11 +19,12 @@ from recon.imaging.gridding import accumulate_samples
 from recon.imaging.phasor_gridding import accumulate_phasors
 from recon.imaging.picture import Grid
 from scanner import devices
-from scanner.device import Axis, Device, Drive, Mechanics, Position
+from scanner.device import Axis, Device
 from scanner.drift import Drift, exponential
 from scanner.errors import BadInput
 from scanner.parametric import sine_drive, slow_flow, steady_state
 from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
 from tests.support.simulated import (
     DRIVES,
     noisy,
