@@ -30,12 +30,13 @@ DEVICE_TABLES: dict[str, type] = {
 
 
 def attribute_texts(record: type) -> dict[str, str]:
-    """Text of every attribute in the ``Attributes:`` section of a class docstring, by the attribute's name."""
-    section = (inspect.getdoc(record) or "").partition("Attributes:\n")[2]
-    section = re.sub(r"\n\s{6,}", " ", section)  # continuation lines
+    """Text of every attribute in the ``Attributes:`` sections of a class and its bases, by the attribute's name."""
     texts: dict[str, str] = {}
-    for names, text in re.findall(r"^ {4}([\w, ]+): (.*)$", section, re.MULTILINE):
-        texts |= dict.fromkeys(re.split(r",\s*", names), text)
+    for described in reversed(record.__mro__):
+        section = inspect.cleandoc(described.__doc__ or "").partition("Attributes:\n")[2]
+        section = re.sub(r"\n\s{6,}", " ", section)  # continuation lines
+        for names, text in re.findall(r"^ {4}([\w, ]+): (.*)$", section, re.MULTILINE):
+            texts |= dict.fromkeys(re.split(r",\s*", names), text)
     return texts
 
 

@@ -159,21 +159,33 @@ class MotionSensor(Checked):
 
 
 class Position(MotionSensor):
-    """A position sensor: ``V = gain theta + offset``, gain in V/rad."""
+    """A position sensor: ``V = gain theta + offset``.
+
+    Attributes:
+        gain: output by mechanical angle [V / rad].
+    """
 
     kind: ClassVar[str] = "position"
     order: ClassVar[int] = 0
 
 
 class Velocity(MotionSensor):
-    """A velocity sensor, such as a laser Doppler vibrometer: ``V = gain theta' + offset``, gain in V s/rad."""
+    """A velocity sensor, such as a laser Doppler vibrometer: ``V = gain theta' + offset``.
+
+    Attributes:
+        gain: output by angular velocity [V s / rad].
+    """
 
     kind: ClassVar[str] = "velocity"
     order: ClassVar[int] = 1
 
 
 class Acceleration(MotionSensor):
-    """An acceleration sensor: ``V = gain theta'' + offset``, gain in V s^2/rad."""
+    """An acceleration sensor: ``V = gain theta'' + offset``.
+
+    Attributes:
+        gain: output by angular acceleration [V s^2 / rad].
+    """
 
     kind: ClassVar[str] = "acceleration"
     order: ClassVar[int] = 2
