@@ -125,7 +125,7 @@ class LinearModel:
 
     @property
     def _groups(self) -> list[NDArray[np.intp]]:
-        return [each.columns for each in self.discrepancies]
+        return [term.columns for term in self.discrepancies]
 
     def hypothesis(self, laws: Sequence[int], scales: Array | None = None, iterations: int = SCALE_ITERATIONS,
                    without: Collection[int] = ()) -> Hypothesis:  # fmt: skip
@@ -135,9 +135,9 @@ class LinearModel:
             without: discrepancy terms that are left out.
         """
         groups = [group for i, group in enumerate(self._groups) if i not in without]
-        own = [c for i in laws for c in self.laws[i].columns]
-        at = np.concatenate([np.array(own, int), *groups])
-        ends = len(own) + np.cumsum([0, *(group.size for group in groups)])
+        of_laws = [column for i in laws for column in self.laws[i].columns]
+        at = np.concatenate([np.array(of_laws, int), *groups])
+        ends = len(of_laws) + np.cumsum([0, *(group.size for group in groups)])
         normal, gradient, power = self.gram[np.ix_(at, at)], self.gram[at, -1], float(self.gram[-1, -1])
         start = np.full(len(self._groups), INITIAL_SCALE**2) if scales is None else scales
         values = np.array([v for i, v in enumerate(start) if i not in without])
@@ -159,9 +159,9 @@ class LinearModel:
         misfit = power + float(gradient @ estimate)
         shapes = sum(self.laws[i].cost for i in laws)
         cost = 2.0 * float(np.log(np.diag(factor)).sum()) - float(np.log(precision).sum())
-        found = np.array(start, float)
-        found[[i for i in range(len(self._groups)) if i not in without]] = values
-        return Hypothesis(tuple(laws), found, misfit + cost + shapes, misfit)
+        all_scales = np.array(start, float)
+        all_scales[[i for i in range(len(self._groups)) if i not in without]] = values
+        return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes, misfit)
 
     def select(self) -> Hypothesis:
         """The laws that no addition, removal or exchange improves; each has to gain ``MIN_SCORE_GAIN``."""
@@ -176,14 +176,14 @@ class LinearModel:
         if len(best.laws) < MAX_LAWS:
             yield from self.beside(best.laws, best.scales)
         for i in best.laws:
-            rest = tuple(each for each in best.laws if each != i)
+            rest = tuple(law for law in best.laws if law != i)
             yield self.hypothesis(rest, best.scales)
             yield from self.beside(rest, best.scales)
 
     def beside(self, laws: tuple[int, ...], scales: Array) -> list[Hypothesis]:
         """The laws with one more, for the most promising of all others."""
         taken = {self.laws[i].candidate.term.effect for i in laws}
-        others = [i for i, each in enumerate(self.laws) if each.candidate.term.effect not in taken]
+        others = [i for i, law in enumerate(self.laws) if law.candidate.term.effect not in taken]
         chosen: set[int] = set()
         for factor in SCREENING_FACTORS:
             gains = self._gains(laws, np.maximum(scales * factor**2, MIN_SCALE**2), others)
@@ -192,10 +192,10 @@ class LinearModel:
 
     def _gains(self, laws: Sequence[int], scales: Array, others: Sequence[int]) -> Array:
         """Fall of -2 log evidence by each of ``others`` beside ``laws``, at fixed scales."""
-        own = [c for i in laws for c in self.laws[i].columns]
-        at = np.concatenate([np.array(own, int), *self._groups])
+        of_laws = [column for i in laws for column in self.laws[i].columns]
+        at = np.concatenate([np.array(of_laws, int), *self._groups])
         precision = np.concatenate(
-            [np.ones(len(own)), *(np.full(g.size, 1.0 / v) for g, v in zip(self._groups, scales, strict=True))]
+            [np.ones(len(of_laws)), *(np.full(g.size, 1.0 / v) for g, v in zip(self._groups, scales, strict=True))]
         )
         inner = self.gram[np.ix_(at, at)] + np.diag(precision)
         new = np.array([c for i in others for c in self.laws[i].columns])
@@ -213,45 +213,46 @@ class LinearModel:
             first = last
         return np.array(gains)
 
-    def share(self, found: Hypothesis, law: int) -> float:
-        """Share of the misfit that only this law of the found ones explains, without a discrepancy."""
+    def share(self, hypothesis: Hypothesis, law: int) -> float:
+        """Share of the misfit that only this law of a hypothesis explains, without a discrepancy."""
         everything = range(len(self.discrepancies))
-        sets = (), tuple(i for i in found.laws if i != law), found.laws
-        nothing, without, whole = (self.hypothesis(laws, found.scales, 0, everything).misfit for laws in sets)
+        sets = (), tuple(i for i in hypothesis.laws if i != law), hypothesis.laws
+        nothing, without, whole = (self.hypothesis(laws, hypothesis.scales, 0, everything).misfit for laws in sets)
         return (without - whole) / max(nothing - whole, 1e-300)
 
-    def without_small(self, found: Hypothesis) -> Hypothesis:
+    def without_small(self, hypothesis: Hypothesis) -> Hypothesis:
         """Without laws that explain less than an unlisted imperfection may."""
-        exact = self.hypothesis(found.laws, np.full(len(self.discrepancies), MIN_SCALE**2), 0)
-        if len(found.laws) < 2 or exact.neg2_log_evidence < found.neg2_log_evidence + MIN_SCORE_GAIN:
-            return found
-        smallest = min(found.laws, key=lambda i: self.share(found, i))
-        if self.share(found, smallest) > MIN_SHARE:
-            return found
-        return self.without_small(self.hypothesis(tuple(i for i in found.laws if i != smallest), found.scales))
+        exact = self.hypothesis(hypothesis.laws, np.full(len(self.discrepancies), MIN_SCALE**2), 0)
+        if len(hypothesis.laws) < 2 or exact.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN:
+            return hypothesis
+        smallest = min(hypothesis.laws, key=lambda i: self.share(hypothesis, i))
+        if self.share(hypothesis, smallest) > MIN_SHARE:
+            return hypothesis
+        rest = tuple(i for i in hypothesis.laws if i != smallest)
+        return self.without_small(self.hypothesis(rest, hypothesis.scales))
 
-    def rivals(self, found: Hypothesis, law: int) -> tuple[RivalFit, ...]:
+    def rivals(self, hypothesis: Hypothesis, law: int) -> tuple[RivalFit, ...]:
         """Other laws in the place of one, the best of each first.
 
         A rival that seems better is one whose evidence rounding spoils, because an exchange has been tried.
         """
-        rest = tuple(i for i in found.laws if i != law)
+        rest = tuple(i for i in hypothesis.laws if i != law)
         best: dict[str, RivalFit] = {}
-        for each in sorted(self.beside(rest, found.scales), key=lambda other: other.neg2_log_evidence):
-            candidate = self.laws[each.laws[-1]].candidate
-            gap = each.neg2_log_evidence - found.neg2_log_evidence
+        for rival in sorted(self.beside(rest, hypothesis.scales), key=lambda other: other.neg2_log_evidence):
+            candidate = self.laws[rival.laws[-1]].candidate
+            gap = rival.neg2_log_evidence - hypothesis.neg2_log_evidence
             if candidate.term.effect != self.laws[law].candidate.term.effect and gap > -MIN_EXCHANGE_GAIN:
-                best.setdefault(candidate.key, RivalFit(gap, candidate, each.misfit - found.misfit))
+                best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
-    def bulk(self, found: Hypothesis, law: int) -> float:
+    def bulk(self, hypothesis: Hypothesis, law: int) -> float:
         """Share that a law takes of what it and a free correction of its stage take together, beside all others."""
         stage = self.laws[law].candidate.term.stage
-        own = [i for i, each in enumerate(self.discrepancies) if each.candidate.term.stage == stage]
-        rest = tuple(i for i in found.laws if self.laws[i].candidate.term.stage != stage)
-        nothing = self.hypothesis(rest, found.scales, 0, own).misfit
-        named = self.hypothesis(found.laws, found.scales, 0, own).misfit
-        free = self.hypothesis(found.laws, None, SCALE_ITERATIONS).misfit
+        of_stage = [i for i, term in enumerate(self.discrepancies) if term.candidate.term.stage == stage]
+        rest = tuple(i for i in hypothesis.laws if self.laws[i].candidate.term.stage != stage)
+        nothing = self.hypothesis(rest, hypothesis.scales, 0, of_stage).misfit
+        named = self.hypothesis(hypothesis.laws, hypothesis.scales, 0, of_stage).misfit
+        free = self.hypothesis(hypothesis.laws, None, SCALE_ITERATIONS).misfit
         return (nothing - named) / max(nothing - min(free, named), 1e-300)
 
 
@@ -261,12 +262,12 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     base = [i for i, f in enumerate(parameters) if f.kind not in ("term", "hidden")]
     residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
     blocks: list[tuple[Candidate, Array, ScoreTest | None, float]] = []
-    for each in uncertain(fit.model):
-        columns, part = _part_of_fit(fit, each)
+    for candidate in uncertain(fit.model):
+        columns, part = _part_of_fit(fit, candidate)
         residual = residual - part
-        blocks.append((each, columns, None, _shape_cost(fit, each)))
-    present = {each.key for each in fit.model.candidates}
-    others = [each for each in candidates if each.key not in present]
+        blocks.append((candidate, columns, None, _shape_cost(fit, candidate)))
+    present = {candidate.key for candidate in fit.model.candidates}
+    others = [candidate for candidate in candidates if candidate.key not in present]
     for tests in score_candidate_starts(likelihood, fit, others):
         cost = 2.0 * float(np.log(len(tests)))
         blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
@@ -276,20 +277,20 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     inner = nuisance.T @ nuisance + np.diag(fit.model.precision[base])
     gram = whole.T @ whole - cross.T @ np.linalg.solve(inner, cross)
     ends = np.cumsum([0, *(columns.shape[1] for _, columns, *_ in blocks)])
-    found = [
+    terms = [
         LinearTerm(candidate, np.arange(low, high), test, cost)
         for (candidate, _, test, cost), (low, high) in zip(blocks, pairwise(ends), strict=True)
     ]
-    free = [each.candidate.term.effect in DISCREPANCY_TERMS for each in found]
-    laws = tuple(each for each, discrepancy in zip(found, free, strict=True) if not discrepancy)
-    return LinearModel(gram, laws, tuple(each for each, discrepancy in zip(found, free, strict=True) if discrepancy))
+    discrepancies = tuple(term for term in terms if term.candidate.term.effect in DISCREPANCY_TERMS)
+    laws = tuple(term for term in terms if term.candidate.term.effect not in DISCREPANCY_TERMS)
+    return LinearModel(gram, laws, discrepancies)
 
 
 def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
     """The best starts of one candidate that is linear in an amplitude and has an effect."""
-    linear = [each for each in tests if amplitude_indices(each.model, each.candidate) and np.any(each.columns)]
+    linear = [test for test in tests if amplitude_indices(test.model, test.candidate) and np.any(test.columns)]
     most = 1 if tests[0].candidate.term.effect in DISCREPANCY_TERMS else MAX_STARTS
-    return sorted(linear, key=lambda each: -each.predicted_gain)[:most]
+    return sorted(linear, key=lambda test: -test.predicted_gain)[:most]
 
 
 def _part_of_fit(fit: Fit, candidate: Candidate) -> tuple[Array, Array]:
@@ -335,19 +336,19 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
         progress: called with one line of text at every step.
     """
     fit = anchor
-    if not _follows(fit) or not all(_is_linear(each) for each in uncertain(fit.model)):
+    if not _follows(fit) or not all(_is_linear(candidate) for candidate in uncertain(fit.model)):
         return None
     for _ in range(MAX_LINEARISATIONS):
         likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
         fit = fit_model(likelihood, fit.model, fit.x)
         linear = linear_model(likelihood, fit, candidates)
-        found = linear.without_small(linear.select())
-        laws = [linear.laws[i] for i in found.laws]
-        effects = {each.candidate.term.effect for each in laws}
+        hypothesis = linear.without_small(linear.select())
+        laws = [linear.laws[i] for i in hypothesis.laws]
+        effects = {law.candidate.term.effect for law in laws}
         progress(f"beside a discrepancy: {', '.join(sorted(effects)) or 'no named law'}")
         if not effects:
             return None
-        if effects == {each.term.effect for each in uncertain(fit.model)}:
+        if effects == {candidate.term.effect for candidate in uncertain(fit.model)}:
             break
         with_laws = _fit_laws(likelihood, fit, laws)
         if with_laws.chi2 > MAX_CHI2_RATIO * fit.chi2:
@@ -355,16 +356,17 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
         fit = with_laws
     else:
         return None
-    if np.max(found.scales) > MAX_SCALE_BESIDE**2 or min(linear.bulk(found, i) for i in found.laws) < MIN_BULK:
+    least_bulk = min(linear.bulk(hypothesis, i) for i in hypothesis.laws)
+    if np.max(hypothesis.scales) > MAX_SCALE_BESIDE**2 or least_bulk < MIN_BULK:
         return None
-    keys = {each.term.effect: each.key for each in uncertain(fit.model)}
-    rivals = {keys[linear.laws[i].candidate.term.effect]: linear.rivals(found, i) for i in found.laws}
+    keys = {candidate.term.effect: candidate.key for candidate in uncertain(fit.model)}
+    rivals = {keys[linear.laws[i].candidate.term.effect]: linear.rivals(hypothesis, i) for i in hypothesis.laws}
     return Choice(likelihood, fit, rivals)
 
 
 def _is_linear(candidate: Candidate) -> bool:
     """Whether a term is linear in an amplitude."""
-    return any(is_amplitude(candidate, each) for each in candidate.term.free_parameters)
+    return any(is_amplitude(candidate, parameter) for parameter in candidate.term.free_parameters)
 
 
 def _follows(fit: Fit) -> bool:
@@ -378,10 +380,10 @@ def _follows(fit: Fit) -> bool:
 
 def _fit_laws(likelihood: Likelihood, fit: Fit, laws: Sequence[LinearTerm]) -> Fit:
     """The fit with these laws and no others."""
-    certain = [each for each in fit.model.candidates if not each.term.free_parameters]
-    model = Model(fit.model.runs, fit.model.device, [*certain, *(each.candidate for each in laws)], fit.model.mains)
+    certain = [candidate for candidate in fit.model.candidates if not candidate.term.free_parameters]
+    model = Model(fit.model.runs, fit.model.device, [*certain, *(law.candidate for law in laws)], fit.model.mains)
     x = model.map_parameters_from(fit.model, fit.x)
-    for test in (each.test for each in laws if each.test is not None):
+    for test in (law.test for law in laws if law.test is not None):
         for i, f in enumerate(model.parameters):
             if f.kind == "term" and f.owner == test.candidate.key:
                 x[i] = test.x[test.model.index("term", f.owner, f.name)]
