@@ -336,6 +336,8 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
         progress: called with one line of text at every step.
     """
     fit = anchor
+    if not any(candidate.term.effect in DISCREPANCY_TERMS for candidate in candidates):
+        return None  # every law would be compared with noise alone
     if not _follows(fit) or not all(_is_linear(candidate) for candidate in uncertain(fit.model)):
         return None
     for _ in range(MAX_LINEARISATIONS):
