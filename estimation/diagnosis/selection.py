@@ -280,16 +280,19 @@ class _LawChoice:
     def settles(self, best: Fit) -> bool:
         """Whether no discrepancy term has to be fitted beside the best named term.
 
-        Where the nominal device is nearly adequate, the laws also have to be significant without a discrepancy.
+        Where the nominal device is nearly adequate, the laws also have to be significant without a discrepancy. A law
+        that slow noise explains as well is dropped.
         """
         choice = choose_laws(best, self._candidates, self._progress)
-        if choice is None:
+        if choice is None or not satisfies_sign_constraints(choice.fit):
             return False
+        several = len(uncertain(choice.fit.model)) > 1
+        fit = drop_redundant(choice.likelihood, choice.fit) if several else choice.fit
         before = fit_model(choice.likelihood, self._nominal.model, self._nominal.x)
-        if before.validation_chi2 < CHI2_INADEQUATE and not is_significant(choice.likelihood, before, choice.fit):
+        if before.validation_chi2 < CHI2_INADEQUATE and not is_significant(choice.likelihood, before, fit):
             return False
         rivals = {**self._rivals, **choice.rivals}
-        self.state = SelectionState(choice.likelihood, before, choice.fit, rivals, settled=True)
+        self.state = SelectionState(choice.likelihood, before, fit, rivals, settled=True)
         return True
 
 

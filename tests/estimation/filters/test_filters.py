@@ -291,7 +291,7 @@ def test_sensor_estimator_uses_position_readouts() -> None:
 
 def test_error_of_an_unknown_estimator_lists_the_known_ones() -> None:
     recording, _ = shared_electrode()
-    with pytest.raises(BadInput, match="no estimator is named 'kalman'; there are acm, constant, ekf, hyb"):
+    with pytest.raises(BadInput, match="no estimator is named 'kalman'; there are acm, constant, edges, ekf, hyb"):
         registry.estimate(recording, None, "kalman")
 
 
