@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector
 from recon.imaging.intensity_drift import DriftKind
-from recon.pipeline import Options, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
 from scanner.recording import Recording
 
 SCENES = ("immunohistochemistry", "retina", "cell", "microaneurysms")

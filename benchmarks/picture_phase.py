@@ -18,7 +18,8 @@ from phantoms.optics import Detector
 from recon.evaluation import truth_from_simulation
 from recon.imaging import blur
 from recon.imaging.gridding import accumulate_samples, mean_picture
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.device import Device
 from scanner.recording import Recording

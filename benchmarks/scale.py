@@ -32,7 +32,7 @@ from estimation.tracker import track
 from phantoms.experiment import Experiment, simulate_experiment
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
-from recon.pipeline import Options
+from recon.reconstruction import Options
 from scanner.device import Device
 from scanner.recording import Recording
 from scanner.stages import Amdm

@@ -13,7 +13,8 @@ import afm_spiral
 import lissajous
 from recon.evaluation import load_truth
 from recon.io.output import finite, replacing_folder
-from recon.pipeline import Options, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
 from recon.report.comparison import comparison_report
 from recon.report.figures import data_uri, save_picture
 from recon.report.page import Figure, Section

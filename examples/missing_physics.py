@@ -23,7 +23,8 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.forward import Plan, simulate
 from recon.evaluation import truth_from_simulation
 from recon.imaging.picture import Picture
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import fill_small_holes, new_figure, normalise_intensity
 from recon.report.summary import summarise
 from scanner.device import Device

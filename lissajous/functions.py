@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from estimation.identification.calibrate import Identification
     from recon.imaging.intensity_drift import DriftKind
     from recon.imaging.picture_estimate import PictureKind
-    from recon.pipeline import Reconstruction
+    from recon.reconstruction import Reconstruction
     from recon.scan_design import ScanCandidate, SustainedBand
     from scanner.motion import Motion
 
@@ -218,8 +218,8 @@ def reconstruct(
         BadInput: the recording or the device lacks what is needed.
     """
     from recon.evaluation import load_truth, truth_from_simulation
-    from recon.pipeline import Options
     from recon.pipeline import reconstruct as reconstruct_recording
+    from recon.reconstruction import Options
 
     options = Options(
         estimator=estimator,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from recon.pipeline import Reconstruction
+    from recon.reconstruction import Reconstruction
 
 Layer = tuple[Any, dict[str, Any], str]
 """Data, arguments and kind of a layer, as napari takes them."""

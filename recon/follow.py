@@ -31,9 +31,10 @@ from recon.imaging.readout_phase import ReadoutPhase, apply_readout_phase, updat
 from recon.interrupts import acknowledge_stop
 from recon.io.convert import convert
 from recon.io.output import check_folder, write_tiff
-from recon.pipeline import Options, estimate_motion, measure_phase_errors, wants_readout_phase
+from recon.pipeline import estimate_motion, measure_phase_errors, wants_readout_phase
 from recon.preparation import prepare_frame, select_device
 from recon.quality.defects import unrecoverable_intervals
+from recon.reconstruction import Options
 from recon.report.figures import save_picture
 from recon.sample_ranges import to_sample_ranges
 from scanner.errors import BadInput

@@ -16,8 +16,8 @@ from recon.imaging.picture import Picture, fill_holes
 from recon.imaging.picture_estimate import EstimatedPicture, estimate_picture
 from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
-from recon.pipeline import Options, Reconstruction
 from recon.quality.defects import unrecoverable_intervals
+from recon.reconstruction import Options, Reconstruction
 from recon.report.movie import write_movie
 from recon.sample_ranges import SampleRanges, to_sample_ranges
 from scanner.errors import BadInput

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.pipeline import EstimatedMotion, Options, correct_readout_phase, estimate_motion
+from recon.pipeline import EstimatedMotion, correct_readout_phase, estimate_motion
 from recon.preparation import prepare
 from recon.quality.defects import unrecoverable_intervals
+from recon.reconstruction import Options
 from recon.sample_ranges import to_sample_ranges
 from scanner.arrays import Array
 from scanner.channel import Channel

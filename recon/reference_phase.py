@@ -6,8 +6,9 @@ import numpy as np
 
 from estimation.optics.readout_effects import ReferencePhase
 from recon.imaging.readout_phase import measured_phase_error
-from recon.pipeline import Options, correct_readout_phase, estimate_motion
+from recon.pipeline import correct_readout_phase, estimate_motion
 from recon.preparation import prepare
+from recon.reconstruction import Options
 from scanner.device import AXES, Device
 from scanner.recording import Recording
 

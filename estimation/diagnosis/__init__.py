@@ -8,7 +8,8 @@ test data, pictures and reports do not belong here. Modules in the order of the 
 2. ``model``: simulated channels as a function of parameters; ``noise``: noise spectrum and whitening.
 3. ``fit``: whitened residuals, Jacobian and fit; ``initial``: initial state and growing windows.
 4. ``discrepancy``: flexible terms for effects without a law; ``screening``: first-order score of every candidate term.
-5. ``progressive_fit``: fits of candidates; ``exchange`` and ``pruning``: moves; ``selection``: the stepwise search.
+5. ``progressive_fit``: fits of candidates; ``significance``: whether a term is needed; ``exchange`` and ``pruning``:
+   moves; ``law_selection``: named laws beside a small discrepancy; ``selection``: the stepwise search.
 6. ``interference``: tones that are neither motion nor drive.
 7. ``profile_likelihood``: intervals; ``localisation``: channel, time and harmonics of a misfit;
    ``identifiability``: detectability of every effect; ``experiment_design``: further measurements.

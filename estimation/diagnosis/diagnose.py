@@ -19,9 +19,9 @@ from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.localisation import describe_localisation
 from estimation.diagnosis.model import Candidate
 from estimation.diagnosis.profile_likelihood import profile_interval
-from estimation.diagnosis.progressive_fit import UNIQUE_NAME_THRESHOLD
 from estimation.diagnosis.selection import Progress, SelectionResult, SelectionStep, select_terms
 from estimation.diagnosis.shares import describe_unexplained, find_remainder, share_of_finding
+from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording

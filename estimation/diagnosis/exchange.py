@@ -18,7 +18,7 @@ import numpy as np
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.fit import Fit, Likelihood, fit_models
 from estimation.diagnosis.model import Candidate, Model
-from estimation.diagnosis.progressive_fit import ABORT_MARGIN, satisfies_sign_constraints
+from estimation.diagnosis.progressive_fit import ABORT_MARGIN
 from estimation.diagnosis.screening import (
     MAX_PRIOR_SIGMAS,
     ProfiledLinearModel,
@@ -28,6 +28,7 @@ from estimation.diagnosis.screening import (
     score_candidates,
     set_amplitudes,
 )
+from estimation.diagnosis.significance import satisfies_sign_constraints
 from scanner.arrays import Array
 
 MAX_EXCHANGE_FITS = 4

@@ -26,16 +26,18 @@ from estimation.diagnosis.noise import Whitener
 from estimation.diagnosis.progressive_fit import (
     CHI2_ADEQUATE,
     CHI2_LINEARISABLE,
-    DETECTION_THRESHOLD,
-    UNIQUE_NAME_THRESHOLD,
-    evidence_gain,
     fit_candidates_progressively,
     fit_screened_candidates,
-    is_significant,
-    satisfies_sign_constraints,
 )
 from estimation.diagnosis.pruning import prune_by_evidence
 from estimation.diagnosis.screening import all_candidates
+from estimation.diagnosis.significance import (
+    DETECTION_THRESHOLD,
+    UNIQUE_NAME_THRESHOLD,
+    evidence_gain,
+    is_significant,
+    satisfies_sign_constraints,
+)
 from scanner.device import Device
 from scanner.terms import Term
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from estimation.diagnosis.diagnose import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
-from estimation.diagnosis.progressive_fit import DETECTION_THRESHOLD
+from estimation.diagnosis.significance import DETECTION_THRESHOLD
 from estimation.least_squares import GaussianPosterior, eliminate_backward, gaussian_posterior
 from estimation.optics.candidates import OpticsEffect, candidate_effects
 from estimation.optics.fit import fit_optics

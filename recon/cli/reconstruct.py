@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from recon.cli.argument_types import parse_count, parse_positive, parse_size
 
 if TYPE_CHECKING:
-    from recon.pipeline import Options
+    from recon.reconstruction import Options
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    from recon.pipeline import Options
+    from recon.reconstruction import Options
     from scanner.errors import BadInput
     from scanner.extras import import_extra
 

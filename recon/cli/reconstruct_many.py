@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from recon.cli.reconstruct import reconstruct_file
 
 if TYPE_CHECKING:
-    from recon.pipeline import Options
+    from recon.reconstruction import Options
 
 TABLE_KEYS = ("estimator", "samples", "fill", "phase_sd_deg", "within_bound", "sign", "trouble", "notes", "seconds")
 """Keys of one recording's summary that the summary of all repeats."""

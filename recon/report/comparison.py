@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.pipeline import AXES, Reconstruction
+from recon.reconstruction import Reconstruction
 from recon.report.figures import (
     contrast_limits,
     data_uri,
@@ -26,6 +26,7 @@ from recon.report.reconstruction import (
     scale_bar,
 )
 from recon.report.summary import is_mirrored
+from scanner.device import AXES
 
 
 def comparison_report(

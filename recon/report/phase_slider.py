@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.pipeline import AXES, MAX_REGISTERED_PERIODS, Reconstruction
+from recon.pipeline import MAX_REGISTERED_PERIODS
 from recon.quality.defects import unrecoverable_intervals
+from recon.reconstruction import Reconstruction
 from recon.report.figures import contrast_limits
 from recon.sample_ranges import to_sample_ranges
 from scanner.arrays import Array
+from scanner.device import AXES
 from scanner.lock_in import block_length, block_phasors
 from scanner.motion import AxisMotion
 

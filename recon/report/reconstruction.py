@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.imaging.picture import Grid
 from recon.io.output import pixel_size
-from recon.pipeline import AXES, Reconstruction
+from recon.reconstruction import Reconstruction
 from recon.report.conclusions import conclude_reconstruction
 from recon.report.figures import (
     blur_figure,
@@ -28,6 +28,7 @@ from recon.report.figures import (
 from recon.report.numbers import format_uncertain
 from recon.report.page import Figure, Section, Table, render
 from recon.report.phase_slider import phase_slider_data
+from scanner.device import AXES
 
 
 def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fill_radius: int = 0) -> str:

@@ -13,7 +13,8 @@ from recon.imaging import blur
 from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
-from recon.pipeline import AXES, Reconstruction
+from recon.reconstruction import Reconstruction
+from scanner.device import AXES
 from scanner.motion import AxisMotion
 
 FILL_FRACTIONS = (0.25, 0.5, 0.75, 0.9, 0.99)

@@ -15,7 +15,8 @@ from phantoms.optics import Detector
 from phantoms.waveforms import Sine, Waveform
 from recon.evaluation import truth_from_simulation
 from recon.io.output import finite
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from recon.report.summary import axis_summary, summarise
 from recon.study.plan import Job, Scenario, StudyDesign
 from scanner.device import AXES, Device

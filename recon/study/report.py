@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging import blur
-from recon.pipeline import AXES
 from recon.report.conclusions import conclude_study
 from recon.report.figures import COLOURS, figure_uri, new_figure, use_plain_ticks
 from recon.report.page import Figure, Section, Table, render
 from recon.study.plan import Study
 from recon.study.table import Columns
 from scanner.arrays import Array
+from scanner.device import AXES
 
 MARKERS = "o+^xs"
 """Markers of the phantoms, repeated if there are more."""

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import UNVISITED
 from scanner.errors import DeviceInvalid
 from scanner.stages import Scan

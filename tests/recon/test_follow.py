@@ -19,7 +19,8 @@ from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.follow import follow_recording, match_signs, reconstruct_frame, repeat_time
 from recon.imaging.readout_phase import apply_readout_phase
-from recon.pipeline import Options, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
 from scanner.recording import Recording
 from tests.support import sample_files
 from tests.support.simulated import imaging, with_sense

@@ -13,7 +13,8 @@ import lissajous
 from lissajous.napari_reader import get_reader
 from recon.cli import main
 from recon.frames import frames, write_scan_frames
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from recon.report.movie import draw_frame
 from scanner.device import Device
 from scanner.recording import Recording

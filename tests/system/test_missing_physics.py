@@ -12,7 +12,8 @@ from estimation.diagnosis.model import Model
 from estimation.diagnosis.screening import all_candidates
 from phantoms.experiment import Experiment, simulate_experiment
 from recon.evaluation import truth_from_simulation
-from recon.pipeline import Options, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
 from recon.report.summary import summarise
 from scanner import devices
 from scanner.terms import catalogue

@@ -11,8 +11,8 @@ import pytest
 
 from phantoms.lidar import add_ranges, measure_wall
 from recon.cli import main
-from recon.pipeline import Options
 from recon.point_cloud import make_point_cloud
+from recon.reconstruction import Options
 from scanner import devices
 from scanner.device import Device
 from scanner.errors import BadInput

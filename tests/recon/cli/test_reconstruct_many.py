@@ -18,7 +18,7 @@ from recon.cli import main
 from recon.cli.reconstruct import format_summary
 from recon.cli.reconstruct_many import reconstruct_files
 from recon.fleet import find_recordings, plan_fleet
-from recon.pipeline import Options
+from recon.reconstruction import Options
 from scanner.errors import BadInput
 from tests.support.simulated import imaging
 

@@ -11,7 +11,8 @@ from recon.evaluation import truth_from_simulation
 from recon.imaging.amplitude_change import measure_amplitude_changes
 from recon.imaging.phase_search import search_phases
 from recon.imaging.picture import Grid
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.errors import BadInput

@@ -18,7 +18,8 @@ from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.imaging.image_phase import refine_motion
 from recon.imaging.picture import Grid
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.errors import BadInput, ChannelMissing
 from scanner.motion import Motion

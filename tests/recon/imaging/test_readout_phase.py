@@ -10,7 +10,8 @@ from phantoms.optics import Detector, detect, sample_scene
 from phantoms.targets import make_target
 from recon.evaluation import truth_from_simulation
 from recon.imaging.readout_phase import correlate_matern32, estimate_readout_phase
-from recon.pipeline import Options, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
 from scanner.recording import Recording
 from tests.support.simulated import imaging, with_sense
 

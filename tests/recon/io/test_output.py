@@ -14,7 +14,8 @@ from recon.frames import write_scan_frames
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
 from recon.io.output import write_frames, write_tiff
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.device import Device
 from scanner.errors import BadInput

@@ -17,10 +17,11 @@ from recon.cli import main
 from recon.evaluation import truth_from_simulation
 from recon.imaging.bidirectional_phase import PhaseError, PhaseEstimate
 from recon.imaging.gridding import map_samples
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
 from recon.quality.clock_jumps import detect_clock_jumps
 from recon.quality.defects import Defect, find_defects
 from recon.quality.dropped_samples import first_late_slice, slice_delays
+from recon.reconstruction import Options, Reconstruction
 from recon.sample_ranges import subtract_ranges, to_sample_ranges
 from scanner.recording import Recording
 from tests.support.simulated import imaging, separate_electrodes

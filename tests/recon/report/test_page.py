@@ -14,8 +14,9 @@ import pytest
 import recon.report.phase_slider
 from recon.imaging.gridding import accumulate_samples
 from recon.imaging.picture import Grid
-from recon.pipeline import Options, Reconstruction, reconstruct
+from recon.pipeline import reconstruct
 from recon.quality.defects import Defect, unrecoverable_intervals
+from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import MAX_CURVE_SEGMENTS, highlight_pixels, min_max_envelope
 from recon.report.page import Section, render
 from recon.report.phase_slider import MISSING_CODE, phase_slider_data
