@@ -250,5 +250,5 @@ def test_an_interrupt_message_states_that_results_are_kept(tmp_path: Path) -> No
     process.send_signal(signal.SIGINT)
     message = process.communicate(timeout=300)[1]
     assert process.returncode == 1
-    assert "interrupted; what was done is kept" in message
+    assert "interrupted; finished jobs are kept" in message
     assert "Traceback" not in message
