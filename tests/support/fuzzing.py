@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-MAX_MEMORY_BYTES = 3 << 30
+MAX_FILE_BYTES = 3 << 30
+MAX_ADDED_MEMORY_BYTES = 2 << 30
+"""Memory of a child process beyond that of the test process, which grows with the tests that ran before."""
 MAX_TIME_S = 20
 
 HUGE = [0, 1, 0x7F, 0xFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 10**9, 10**12, 2**62, 2**63 - 1, 2**64 - 1]
@@ -89,6 +91,12 @@ class Outcome:
         return self.code == 2 and self.stderr.count("\n") == 1 and "Traceback" not in self.stderr
 
 
+def data_size() -> int:
+    """Size of this process's data segments [bytes], which is what RLIMIT_DATA bounds."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmData")))
+
+
 def run_in_child(
     act: Callable[[], int], log: Path, meanwhile: Callable[[int], None] = lambda pid: None, seconds: int = MAX_TIME_S
 ) -> Outcome:
@@ -101,9 +109,10 @@ def run_in_child(
         try:
             signal.alarm(seconds)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
-            resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
+            memory = data_size() + MAX_ADDED_MEMORY_BYTES
+            resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_BYTES, MAX_FILE_BYTES))
             out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(out, 2)
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
