@@ -61,7 +61,7 @@ def test_terms_of_a_shared_readout_are_candidates_once(calibration) -> None:  # 
 def test_the_demodulator_lag_changes_over_a_sweep() -> None:
     example = runpy.run_path(str(Path(__file__).parent.parent.parent / "examples" / "sweep_lag.py"))
     true = devices.load("chen2020-driven")
-    nominal = example["papers_own"](true)
+    nominal = example["without_filters"](true)
     axis = nominal.axis("x")
     improved = replace(nominal, axes={"x": replace(axis, terms={"demodulator-lag": {"f_c": 40950.0}})})
     sweep = (31440.0, 31540.0)
