@@ -46,12 +46,17 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fi
     )
     shown = shown_image(result.picture, fill_radius)
     image, limits = to_rgb(shown), contrast_limits(shown)
-    filling = f"holes up to {fill_radius} pixels wide filled from their neighbours; " if fill_radius else "not filled; "
+    filling = f"holes up to {fill_radius} pixels wide filled from their neighbours" if fill_radius else "not filled"
+    content = (
+        f"picture, {filling}; blue: pixels never visited"
+        if result.picture_kind == "mean"
+        else f"{result.picture_kind} estimate of every pixel, also of those never visited"
+    )
     bar, unit = scale_bar(grid), result.intensity.unit
     pictures = [
         Figure(
             data_uri(encode_png(image)),
-            f"picture, {filling}blue: pixels never visited",
+            content,
             scale_bar=bar,
             grey_scale=(f"{limits[0]:.3g} {unit}", f"{limits[1]:.3g} {unit}"),
         ),
