@@ -76,7 +76,7 @@ def test_smoother_and_score_agree_with_the_textbook() -> None:
     made = linear.point.copy()
     xs, Ps, squares, spreads = rauch_tung_striebel(prepared, linear, run)
     assert (linear.point == made).all()
-    told = disturbance_scores(prepared.signal, linear, run.history)
+    scores = disturbance_scores(prepared.signal, linear, run.history)
     run_smoother(prepared.signal.step, run.history)
     deviations = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2))
     used = slice(0, 2 * AXIS_STATES + 1)
@@ -93,8 +93,8 @@ def test_smoother_and_score_agree_with_the_textbook() -> None:
         AXIS_STATES + STIFFNESS_RATE,
         AXIS_STATES + DAMPING,
     ]
-    assert told[0][walked] == pytest.approx(squares[walked], rel=1e-4)
-    assert told[1][walked] == pytest.approx(spreads[walked], rel=1e-4)
+    assert scores[0][walked] == pytest.approx(squares[walked], rel=1e-4)
+    assert scores[1][walked] == pytest.approx(spreads[walked], rel=1e-4)
 
 
 def test_stored_linearisation_gives_the_same_result_for_other_densities() -> None:
@@ -170,14 +170,14 @@ def test_measurement_jacobian_includes_the_rate_by_stiffness_and_damping() -> No
 def test_score_is_the_derivative_of_the_likelihood() -> None:
     prepared = prepared_of(8)
 
-    def told(trend: float) -> tuple[float, np.ndarray, np.ndarray]:
+    def evaluate_with(trend: float) -> tuple[float, np.ndarray, np.ndarray]:
         linear, walk = empty_linearisation(prepared.signal), WALK.copy()
         walk[0, 1] *= trend
         run = run_of(prepared, walk, linear)
         return run.log_likelihood, *disturbance_scores(prepared.signal, linear, run.history)
 
-    slope = (told(1.1)[0] - told(0.9)[0]) / 0.2
-    _, squares, spreads = told(1.0)
+    slope = (evaluate_with(1.1)[0] - evaluate_with(0.9)[0]) / 0.2
+    _, squares, spreads = evaluate_with(1.0)
     score = 0.5 * (squares - spreads)[STIFFNESS_RATE] * WALK[0, 1] * prepared.signal.step
     assert score == pytest.approx(slope, rel=0.1)
 
