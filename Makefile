@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+WORKERS := --numprocesses auto --dist loadscope
 
 .PHONY: demo test test-fast lint docs notebooks bench papers blind wheel-check clean
 
@@ -16,12 +17,13 @@ $(STAMP): pyproject.toml requirements.lock
 demo: $(STAMP)
 	$(BIN)/python examples/demo.py demo-output
 
+# All tests, with a worker on each core. Tests of one module stay together, because they share fixtures.
 test: $(STAMP) lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(WORKERS)
 
 # For development: all tests but those marked slow.
 test-fast: $(STAMP) lint
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest $(WORKERS) -m "not slow"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -35,7 +35,7 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_default_options = {"ignore-module-all": True}  # a re-exported name is documented where it is defined
 napoleon_use_ivar = True  # attributes of a dataclass are listed once, from its docstring
-apidoc_separate_modules = True
+apidoc_separate_modules = False  # a page for each package; with one for each module, every sidebar lists hundreds
 apidoc_module_first = True
 apidoc_modules = [
     {"path": f"../{package}", "destination": f"api/{package}", "automodule_options": {"members", "show-inheritance"}}

@@ -63,9 +63,10 @@ def test_every_page_module_and_example_is_reached_from_the_index(site: Path) -> 
     assert pages
     assert {page for page in pages if f'href="{page.as_posix()}.html"' not in index} == set()
     for package in ("lissajous", "scanner", "phantoms", "estimation", "recon"):
-        for module in (ROOT / package).glob("[!_]*.py"):
-            page = site / "api" / package / f"{package}.{module.stem}.html"
-            assert f'id="module-{package}.{module.stem}"' in page.read_text(encoding="utf-8")
+        for module in (ROOT / package).rglob("[!_]*.py"):
+            *parents, stem = module.relative_to(ROOT).with_suffix("").parts
+            page = site / "api" / package / f"{'.'.join(parents)}.html"
+            assert f'id="module-{".".join(parents)}.{stem}"' in page.read_text(encoding="utf-8")
     gallery = (site / "gallery" / "index.html").read_text(encoding="utf-8")
     for script in (ROOT / "examples").glob("[0-9]_*.py"):
         assert f'href="{script.stem}.html' in gallery
