@@ -25,7 +25,13 @@ from estimation.diagnosis.exchange import MIN_EXCHANGE_GAIN, RivalFit
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import estimate_whiteners
 from estimation.diagnosis.model import Candidate, Model, uncertain
-from estimation.diagnosis.screening import ScoreTest, amplitude_indices, is_amplitude, score_candidate_starts
+from estimation.diagnosis.screening import (
+    ScoreTest,
+    amplitude_indices,
+    is_amplitude,
+    score_candidate_starts,
+    set_amplitudes,
+)
 from scanner.arrays import Array
 
 SCALE_ITERATIONS = 12
@@ -115,11 +121,14 @@ class LinearModel:
     Attributes:
         gram: of all columns and, last, of the misfit without any of them, shape (q + 1, q + 1). What every hypothesis
             contains is projected out.
+        profile: what every hypothesis contains, as it follows the columns and the misfit: minus its estimate beside
+            each, shape (p, q + 1).
         laws: named laws.
         discrepancies: discrepancy terms of all stages.
     """
 
     gram: Array
+    profile: Array
     laws: tuple[LinearTerm, ...]
     discrepancies: tuple[LinearTerm, ...]
 
@@ -213,6 +222,15 @@ class LinearModel:
             first = last
         return np.array(gains)
 
+    def estimate(self, laws: Sequence[int]) -> tuple[Array, Array]:
+        """Estimates of laws without a discrepancy, and of what every hypothesis contains beside them, shape (p,).
+
+        The estimates of the laws follow each other in the order of ``laws``.
+        """
+        at = np.array([column for i in laws for column in self.laws[i].columns], int)
+        of_laws = -np.linalg.solve(self.gram[np.ix_(at, at)] + np.eye(at.size), self.gram[at, -1])
+        return of_laws, -(self.profile[:, at] @ of_laws + self.profile[:, -1])
+
     def share(self, hypothesis: Hypothesis, law: int) -> float:
         """Share of the misfit that only this law of a hypothesis explains, without a discrepancy."""
         everything = range(len(self.discrepancies))
@@ -258,8 +276,7 @@ class LinearModel:
 
 def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> LinearModel:
     """The linear model around a fit, of its own terms and of ``candidates``."""
-    rows, parameters = fit.rows, fit.model.parameters
-    base = [i for i, f in enumerate(parameters) if f.kind not in ("term", "hidden")]
+    rows, base = fit.rows, _common_parameters(fit)
     residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
     blocks: list[tuple[Candidate, Array, ScoreTest | None, float]] = []
     for candidate in uncertain(fit.model):
@@ -275,7 +292,8 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     nuisance = fit.jacobian[rows][:, base]
     cross = nuisance.T @ whole
     inner = nuisance.T @ nuisance + np.diag(fit.model.precision[base])
-    gram = whole.T @ whole - cross.T @ np.linalg.solve(inner, cross)
+    profile = np.asarray(np.linalg.solve(inner, cross))
+    gram = whole.T @ whole - cross.T @ profile
     ends = np.cumsum([0, *(columns.shape[1] for _, columns, *_ in blocks)])
     terms = [
         LinearTerm(candidate, np.arange(low, high), test, cost)
@@ -283,7 +301,7 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     ]
     discrepancies = tuple(term for term in terms if term.candidate.term.effect in DISCREPANCY_TERMS)
     laws = tuple(term for term in terms if term.candidate.term.effect not in DISCREPANCY_TERMS)
-    return LinearModel(gram, laws, discrepancies)
+    return LinearModel(gram, profile, laws, discrepancies)
 
 
 def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
@@ -352,7 +370,7 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
             return None
         if effects == {candidate.term.effect for candidate in uncertain(fit.model)}:
             break
-        with_laws = _fit_laws(likelihood, fit, laws)
+        with_laws = _fit_laws(likelihood, fit, linear, hypothesis.laws)
         if with_laws.chi2 > MAX_CHI2_RATIO * fit.chi2:
             return None
         fit = with_laws
@@ -380,13 +398,24 @@ def _follows(fit: Fit) -> bool:
     )
 
 
-def _fit_laws(likelihood: Likelihood, fit: Fit, laws: Sequence[LinearTerm]) -> Fit:
-    """The fit with these laws and no others."""
+def _fit_laws(likelihood: Likelihood, fit: Fit, linear: LinearModel, laws: Sequence[int]) -> Fit:
+    """The fit with these laws of the linear model and no others, from their estimates in it."""
+    terms = [linear.laws[i] for i in laws]
     certain = [candidate for candidate in fit.model.candidates if not candidate.term.free_parameters]
-    model = Model(fit.model.runs, fit.model.device, [*certain, *(law.candidate for law in laws)], fit.model.mains)
-    x = model.map_parameters_from(fit.model, fit.x)
-    for test in (law.test for law in laws if law.test is not None):
+    model = Model(fit.model.runs, fit.model.device, [*certain, *(law.candidate for law in terms)], fit.model.mains)
+    estimates, others = linear.estimate(laws)
+    start = fit.x.copy()
+    start[_common_parameters(fit)] = others
+    x = model.map_parameters_from(fit.model, start)
+    ends = np.cumsum([0, *(law.columns.size for law in terms)])
+    for law, (low, high) in zip(terms, pairwise(ends), strict=True):
         for i, f in enumerate(model.parameters):
-            if f.kind == "term" and f.owner == test.candidate.key:
-                x[i] = test.x[test.model.index("term", f.owner, f.name)]
+            if law.test is not None and f.kind == "term" and f.owner == law.candidate.key:
+                x[i] = law.test.x[law.test.model.index("term", f.owner, f.name)]
+        set_amplitudes(x, model, law.candidate, estimates[low:high])
     return fit_model(likelihood, model, x, max_iterations=20)
+
+
+def _common_parameters(fit: Fit) -> list[int]:
+    """Indices of the parameters of a fit that belong to no term."""
+    return [i for i, f in enumerate(fit.model.parameters) if f.kind not in ("term", "hidden")]

@@ -31,7 +31,8 @@ def linear_model(weights: dict[str, float], discrepancy: float, seed: int = 3) -
         for term, low, high in zip(terms, ends[:-1], ends[1:], strict=True)
     ]
     whole = np.column_stack([*columns, misfit])
-    return LinearModel(whole.T @ whole, tuple(linear[: len(LAWS)]), tuple(linear[len(LAWS) :]))
+    nothing_else = np.zeros((0, whole.shape[1]))
+    return LinearModel(whole.T @ whole, nothing_else, tuple(linear[: len(LAWS)]), tuple(linear[len(LAWS) :]))
 
 
 def selected(model: LinearModel) -> set[str]:
