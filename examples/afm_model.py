@@ -22,7 +22,8 @@ from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import flat_whiteners
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
 from recon.io.readers import read
 from scanner.arrays import Array
 from scanner.device import Axis, Device

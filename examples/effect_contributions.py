@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.fit import Fit
-from estimation.diagnosis.selection import refit_without
+from estimation.diagnosis.pruning import refit_without
 
 
 def nested_fits(diagnosis: Diagnosis) -> dict[str, Fit]:

@@ -12,11 +12,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from estimation.estimators import register as register_estimators
     from lissajous.functions import (
-        ScanDesign,
         Simulation,
-        blur_study,
         convert,
-        design,
         diagnose,
         estimate,
         identify,
@@ -25,6 +22,7 @@ if TYPE_CHECKING:
         reconstruct,
         simulate,
     )
+    from lissajous.planning import ScanDesign, blur_study, design
     from recon.frames import ScanFrames, frames
     from recon.imaging.blur import compare_with_scene, phase_bound
     from recon.imaging.gridding import map_samples
@@ -77,9 +75,12 @@ _DEFINED_ELSEWHERE = {
     "Motion": ("scanner.motion", "Motion"),
     "Picture": ("recon.imaging.picture", "Picture"),
     "Recording": ("scanner.recording", "Recording"),
+    "ScanDesign": ("lissajous.planning", "ScanDesign"),
     "ScanFrames": ("recon.frames", "ScanFrames"),
+    "blur_study": ("lissajous.planning", "blur_study"),
     "catalogue": ("scanner.terms", "catalogue"),
     "compare_with_scene": ("recon.imaging.blur", "compare_with_scene"),
+    "design": ("lissajous.planning", "design"),
     "frames": ("recon.frames", "frames"),
     "map_samples": ("recon.imaging.gridding", "map_samples"),
     "phase_bound": ("recon.imaging.blur", "phase_bound"),
@@ -87,7 +88,7 @@ _DEFINED_ELSEWHERE = {
     "register_estimators": ("estimation.estimators", "register"),
     "register_readers": ("recon.io.readers", "register"),
 }
-"""Public names that are no adapter in ``lissajous.functions``: name -> (module, name in that module)."""
+"""Public names that are not defined in ``lissajous.functions``: name -> (module, name in that module)."""
 
 
 def __getattr__(name: str) -> Any:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimation.diagnosis.data import Run
-from estimation.diagnosis.model import Candidate
+from estimation.diagnosis.parameters import Candidate
 from scanner.arrays import Array
 from scanner.terms import Parameter, Term
 

@@ -17,7 +17,7 @@ from estimation.diagnosis.fit import Fit, Likelihood
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_parameters
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.localisation import describe_localisation
-from estimation.diagnosis.model import Candidate
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.profile_likelihood import profile_interval
 from estimation.diagnosis.selection import Progress, SelectionResult, SelectionStep, select_terms
 from estimation.diagnosis.shares import describe_unexplained, find_remainder, share_of_finding

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.fit import Fit
-from estimation.diagnosis.model import Candidate
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.posterior import axis_trajectories, draw_parameters
 from scanner.arrays import Array
 from scanner.forward_model import (

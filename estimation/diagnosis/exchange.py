@@ -17,7 +17,8 @@ import numpy as np
 
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.fit import Fit, Likelihood, fit_models
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.progressive_fit import ABORT_MARGIN
 from estimation.diagnosis.screening import (
     MAX_PRIOR_SIGMAS,

@@ -16,8 +16,9 @@ from estimation.diagnosis.identifiability import (
     stated_whitener,
     unexplained_norms,
 )
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
 from estimation.diagnosis.noise import Whitener
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import amplitude_indices
 from scanner.arrays import Array
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from estimation.diagnosis.data import Output
 from estimation.diagnosis.fit import Fit, Likelihood, linearise_at
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
 from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
 from scanner.arrays import Array
 from scanner.errors import BadInput
@@ -80,7 +81,7 @@ def detectability(likelihood: Likelihood, fit: Fit, terms: Iterable[Term]) -> li
     The sensitivity to an effect with a time constant or frequency depends on that parameter: the effect itself is
     evaluated at the grid point of median size, a confounder at the one that fits best.
     """
-    present = {each.key for each in fit.model.candidates}
+    present = {candidate.key for candidate in fit.model.candidates}
     candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in present]
     blocks = candidate_sensitivities(likelihood, fit, candidates)
     linearisations = [

@@ -13,8 +13,8 @@ from estimation.diagnosis.fit import Fit, fit_model
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.model import Model
 from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
-from estimation.diagnosis.pruning import with_free_parameters
-from estimation.diagnosis.selection import SelectionResult, SelectionStep, refit_without
+from estimation.diagnosis.pruning import refit_without, with_free_parameters
+from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from scanner.device import Axis, Device
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import percentile_filter
 
-from estimation.diagnosis.fit import Fit
+from estimation.diagnosis.fit import Fit, Likelihood
+from estimation.diagnosis.model import Model
 from estimation.diagnosis.noise import near_lines, noise_psd, periodogram
 from scanner.arrays import Array
 
@@ -78,3 +81,16 @@ def _peak(power: Array, top: int) -> float:
         return float(top)
     a, b, c = np.log(power[top - 1 : top + 2])
     return top + 0.5 * float((a - c) / (a - 2 * b + c))
+
+
+def with_interference_line(likelihood: Likelihood, fit: Fit) -> Fit:
+    """The same fit, with the strongest interfering line in the natural scales of its runs."""
+    line = strongest_interfering_line(fit)
+    if line is None:
+        return fit
+    runs = tuple(
+        replace(run, scales={axis: replace(scales, line=line) for axis, scales in run.scales.items()})
+        for run in fit.model.runs
+    )
+    model = Model(runs, fit.model.device, fit.model.candidates, fit.model.mains)
+    return replace(fit, model=model)

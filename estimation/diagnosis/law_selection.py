@@ -24,7 +24,8 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.exchange import MIN_EXCHANGE_GAIN, RivalFit
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import estimate_whiteners
-from estimation.diagnosis.model import Candidate, Model, uncertain
+from estimation.diagnosis.model import Model, uncertain
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import (
     ScoreTest,
     amplitude_indices,

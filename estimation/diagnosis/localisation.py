@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.diagnosis.fit import Fit, Likelihood
-from estimation.diagnosis.model import Candidate
+from estimation.diagnosis.parameters import Candidate
 from scanner.arrays import Array
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from threading import Lock
 from typing import NamedTuple
@@ -11,6 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.diagnosis.data import Output, Run, readout_of
+from estimation.diagnosis.parameters import (
+    OFFSET_RELATIVE_SD,
+    REFERENCE_GAIN_RELATIVE_SD,
+    Candidate,
+    ParameterSpec,
+    nominal_parameters,
+)
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.forward_model import (
@@ -26,19 +33,13 @@ from scanner.forward_model import (
     with_constants,
 )
 from scanner.integrator.runge_kutta import LANES
-from scanner.stages import Amdm, MotionSensor, Readout
-from scanner.terms import NaturalScales, Parameter, Term
+from scanner.stages import Amdm
+from scanner.terms import NaturalScales
 
 START_STATE_SD = 3.0
 """Prior standard deviation of the initial angle and rate in amplitudes of the motion: so wide that the data determine
 both."""
 
-REFERENCE_GAIN_RELATIVE_SD = 0.02
-"""Prior relative standard deviation of the gain of a reference angle: the default tolerance of the device file."""
-
-OFFSET_RELATIVE_SD = 0.05
-"""Prior standard deviation of an unstated offset in standard deviations of the signal. An offset of a well-adjusted
-readout is a few per cent of the signal."""
 
 MAINS_HZ = (50.0, 60.0)
 """Mains frequencies [Hz]. Their first ``HUM_HARMONICS`` harmonics below the noise's standard deviation are part of the
@@ -52,42 +53,6 @@ HUM_HARMONICS = 3
 
 HUM_RELATIVE_SD = 0.5
 """Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A term on one axis, and the channel on which it acts."""
-
-    term: Term
-    axis: str
-    channel: str
-
-    @property
-    def key(self) -> str:
-        """Unique name: ``x.cubic-stiffness``, ``x.channel-delay:angle``."""
-        suffix = "" if self.channel == self.term.channels[0] else f":{self.channel}"
-        return f"{self.axis}.{self.term.effect}{suffix}"
-
-
-@dataclass(frozen=True)
-class ParameterSpec:
-    """One parameter of a model, in prior standard deviations: value = centre + scale x, or by its term's parameter.
-
-    Attributes:
-        kind: ``"nominal"``, ``"term"``, ``"start"``, ``"hidden"``, ``"gain"`` or ``"additive"``.
-        owner: axis, key of the candidate, or channel.
-        name: of the physical value (``"mechanics.k"``, ``"k3"``, ...).
-        run: index of its recording, -1 for all.
-        precision: 1 / variance of the prior of x, 1 for a standard normal prior.
-        parameter: of the term, None for other kinds.
-    """
-
-    kind: str
-    owner: str
-    name: str
-    run: int = -1
-    precision: float = 1.0
-    parameter: Parameter | None = None
 
 
 _Key = tuple[object, ...]
@@ -331,7 +296,8 @@ class Model:
                         inputs = _truncate(run.inputs[name], stop)
                         key = motion.key(r, inputs)
                         if key not in self._trajectory_cache:
-                            drive = tuple(each.values for each in motion.active_terms if each.term.voltage is not None)
+                            on_drive = (active for active in motion.active_terms if active.term.voltage is not None)
+                            drive = tuple(active.values for active in on_drive)
                             groups.setdefault((r, name, drive), {})[key] = motion
 
         def simulate_part(part: tuple[DriveInput, list[tuple[_Key, _Motion]]]) -> None:
@@ -401,39 +367,6 @@ def _hum_quadratures(mains: float, n: int, step: float) -> dict[str, Array]:
     }
 
 
-def nominal_parameters(device: Device, axis: str) -> list[tuple[str, float | tuple[float, ...], float]]:
-    """Uncertain nominal values of an axis: (``stage.key``, nominal value, relative tolerance)."""
-    device_axis = device.axis(axis)
-    readout = readout_of(device, axis)
-    shared = device.readout is not None and axis != next(iter(device.axes))
-    parameters: list[tuple[str, float | tuple[float, ...], float]] = []
-    stages: list[tuple[str, object, tuple[str, ...]]] = [
-        ("mechanics", device_axis.mechanics, ("J", "b", "k")),
-        (
-            "capacitance",
-            device_axis.capacitance,
-            ("C0", "theta0", "theta_th", *(("Cb",) if isinstance(readout, Amdm) else ())),
-        ),
-        ("drive", device_axis.drive, ("torque_per_volt",)),
-        ("readout", None if shared else readout, _readout_keys(readout)),
-    ]
-    for stage, table, keys in stages:
-        for key in keys:
-            value = getattr(table, key, None)
-            tolerance = device.tolerance(axis, key)
-            if value and tolerance > 0.0:
-                parameters.append((f"{stage}.{key}", value, tolerance))
-    return parameters
-
-
-def _readout_keys(readout: Readout | None) -> tuple[str, ...]:
-    if readout is None:
-        return ()
-    if isinstance(readout, MotionSensor):
-        return "gain", "offset"
-    return ("a_cir", "b_cir", "lpf_hz") if isinstance(readout, Amdm) else ("R_s",)
-
-
 def _motion_terms(added: Iterable[ActiveTerm]) -> tuple[ActiveTerm, ...]:
     """The terms that change the motion."""
     return tuple(active for active in added if active.term.stage in ("drive", "mechanics", "capacitance"))
@@ -447,4 +380,4 @@ def _truncate(inputs: DriveInput, stop: float) -> DriveInput:
 
 def uncertain(model: Model) -> list[Candidate]:
     """The terms of a model that a fit can decide on: those recognised in the samples have no free parameter."""
-    return [each for each in model.candidates if each.term.free_parameters]
+    return [candidate for candidate in model.candidates if candidate.term.free_parameters]

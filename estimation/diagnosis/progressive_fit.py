@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.fit import MAX_PARALLEL_FITS, Fit, Likelihood, fit_model, fit_models, linearise_at
 from estimation.diagnosis.initial import estimate_whiteners
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import (
     MIN_PREDICTED_GAIN,
     ScoreTest,
@@ -20,18 +19,20 @@ from estimation.diagnosis.screening import (
     score_candidates,
 )
 from estimation.diagnosis.significance import DETECTION_THRESHOLD, satisfies_sign_constraints
+from estimation.diagnosis.windows import (
+    CHI2_ADEQUATE,
+    CHI2_LINEARISABLE,
+    MIN_WINDOW_RATIO,
+    WINDOWS_PER_STEP,
+    divergence_window,
+    reduced_chi2,
+    refine_windows,
+)
 from scanner.arrays import Array
-
-CHI2_LINEARISABLE = 2.0
-"""Reduced chi-square up to which the phase error of a fit is small, so that the model is linear around it."""
 
 NONLINEAR_GAIN = 100.0
 """Largest predicted fall of -2 log evidence above which predictions of first order no longer rank candidates."""
 
-CHI2_ADEQUATE = 1.08
-"""Reduced chi-square up to which a model is adequate. On the fitted samples of a window, the candidate then explains
-the misfit. On held-out samples, an additional discrepancy term would only correct details of the laws of named
-terms."""
 
 BEAM_WIDTH = 6
 """Number of candidates that are continued over long windows. Each of them costs a fit over every remaining window."""
@@ -44,9 +45,6 @@ MIN_SAMPLES_FOR_SHORTLIST = 1500
 """Fitted samples in the window of the score test from which only ``MAX_INITIAL_CANDIDATES`` are fitted. Over shorter
 windows fits cost little, so all candidates are fitted."""
 
-WINDOWS_PER_STEP = 5
-"""Number of windows from the last one that the nominal model fits to the first that it does not. The effect of a
-candidate may become visible in any of them."""
 
 DIVERGENCE_RATIO = 3.0
 """Ratio of the reduced chi-squares of successive windows above which the phase error has exceeded half a cycle."""
@@ -55,16 +53,11 @@ MAX_RATIO_AFTER_SPLIT = 0.95
 """Ratio of the reduced chi-square of a window after an intermediate window was inserted to that before. Above it, no
 further intermediate window is inserted."""
 
-SPLIT_RATIO = 8.0
-"""Ratio of the reduced chi-squares of the first failing window and of the last good one above which the failing window
-is too long for a linearised model. A shorter one is then searched by bisection."""
 
 MAX_WINDOW_SPLITS, MAX_WINDOW_SPLITS_SINGLE = 3, 12
 """Largest number of inserted intermediate windows: in the fits of all candidates together, and in the fit of a single
 discrepancy term, which needs more. They bound the computing time."""
 
-MIN_WINDOW_RATIO = 1.03
-"""Smallest ratio of the lengths of successive windows: 3 % more samples hardly change a fit."""
 
 PRUNE_MARGIN = 60.0
 """Difference in -2 log evidence to the best candidate up to which a candidate is continued over the next window. Over
@@ -94,14 +87,14 @@ def fit_screened_candidates(
     Discrepancy terms, which cost most, are fitted only if they gain beside the best named term.
     """
     promising = sorted(score_candidates(likelihood, base, candidates), key=lambda s: -s.predicted_gain)
-    named, free = _split_discrepancy([each for each in promising if each.predicted_gain > MIN_PREDICTED_GAIN])
+    named, free = _split_discrepancy([score for score in promising if score.predicted_gain > MIN_PREDICTED_GAIN])
     return _fit_named_first(named, free, lambda part, bar: _fit_shortlist(likelihood, base, part), settles)
 
 
 def _split_discrepancy(screened: Sequence[ScoreTest]) -> tuple[list[ScoreTest], list[ScoreTest]]:
     """Named terms, and discrepancy terms."""
-    free = [each for each in screened if each.candidate.term.effect in DISCREPANCY_TERMS]
-    return [each for each in screened if each.candidate.term.effect not in DISCREPANCY_TERMS], free
+    free = [score for score in screened if score.candidate.term.effect in DISCREPANCY_TERMS]
+    return [score for score in screened if score.candidate.term.effect not in DISCREPANCY_TERMS], free
 
 
 def _fit_named_first(
@@ -118,7 +111,7 @@ def _fit_named_first(
     """
     fits = fitted(named, None)
     best = min(fits, key=lambda fit: fit.neg2_log_evidence, default=None)
-    if free and not (best is not None and (_explains(best, [each.candidate for each in free]) or settles(best))):
+    if free and not (best is not None and (_explains(best, [score.candidate for score in free]) or settles(best))):
         fits += fitted(free, best)
     return sorted(fits, key=lambda fit: fit.neg2_log_evidence)
 
@@ -129,7 +122,7 @@ def _explains(fit: Fit, free: Sequence[Candidate]) -> bool:
     again = fit_model(likelihood, fit.model, fit.x, max_iterations=3)
     if again.chi2 > CHI2_LINEARISABLE * int(again.rows.sum()):
         return False
-    return all(each.predicted_gain < DETECTION_THRESHOLD for each in score_candidates(likelihood, again, free))
+    return all(score.predicted_gain < DETECTION_THRESHOLD for score in score_candidates(likelihood, again, free))
 
 
 def _fit_shortlist(likelihood: Likelihood, base: Fit, promising: Sequence[ScoreTest]) -> list[Fit]:
@@ -172,7 +165,7 @@ def fit_candidates_progressively(
     Args:
         early: fits of the nominal model over the windows ``stops``.
     """
-    last_good, reached, base, failing_stop = _divergence_window(likelihood, nominal, early, stops)
+    last_good, reached, base, failing_stop = divergence_window(likelihood, nominal, early, stops)
     self_excited = [score for score in candidates if score.term.initial_seeds]
     linear_candidates = [score for score in candidates if not score.term.initial_seeds]
     scores = sorted(
@@ -189,9 +182,9 @@ def fit_candidates_progressively(
     _, free = _split_discrepancy(scores[:MAX_INITIAL_CANDIDATES])
     later = [stop for stop in stops if stop > failing_stop]
     windows = (
-        list(_refine_windows([reached, failing_stop, *later]))
+        list(refine_windows([reached, failing_stop, *later]))
         if reached
-        else [failing_stop, *_refine_windows([failing_stop, *later])]
+        else [failing_stop, *refine_windows([failing_stop, *later])]
     )
 
     def through(part: list[ScoreTest], rival: Fit | None) -> list[Fit]:
@@ -233,47 +226,6 @@ def _seed_self_excited(
                 yield start
 
 
-class DivergenceWindow(NamedTuple):
-    """The windows between which the phase error of a model becomes too large.
-
-    Attributes:
-        last_good: its fit over the longest window ``reached`` in which its phase is right. If there is none,
-            ``reached`` is 0 and this is the fit over the first window.
-        failing: its fit over the window ``stop``, in which its phase error is too large, but still small.
-    """
-
-    last_good: Fit
-    reached: float
-    failing: Fit
-    stop: float
-
-
-def _divergence_window(
-    likelihood: Likelihood, model: Model, early: Sequence[Fit], stops: Sequence[float]
-) -> DivergenceWindow:
-    """The two windows between which ``model`` fails, found among ``stops`` and refined by bisection."""
-    first = _first_divergent(early)
-    last_good, reached, stop = early[max(first - 1, 0)], stops[first - 1] if first else 0.0, stops[first]
-    failing = fit_model(likelihood, model, model.map_parameters_from(early[first].model, early[first].x), stop, 8)
-    for later in stops[first + 1 :]:
-        if _reduced_chi2(failing) > CHI2_ADEQUATE:
-            break
-        # under the estimated noise the model may fit a window that it did not fit under the first estimate
-        last_good, reached, stop = failing, stop, later
-        failing = fit_model(likelihood, model, failing.x, stop, 8)
-    while (
-        _reduced_chi2(failing) > SPLIT_RATIO * max(_reduced_chi2(last_good), 1.0)
-        and stop > MIN_WINDOW_RATIO**2 * reached > 0.0
-    ):
-        middle = float(np.sqrt(reached * stop))
-        fit = fit_model(likelihood, model, model.map_parameters_from(last_good.model, last_good.x), middle, 8)
-        if _reduced_chi2(fit) < 2.0 * _reduced_chi2(last_good):
-            last_good, reached = fit, middle
-        else:
-            failing, stop = fit, middle
-    return DivergenceWindow(last_good, reached, failing, stop)
-
-
 def _fit_over_windows(
     likelihood: Likelihood,
     running: list[tuple[Model, Array]],
@@ -311,7 +263,7 @@ def _fit_over_windows(
             batch = running[first : first + MAX_PARALLEL_FITS]
             fits += fit_models(likelihood, batch, stop, max_iterations, tolerance, abort_above=best + ABORT_MARGIN)
         fits.sort(key=lambda fit: (not satisfies_sign_constraints(fit), fit.neg2_log_evidence))
-        chi2 = _reduced_chi2(fits[0])
+        chi2 = reduced_chi2(fits[0])
         diverged = previous_chi2 < CHI2_LINEARISABLE and chi2 > DIVERGENCE_RATIO * max(previous_chi2, 1.0)
         if (
             diverged
@@ -368,7 +320,7 @@ def _prune(fits: list[Fit], unexplained: bool, few: bool) -> list[tuple[Model, A
     best, worst = fits[0].neg2_log_evidence, max(fit.neg2_log_evidence for fit in fits)
     margin = max(PRUNE_MARGIN, 0.5 * (worst - best))
     # adequate fits are always continued: over a short window, refitted nominal values explain the same as any law
-    remaining = [fit for fit in fits if fit.neg2_log_evidence < best + margin or _reduced_chi2(fit) < CHI2_ADEQUATE]
+    remaining = [fit for fit in fits if fit.neg2_log_evidence < best + margin or reduced_chi2(fit) < CHI2_ADEQUATE]
     if unexplained:
         remaining = fits[: max(BEAM_WIDTH, len(remaining))]
     # The best fits with an impossible sign are continued with the opposite sign: a ringing mode fits with both.
@@ -388,30 +340,6 @@ def _flip_sign(fit: Fit) -> Array:
         if f.owner == key and (f.kind == "hidden" or (f.parameter is not None and f.parameter.sign * x[i] < 0.0)):
             x[i] = -x[i]
     return x
-
-
-def _reduced_chi2(fit: Fit) -> float:
-    """Reduced chi-square over the window of a fit."""
-    return fit.chi2 / int(fit.rows.sum())
-
-
-def _first_divergent(early: Sequence[Fit]) -> int:
-    """Index of the first window over which the fit of the nominal model is clearly worse than before."""
-    chi2 = [_reduced_chi2(fit) for fit in early]
-    first = 0
-    while first + 1 < len(chi2) and chi2[first] < 2.0 * min([CHI2_LINEARISABLE, *chi2[:first]]):
-        first += 1
-    return first
-
-
-def _refine_windows(stops: Sequence[float]) -> Iterator[float]:
-    """Windows after the first of ``stops``, with intermediate ones.
-
-    Most are inserted before the first window that the nominal model does not fit, where an effect becomes visible.
-    """
-    for i, (low, high) in enumerate(pairwise(stops)):
-        yield from np.geomspace(low, high, (WINDOWS_PER_STEP if i == 0 else 2) + 1)[1:-1].tolist()
-        yield high
 
 
 def _init_from_last_good(score: ScoreTest, last_good: Fit) -> Array:

@@ -1,4 +1,4 @@
-"""Pruning of a discrepancy term: only the amplitudes that the data require remain.
+"""Terms and amplitudes of a fit that the data do not require are removed.
 
 A discrepancy term has dozens of amplitudes, and the evidence charges for each. Unpruned, it would lose against two
 named terms even where a law with two of its amplitudes fits better.
@@ -13,7 +13,12 @@ from math import comb, log
 import numpy as np
 
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.hum import select_mains_hum
+from estimation.diagnosis.model import Model, uncertain
+from estimation.diagnosis.parameters import Candidate
+from estimation.diagnosis.significance import (
+    evidence_gain,
+)
 from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
 
 
@@ -61,3 +66,26 @@ def _required_parameters(fit: Fit, indices: list[int]) -> list[int]:
 
     remaining, _ = eliminate_backward(range(x.size), neg2_log_evidence, removable=indices)
     return [i for i in remaining if i in indices]
+
+
+def drop_redundant(likelihood: Likelihood, fit: Fit) -> Fit:
+    """Refit without the terms that the others make redundant.
+
+    A confounder may be selected first and become redundant when the true effect is added. Hum is selected again with
+    and without every term, because in a short recording a drift and one mains frequency resemble the other mains
+    frequency.
+    """
+    fit = select_mains_hum(likelihood, fit)
+    several = len(fit.model.candidates) > 1
+    for candidate in uncertain(fit.model) if several else ():
+        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate))
+        if not evidence_gain(likelihood, reduced, fit):
+            return drop_redundant(likelihood, reduced)
+    return fit
+
+
+def refit_without(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Fit:
+    """The fit refitted with one of its terms taken out."""
+    kept = [other for other in fit.model.candidates if other is not candidate]
+    model = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
+    return fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.diagnosis.fit import TRAJECTORY_POOL, Fit, Likelihood
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.integrator.runge_kutta import LANES

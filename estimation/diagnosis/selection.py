@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-
-import numpy as np
 
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.data import Run
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.discrepancy_exchange import (
+    MAX_DISCREPANCY_FITS,
+    ends_with_discrepancy,
+    replace_discrepancy_by_terms,
+)
 from estimation.diagnosis.exchange import RivalFit, RivalFits, exchange_to_convergence, fit_exchanges, rivals_of
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models
+from estimation.diagnosis.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
 from estimation.diagnosis.initial import (
     estimate_whiteners,
     fit_initial_state,
@@ -19,25 +23,20 @@ from estimation.diagnosis.initial import (
     flat_whiteners,
     window_schedule,
 )
-from estimation.diagnosis.interference import strongest_interfering_line
+from estimation.diagnosis.interference import with_interference_line
 from estimation.diagnosis.law_selection import choose_laws
-from estimation.diagnosis.model import MAINS_HZ, Candidate, Model, uncertain
-from estimation.diagnosis.noise import Whitener
-from estimation.diagnosis.progressive_fit import (
-    CHI2_ADEQUATE,
-    CHI2_LINEARISABLE,
-    fit_candidates_progressively,
-    fit_screened_candidates,
-)
-from estimation.diagnosis.pruning import prune_by_evidence
+from estimation.diagnosis.model import Model, uncertain
+from estimation.diagnosis.parameters import Candidate
+from estimation.diagnosis.progressive_fit import fit_candidates_progressively, fit_screened_candidates
+from estimation.diagnosis.pruning import drop_redundant, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import all_candidates
 from estimation.diagnosis.significance import (
     DETECTION_THRESHOLD,
     UNIQUE_NAME_THRESHOLD,
-    evidence_gain,
     is_significant,
     satisfies_sign_constraints,
 )
+from estimation.diagnosis.windows import CHI2_ADEQUATE, CHI2_LINEARISABLE
 from scanner.device import Device
 from scanner.terms import Term
 
@@ -63,8 +62,6 @@ CHI2_DIVERGED = 100.0
 """Reduced chi-square above which the phase error of a fit exceeds half a cycle, so that sensitivities around it do not
 predict the effect of a further term."""
 
-MAX_DISCREPANCY_FITS = 3
-"""Number of discrepancy terms that are pruned and compared with named terms. Each costs a fit."""
 
 REFIT_MARGIN, REFIT_MARGIN_RELATIVE = 80.0, 0.1
 """Candidates up to this distance from the best in -2 log evidence, or up to this share of the gain of the best, are
@@ -122,46 +119,43 @@ def select_terms(
     stops = window_schedule(model)
     likelihood = Likelihood(runs, flat_whiteners(model))
     early = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)
-    likelihood = Likelihood(runs, _min_entropy_whiteners(_fit_hum_variants(likelihood, early[-1])))
+    likelihood = Likelihood(runs, min_entropy_whiteners(fit_hum_variants(likelihood, early[-1])))
     nominal = fit_model(likelihood, model, early[-1].x)
-    named = [each for each in terms.values() if each.effect not in {certain.term.effect for certain in clipped}]
+    named = [term for term in terms.values() if term.effect not in {certain.term.effect for certain in clipped}]
     states = [SelectionState(likelihood, nominal, select_mains_hum(likelihood, nominal), {})]
     states += _forward_steps(states[0], [*named, *DISCREPANCY_TERMS.values()], early, stops, progress)
-    found = states[-1]
-    if not found.settled and len(uncertain(found.best.model)) > 1:
-        pool = all_candidates(device, found.best.model, [*named, *DISCREPANCY_TERMS.values()])
-        chosen = _LawChoice(found.nominal, pool, found.rivals, progress)
-        if chosen.settles(found.best) and chosen.state is not None:
-            found = chosen.state
+    selected = states[-1]
+    if not selected.settled and len(uncertain(selected.best.model)) > 1:
+        pool = all_candidates(device, selected.best.model, [*named, *DISCREPANCY_TERMS.values()])
+        chosen = _LawChoice(selected.nominal, pool, selected.rivals, progress)
+        if chosen.settles(selected.best) and chosen.state is not None:
+            selected = chosen.state
     if (
-        _ends_with_discrepancy(found.best)
-        and found.nominal.validation_chi2 > CHI2_LARGE
-        and found.best.validation_chi2 > CHI2_ADEQUATE
+        ends_with_discrepancy(selected.best)
+        and selected.nominal.validation_chi2 > CHI2_LARGE
+        and selected.best.validation_chi2 > CHI2_ADEQUATE
     ):
         several = _accept_while_halving(
-            states[-2], _forward_steps(states[-2], named, early, stops, progress, found.tried)
+            states[-2], _forward_steps(states[-2], named, early, stops, progress, selected.tried)
         )
         enough = several.best.validation_chi2 - 1.0 < MAX_REMAINING_MISFIT_RATIO * (
             several.nominal.validation_chi2 - 1.0
         )
         if (
             enough
-            and fit_model(found.likelihood, several.best.model, several.best.x).neg2_log_evidence
-            < found.best.neg2_log_evidence
+            and fit_model(selected.likelihood, several.best.model, several.best.x).neg2_log_evidence
+            < selected.best.neg2_log_evidence
         ):
-            found = several
-    if _ends_with_discrepancy(found.best):
+            selected = several
+    if ends_with_discrepancy(selected.best):
         # with the required amplitudes only, its law is simpler and better determined
-        fewer = prune_by_evidence(found.likelihood, found.best)
-        if fewer is not None and fewer.neg2_log_evidence < found.best.neg2_log_evidence:
-            found = replace(found, best=fewer)
-    elif len(found.best.model.candidates) > len(clipped) and not found.settled:
-        found = _replace_terms_by_discrepancy(found)
-    steps = tuple(
-        _selection_step(found.likelihood, found.nominal, found.best, each, found.rivals.get(each.key, ()))
-        for each in found.best.model.candidates
-    )
-    return SelectionResult(found.likelihood, found.nominal, found.best, steps)
+        fewer = prune_by_evidence(selected.likelihood, selected.best)
+        if fewer is not None and fewer.neg2_log_evidence < selected.best.neg2_log_evidence:
+            selected = replace(selected, best=fewer)
+    elif len(selected.best.model.candidates) > len(clipped) and not selected.settled:
+        selected = _replace_terms_by_discrepancy(selected)
+    steps = tuple(_selection_step(selected, candidate) for candidate in selected.best.model.candidates)
+    return SelectionResult(selected.likelihood, selected.nominal, selected.best, steps)
 
 
 @dataclass(frozen=True)
@@ -198,15 +192,16 @@ def _forward_steps(
     """
     likelihood, nominal, best, rivals = state.likelihood, state.nominal, state.best, dict(state.rivals)
     for _ in range(MAX_EFFECTS - len(best.model.candidates)):
-        taken = {each.key for each in best.model.candidates}
+        taken = {candidate.key for candidate in best.model.candidates}
         if taken:
             # The noise was estimated before these terms were fitted, so it may contain part of their effect.
             likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
             best = fit_model(likelihood, best.model, best.x)
         best = with_interference_line(likelihood, best)
         adequate = bool(rivals) and best.validation_chi2 < CHI2_ADEQUATE
-        pool = [each for each in terms if not (adequate and each.effect in DISCREPANCY_TERMS)]
-        candidates = [each for each in all_candidates(best.model.device, best.model, pool) if each.key not in taken]
+        pool = [term for term in terms if not (adequate and term.effect in DISCREPANCY_TERMS)]
+        possible = all_candidates(best.model.device, best.model, pool)
+        candidates = [candidate for candidate in possible if candidate.key not in taken]
         progress(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
         chosen = _LawChoice(nominal, candidates, rivals, progress)
         if tried:
@@ -227,42 +222,42 @@ def _forward_steps(
             return
         progress(f"refit with {fits[0].model.candidates[-1].key}")
         likelihood = Likelihood(best.model.runs, estimate_whiteners(fits[0].model, fits[0].x))
-        by_name = [fit for fit in fits if not _ends_with_discrepancy(fit)]
+        by_name = [fit for fit in fits if not ends_with_discrepancy(fit)]
         reach = max(REFIT_MARGIN, REFIT_MARGIN_RELATIVE * (best.neg2_log_evidence - fits[0].neg2_log_evidence))
         close = [fit for fit in fits if fit.neg2_log_evidence < fits[0].neg2_log_evidence + reach][:6]
         close = fit_models(likelihood, [(fit.model, fit.x) for fit in close])
         close = sorted((fit for fit in close if satisfies_sign_constraints(fit)), key=lambda fit: fit.neg2_log_evidence)
         before = fit_model(likelihood, best.model, best.x, max_iterations=4)
         nominal = before if not rivals else fit_model(likelihood, nominal.model, nominal.x, max_iterations=4)
-        found = next((fit for fit in close if is_significant(likelihood, before, fit)), None)
-        if found is None and before.validation_chi2 > CHI2_INADEQUATE and not taken:
-            found = next(
-                (fit for fit in close if _ends_with_discrepancy(fit)), None
+        extended = next((fit for fit in close if is_significant(likelihood, before, fit)), None)
+        if extended is None and before.validation_chi2 > CHI2_INADEQUATE and not taken:
+            extended = next(
+                (fit for fit in close if ends_with_discrepancy(fit)), None
             )  # an effect is missing, of which only the stage is known
-        if found is None:
+        if extended is None:
             yield SelectionState(likelihood, nominal, before, rivals, by_name)
             return
-        named = [each for each in candidates if each.term.effect not in DISCREPANCY_TERMS]
-        leads = _rivals_of_newest(found, before, close)
-        if _ends_with_discrepancy(found):
+        named = [candidate for candidate in candidates if candidate.term.effect not in DISCREPANCY_TERMS]
+        leads = _rivals_of_newest(extended, before, close)
+        if ends_with_discrepancy(extended):
             progress("named laws beside the discrepancy")
-            if chosen.settles(found) and chosen.state is not None:
+            if chosen.settles(extended) and chosen.state is not None:
                 yield chosen.state
                 return
-            likelihood, before, found = _replace_discrepancy_by_terms(likelihood, before, found, named)
+            likelihood, before, extended = replace_discrepancy_by_terms(likelihood, before, extended, named)
             close = []  # they were fitted under another noise if terms were exchanged
-        if not _ends_with_discrepancy(found) and found.chi2 < CHI2_DIVERGED * found.rows.sum():
+        if not ends_with_discrepancy(extended) and extended.chi2 < CHI2_DIVERGED * extended.rows.sum():
             # The first term may imitate several effects: where much misfit remains, it may be exchanged too.
-            kept = len(best.model.candidates) if found.validation_chi2 <= CHI2_LINEARISABLE else 0
-            newest = min(len(found.model.candidates) - kept, len(uncertain(found.model)))
-            final = exchange_to_convergence(likelihood, found, named, newest)
+            kept = len(best.model.candidates) if extended.validation_chi2 <= CHI2_LINEARISABLE else 0
+            newest = min(len(extended.model.candidates) - kept, len(uncertain(extended.model)))
+            final = exchange_to_convergence(likelihood, extended, named, newest)
             earlier = _rivals_of_newest(final.fit, before, close)
             leads = {key: _merge_rivals(own, earlier.get(key, ())) for key, own in final.rivals.items()}
-            found = final.fit
+            extended = final.fit
         rivals |= leads
-        best = drop_redundant(likelihood, found)
+        best = drop_redundant(likelihood, extended)
         yield SelectionState(likelihood, nominal, best, rivals, by_name)
-        if _ends_with_discrepancy(best):
+        if ends_with_discrepancy(best):
             return
 
 
@@ -309,31 +304,6 @@ def _accept_while_halving(start: SelectionState, further: Iterator[SelectionStat
     return last
 
 
-def _replace_discrepancy_by_terms(
-    likelihood: Likelihood, before: Fit, free: Fit, named: Sequence[Candidate]
-) -> tuple[Likelihood, Fit, Fit]:
-    """Replace a discrepancy term by named terms if they have the better evidence, under newly estimated noise.
-
-    Returns:
-        likelihood, the fit before, the fit with the terms or, where none is adequate, with the discrepancy term.
-    """
-    others = fit_exchanges(likelihood, free, free.model.candidates[-1:], named, pairs=True)
-    others = [
-        fit
-        for fit in others
-        if fit.neg2_log_evidence < free.neg2_log_evidence and is_significant(likelihood, before, fit)
-    ]
-    if not others:
-        return likelihood, before, free
-    found = others[0]
-    fewer = [fit for fit in others if len(fit.model.candidates) < len(found.model.candidates)]
-    # the second of two terms must be significant like any second effect
-    if fewer and not is_significant(likelihood, fewer[0], found):
-        found = fewer[0]
-    likelihood = Likelihood(likelihood.runs, estimate_whiteners(found.model, found.x))
-    return likelihood, fit_model(likelihood, before.model, before.x), fit_model(likelihood, found.model, found.x)
-
-
 def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
     """Replace named terms by one pruned discrepancy term if that lowers -2 log evidence by ``UNIQUE_NAME_THRESHOLD``.
 
@@ -343,37 +313,38 @@ def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
     """
     likelihood, fit = state.likelihood, state.best
     terms = uncertain(fit.model)
-    removed = max(([each for each in terms if each.term.stage == first.term.stage] for first in terms), key=len)
+    by_stage = [[other for other in terms if other.term.stage == first.term.stage] for first in terms]
+    removed = max(by_stage, key=len)
     if len(removed) == 1:
         if fit.validation_chi2 < CHI2_INADEQUATE:
             return state
-        removed = [max(terms, key=lambda each: refit_without(likelihood, fit, each).neg2_log_evidence)]
+        removed = [max(terms, key=lambda term: refit_without(likelihood, fit, term).neg2_log_evidence)]
     free = all_candidates(fit.model.device, fit.model, DISCREPANCY_TERMS.values())
-    others = [each for each in fit_exchanges(likelihood, fit, removed, free) if each.chi2 < fit.chi2]
+    others = [other for other in fit_exchanges(likelihood, fit, removed, free) if other.chi2 < fit.chi2]
     fewer = [
-        each
-        for each in (prune_by_evidence(likelihood, other) for other in others[:MAX_DISCREPANCY_FITS])
-        if each is not None
+        pruned
+        for pruned in (prune_by_evidence(likelihood, other) for other in others[:MAX_DISCREPANCY_FITS])
+        if pruned is not None
     ]
-    best = min(fewer, key=lambda each: each.neg2_log_evidence, default=fit)
+    best = min(fewer, key=lambda other: other.neg2_log_evidence, default=fit)
     if best.neg2_log_evidence > fit.neg2_log_evidence - UNIQUE_NAME_THRESHOLD:
         return state
-    found = drop_redundant(likelihood, best)
+    free_fit = drop_redundant(likelihood, best)
     worse = fit.chi2 + fit.penalty - best.chi2 - best.penalty
-    leads = tuple(RivalFit(fit.neg2_log_evidence - best.neg2_log_evidence, each, worse) for each in removed)
-    return replace(state, best=found, rivals={**state.rivals, found.model.candidates[-1].key: leads})
+    leads = tuple(RivalFit(fit.neg2_log_evidence - best.neg2_log_evidence, candidate, worse) for candidate in removed)
+    return replace(state, best=free_fit, rivals={**state.rivals, free_fit.model.candidates[-1].key: leads})
 
 
-def _rivals_of_newest(found: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, RivalFits]:
-    """Rivals, among ``tried``, of the one term that ``found`` has in addition to ``before``."""
+def _rivals_of_newest(extended: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, RivalFits]:
+    """Rivals, among ``tried``, of the one term that ``extended`` has in addition to ``before``."""
     old = {candidate.key for candidate in before.model.candidates}
-    new = [candidate.key for candidate in found.model.candidates if candidate.key not in old]
+    new = [candidate.key for candidate in extended.model.candidates if candidate.key not in old]
     less_likely = [
         fit
         for fit in tried
-        if fit.neg2_log_evidence > found.neg2_log_evidence and fit.model.candidates[-1].key not in new
+        if fit.neg2_log_evidence > extended.neg2_log_evidence and fit.model.candidates[-1].key not in new
     ]
-    return {new[0]: rivals_of(found, less_likely)} if len(new) == 1 else {}
+    return {new[0]: rivals_of(extended, less_likely)} if len(new) == 1 else {}
 
 
 def _merge_rivals(*parts: RivalFits) -> RivalFits:
@@ -387,76 +358,9 @@ def _merge_rivals(*parts: RivalFits) -> RivalFits:
     return tuple(sorted(nearest.values(), key=lambda entry: entry.evidence_gap))
 
 
-def _ends_with_discrepancy(fit: Fit) -> bool:
-    return bool(fit.model.candidates) and fit.model.candidates[-1].term.effect in DISCREPANCY_TERMS
-
-
-def drop_redundant(likelihood: Likelihood, fit: Fit) -> Fit:
-    """Refit without the terms that the others make redundant.
-
-    A confounder may be selected first and become redundant when the true effect is added. Hum is selected again with
-    and without every term, because in a short recording a drift and one mains frequency resemble the other mains
-    frequency.
-    """
-    fit = select_mains_hum(likelihood, fit)
-    several = len(fit.model.candidates) > 1
-    for candidate in uncertain(fit.model) if several else ():
-        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate))
-        if not evidence_gain(likelihood, reduced, fit):
-            return drop_redundant(likelihood, reduced)
-    return fit
-
-
-def refit_without(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Fit:
-    """The fit refitted with one of its terms taken out."""
-    kept = [each for each in fit.model.candidates if each is not candidate]
-    model = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
-    return fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
-
-
-def _selection_step(
-    likelihood: Likelihood,
-    nominal: Fit,
-    best: Fit,
-    candidate: Candidate,
-    rivals: RivalFits,
-) -> SelectionStep:
-    """The selection step of one term of the final fit."""
+def _selection_step(state: SelectionState, candidate: Candidate) -> SelectionStep:
+    """The selection step of one term of the best fit."""
+    best, rivals = state.best, state.rivals.get(candidate.key, ())
     alone = len(best.model.candidates) == 1 and bool(candidate.term.free_parameters)
-    return SelectionStep(candidate, nominal if alone else refit_without(likelihood, best, candidate), best, rivals)
-
-
-def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
-    """The fit with hum of the one mains frequency that the recordings show, or of none."""
-    return min(_fit_hum_variants(likelihood, fit), key=lambda each: each.neg2_log_evidence)
-
-
-def _fit_hum_variants(likelihood: Likelihood, fit: Fit) -> list[Fit]:
-    """The fit without hum, and with hum of each mains frequency alone."""
-    mains_variants = ((), *((frequency,) for frequency in MAINS_HZ))
-    models = [Model(fit.model.runs, fit.model.device, fit.model.candidates, mains) for mains in mains_variants]
-    return fit_models(
-        likelihood, [(model, model.map_parameters_from(fit.model, fit.x)) for model in models], max_iterations=3
-    )
-
-
-def _min_entropy_whiteners(fits: Iterable[Fit]) -> list[list[Whitener]]:
-    """The whiteners with the lowest noise entropy among those of the fits.
-
-    Hum of both mains frequencies together resembles a drift of the baseline and would raise the estimate of slow noise.
-    """
-    whiteners = [estimate_whiteners(fit.model, fit.x) for fit in fits]
-    return min(whiteners, key=lambda noise: sum(float(np.log(whitener.psd).sum()) for row in noise for whitener in row))
-
-
-def with_interference_line(likelihood: Likelihood, fit: Fit) -> Fit:
-    """The same fit, with the strongest interfering line in the natural scales of its runs."""
-    line = strongest_interfering_line(fit)
-    if line is None:
-        return fit
-    runs = tuple(
-        replace(run, scales={axis: replace(scales, line=line) for axis, scales in run.scales.items()})
-        for run in fit.model.runs
-    )
-    model = Model(runs, fit.model.device, fit.model.candidates, fit.model.mains)
-    return replace(fit, model=model)
+    before = state.nominal if alone else refit_without(state.likelihood, best, candidate)
+    return SelectionStep(candidate, before, best, rivals)

@@ -24,8 +24,9 @@ from estimation.diagnosis.initial import (
     window_schedule,
 )
 from estimation.diagnosis.interference import strongest_interfering_line
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
 from estimation.diagnosis.noise import make_whitener, noise_psd
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.resampling import decimate, resample_drive
 from estimation.diagnosis.screening import all_candidates
 from recon.cli import main

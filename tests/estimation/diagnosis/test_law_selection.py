@@ -7,7 +7,7 @@ import pytest
 
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.law_selection import LinearModel, LinearTerm
-from estimation.diagnosis.model import Candidate
+from estimation.diagnosis.parameters import Candidate
 from scanner.terms import catalogue
 
 SAMPLES, FREE = 600, 12

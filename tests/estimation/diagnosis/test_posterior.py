@@ -10,7 +10,8 @@ import pytest
 from estimation.diagnosis.effect_curve import effect_curve
 from estimation.diagnosis.fit import Fit, Likelihood
 from estimation.diagnosis.identifiability import linearise_simulated, stated_whitener
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.posterior import (
     PICTURE_HALF_WIDTH_PX,
     PORTRAIT_CELLS,

@@ -12,7 +12,8 @@ from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.discrepancy import cosine_series
 from estimation.diagnosis.fit import Likelihood, fit_model, fit_models
 from estimation.diagnosis.initial import fit_initial_state, flat_whiteners, window_schedule
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.progressive_fit import (
     ABORT_MARGIN,
     DUPLICATE_DISTANCE_SIGMA2,

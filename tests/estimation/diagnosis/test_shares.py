@@ -72,7 +72,7 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     from estimation.diagnosis.fit import Fit
     from estimation.diagnosis.improvement import improve
     from estimation.diagnosis.initial import estimate_whiteners, fit_initial_state, fit_progressively, window_schedule
-    from estimation.diagnosis.model import Candidate
+    from estimation.diagnosis.parameters import Candidate
     from estimation.diagnosis.selection import SelectionResult, SelectionStep
 
     (recording,), _, device = ROWS["pendulum-45"](measured_data)

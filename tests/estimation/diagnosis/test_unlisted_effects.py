@@ -10,7 +10,8 @@ from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
-from estimation.diagnosis.model import Candidate, Model
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.selection import SelectionState, _replace_terms_by_discrepancy
 from scanner.recording import Recording
 from scanner.terms import catalogue
