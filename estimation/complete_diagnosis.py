@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from estimation.diagnosis.diagnose import Diagnosis, Finding, diagnose, nominal_device
 from estimation.diagnosis.selection import Progress
-from estimation.slow.diagnose import diagnose_decay, slow_decay
+from estimation.slow.diagnose import diagnose_decays, slow_decays
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -70,13 +70,13 @@ def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress:
     pictures = any("intensity" in recording for recording in recordings)
     if pictures and not any(axis.mechanics for axis in nominal.axes.values()):
         return Diagnosis("consistent", (), None, nominal, None)
-    decays = [decay for recording in recordings if (decay := slow_decay(recording, nominal)) is not None]
-    if decays:
-        if len(recordings) > 1:
-            hint = "diagnose them one at a time and compare the laws"
-            raise BadInput("a decay that is diagnosed by its amplitude takes one recording", hint=hint)
+    decays = [slow_decays(recording, nominal) for recording in recordings]
+    if any(decays):
+        if not all(decays):
+            hint = "diagnose decays that are judged by their amplitude and other recordings apart"
+            raise BadInput("is no free decay as another recording is", file=recordings[0].path, hint=hint)
         progress("amplitude of a free decay")
-        return diagnose_decay(decays[0], nominal)
+        return diagnose_decays([decay for of_one in decays for decay in of_one], nominal)
     return diagnose(recordings, nominal, progress)
 
 

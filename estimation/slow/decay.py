@@ -85,18 +85,21 @@ def solve_decay(start, rate, coefficient, power, drift, drift_time, steps):  # t
     return out
 
 
-def log_amplitude(x: Array, law: Law | None, time: Array) -> Array:
-    """ln of the measured amplitude, noise floor included, at ``time`` in units of the duration.
+def log_amplitude(shared: Array, start: float, log_floor: float, law: Law | None, time: Array) -> Array:
+    """ln of the measured amplitude over the reference amplitude, noise floor included, at ``time`` in units of T.
 
     Args:
-        x: ln A at the start, ln of rate times duration, ln of the floor (relative to the first amplitude), and the
-            parameters of the law.
+        shared: of all decays of a device: ln of rate times T, and the parameters of the law.
+        start: ln of the amplitude at time 0, over the reference amplitude.
+        log_floor: ln of the floor over the reference amplitude.
+        law: None for a constant rate.
+        time: not after 1, shape (n,).
     """
     coefficient, power, drift, drift_time = 0.0, 1.0, 0.0, 1.0
     if law is not None and law.power is not None:
-        coefficient, power = float(x[3]), law.power
+        coefficient, power = float(shared[1]), law.power
     elif law is not None:
-        drift, drift_time = float(x[3]), float(np.exp(x[4]))
-    solved = solve_decay(float(x[0]), float(np.exp(x[1])), coefficient, power, drift, drift_time, GRID_STEPS)
+        drift, drift_time = float(shared[1]), float(np.exp(shared[2]))
+    solved = solve_decay(start, float(np.exp(shared[0])), coefficient, power, drift, drift_time, GRID_STEPS)
     clean = np.interp(time, np.linspace(0.0, 1.0, GRID_STEPS + 1), solved)
-    return 0.5 * np.logaddexp(2.0 * clean, 2.0 * x[2])
+    return 0.5 * np.logaddexp(2.0 * clean, 2.0 * log_floor)

@@ -1,4 +1,4 @@
-"""Diagnosis of a free decay from its amplitude: consistent, a named law of damping, or an unknown one."""
+"""Diagnosis of free decays from their amplitudes: consistent, a named law of damping, or an unknown one."""
 
 from __future__ import annotations
 
@@ -9,9 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.diagnosis.diagnose import Diagnosis, Finding, ParameterEstimate, Rival
+from estimation.diagnosis.open_loop import OpenLoop, is_worse
 from estimation.lock_in_channels import lock_in_amplitude
 from estimation.slow.decay import LAWS, Law
-from estimation.slow.selection import DecayFit, compress, covariance_root, fit_free_curve, fit_law
+from estimation.slow.selection import (
+    UNKNOWN_LAW_ERRORS,
+    DecayFit,
+    Decays,
+    compress,
+    fit_curve,
+    fit_law,
+    prediction_errors,
+    rate_price,
+)
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
@@ -26,52 +36,73 @@ MIN_COMPRESSED_TURNS = 5000.0
 BLOCK_TURNS = 20.0
 """Turns in a block of such a waveform: its amplitude changes by less than 1 % where Q exceeds 5000."""
 
-MIN_MISFIT = 0.01
-"""Misfit of a constant damping, as a fraction of the amplitude (rms), below which no law is claimed: what the offsets
-and the linearity of envelope detectors leave."""
-
 MIN_SCORE_GAIN = 12.0
 """Gain of the score over a constant damping from which a law is claimed: odds of 400 to 1."""
 
 MIN_SHARE = 0.9
 """Share of the misfit that a named law explains at least of what a free curve explains; below, the law is unknown."""
 
-METRIC = "whitened misfit of ln A a point"
+MIN_REMAINDER = 0.005
+"""Share of the misfit below which no remainder is reported: the accuracy of a share."""
+
+MIN_RIVAL_PROBABILITY = 1e-4
+"""Probability below which a law is not listed as a rival."""
+
+METRIC = "error of the amplitude on samples not used in the fit, as a fraction of the amplitude (rms)"
 
 GAIN_DRIFT = "in a free decay, amplitude is a function of time: a gain that drifts may fit; record another amplitude"
 
 
 class SlowDecay(NamedTuple):
-    """Free decay of the axis ``name``: time [s] and amplitude, shape (n,), in rad or in another unit."""
+    """Free decay of one axis.
+
+    Attributes:
+        name: of the axis.
+        channel: from which the amplitude was taken.
+        time: [s], amplitude: in rad or in another unit, shape (n,).
+        in_rad: whether the amplitude is in rad.
+        scale: unit of the channel over the unit of ``amplitude``.
+    """
 
     name: str
+    channel: str
     time: Array
     amplitude: Array
     in_rad: bool
+    scale: float
 
 
-def slow_decay(recording: Recording, device: Device) -> SlowDecay | None:
-    """The free decay of a recording that is diagnosed by its amplitude, else None.
+def slow_decays(recording: Recording, device: Device) -> list[SlowDecay]:
+    """The free decays of a recording that are diagnosed by their amplitude, at most one an axis.
 
     That is an ``amplitude_x`` channel beside no other signal of the motion, or the waveform of a sensor of the motion
     over more than ``MIN_COMPRESSED_TURNS`` turns without a drive.
     """
+    decays = []
     for name, axis in device.axes.items():
         found = [kind for kind in ("sense", "angle", "velocity", "acceleration") if f"{kind}_{name}" in recording]
         if f"amplitude_{name}" in recording and not found:
             time, amplitude, in_rad = lock_in_amplitude(recording, axis)
-            return SlowDecay(name, time, amplitude, in_rad)
+            scale = _largest(recording[f"amplitude_{name}"].read()) / _largest(amplitude)
+            decays.append(SlowDecay(name, f"amplitude_{name}", time, amplitude, in_rad, scale))
+            continue
         if axis.mechanics is None or f"drive_{name}" in recording or f"bias_{name}" in recording:
             continue
-        order, scale, key = _waveform(recording, axis)
+        order, gain, key = _waveform(recording, axis)
         if key is not None and recording[key].size / recording[key].sample_rate * axis.resonance > MIN_COMPRESSED_TURNS:
             channel, frequency = recording[key], axis.resonance
             block = block_length(frequency, channel.sample_rate, BLOCK_TURNS)
             values = channel.read()
             time, phasors = block_phasors(values - values.mean(), channel.sample_rate, channel.start, frequency, block)
-            amplitude = np.abs(phasors) / scale / (2 * np.pi * frequency) ** order
-            return SlowDecay(name, time, amplitude, True)
-    return None
+            scale = gain * (2 * np.pi * frequency) ** order
+            decays.append(SlowDecay(name, key, time, np.abs(phasors) / scale, True, scale))
+    return decays
+
+
+def _largest(values: Array) -> float:
+    """Largest magnitude; 1 where there is none."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(finite.max()) if finite.size and finite.max() > 0.0 else 1.0
 
 
 def _waveform(recording: Recording, axis: Axis) -> tuple[int, float, str | None]:
@@ -83,97 +114,154 @@ def _waveform(recording: Recording, axis: Axis) -> tuple[int, float, str | None]
     return 0, 1.0, None
 
 
-def diagnose_decay(measured: SlowDecay, device: Device) -> Diagnosis:
-    """Diagnose one free decay against the nominal device.
+def diagnose_decays(measured: Sequence[SlowDecay], device: Device) -> Diagnosis:
+    """Diagnose free decays against the nominal device; those of one axis have one law.
 
-    If the amplitude is in rad, the parameters have SI units and the device is updated.
+    If amplitudes are in rad, the parameters have SI units and the device is updated.
 
     Raises:
-        BadInput: too few points of a decay.
+        BadInput: too few points of a decay, or amplitudes of one axis with and without rad.
     """
-    name, in_rad = measured.name, measured.in_rad
-    try:
-        decay = compress(measured.time, measured.amplitude)
-    except BadInput as error:
-        raise BadInput(error.what, channel=f"amplitude_{name}", hint=error.hint) from None
-    root = covariance_root(decay)
-    constant, *fits = (fit_law(decay, law, root) for law in (None, *LAWS))
-    free_score, free_error = fit_free_curve(decay, root)
-    best = min(fits, key=lambda fit: fit.score)
-    gain = constant.score - min(best.score, free_score)
-    if constant.rms < MIN_MISFIT or gain < MIN_SCORE_GAIN:
-        improved = _with_constants(device, name, constant, float(decay.time[-1]))
-        return Diagnosis("consistent", (), None, improved, None, open_loop=_errors(name, constant, constant))
-    misfit = constant.rms**2 - free_error**2
-    share = float(np.clip((constant.rms**2 - best.rms**2) / misfit, 0.0, 1.0))
-    first = decay.first_amplitude
-    finding = _finding(name, device, best, fits, constant, share, decay.time, first, in_rad)
-    improved = device
-    if finding.effect != "unknown" and in_rad and device.axes[name].mechanics is not None:
-        values = {each.name: each.value for each in finding.parameters}
-        improved = _with_constants(device, name, best, float(decay.time[-1])).with_terms(
-            {name: {finding.effect: values}}
+    whole = Diagnosis("consistent", (), None, device, None)
+    for name in dict.fromkeys(each.name for each in measured):
+        of_axis = [each for each in measured if each.name == name]
+        if len({each.in_rad for each in of_axis}) > 1:
+            hint = "record all of them in rad, or all in volts"
+            raise BadInput("is in rad in one recording and not in another", channel=of_axis[0].channel, hint=hint)
+        found = _diagnose_axis(of_axis, whole.device)
+        whole = replace(
+            found,
+            verdict="mismatch" if "mismatch" in (whole.verdict, found.verdict) else "consistent",
+            findings=(*whole.findings, *found.findings),
+            unexplained="; ".join(filter(None, (whole.unexplained, found.unexplained))) or None,
+            remainder=max(
+                filter(None, (whole.remainder, found.remainder)), key=lambda each: float(each["share"]), default=None
+            ),
+            open_loop={**whole.open_loop, **found.open_loop},
         )
-    left = 1.0 - share
-    remainder = {"share": left, "stage": "mechanics", "channel": f"amplitude_{name}"} if left > 0.005 else None
-    unexplained = None if finding.effect != "unknown" else f"the decay of {name} follows no listed law of damping"
-    return Diagnosis(
-        "mismatch",
-        (finding,),
-        unexplained,
-        improved,
-        None,
-        remainder=remainder,
-        open_loop=_errors(name, constant, best),
+    return whole
+
+
+def _diagnose_axis(measured: Sequence[SlowDecay], device: Device) -> Diagnosis:
+    name, channel, axis = measured[0].name, measured[0].channel, device.axes[measured[0].name]
+    try:
+        decays = Decays.of([compress(each.time, each.amplitude) for each in measured])
+    except BadInput as error:
+        raise BadInput(error.what, channel=channel, hint=error.hint) from None
+    constant, *laws = (fit_law(decays, law) for law in (None, *LAWS))
+    stated = None if axis.mechanics is None else 0.5 * axis.mechanics.b / axis.mechanics.J
+    nominal = fit_law(decays, None, stated) if stated else constant
+    improved = _with_law(device, name, constant, decays)
+    if nominal.score < constant.score + rate_price(decays):
+        constant, improved = nominal, device
+    nominal_errors, constant_errors = (prediction_errors(decays, fit.predicted) for fit in (nominal, constant))
+    best, curve = min(laws, key=lambda fit: fit.score), fit_curve(decays)
+    law_errors, curve_errors = (prediction_errors(decays, fit.predicted) for fit in (best, curve))
+    total = _squares(constant_errors) - _squares(curve_errors)
+    share = float(np.clip((_squares(constant_errors) - _squares(law_errors)) / max(total, 1e-300), 0.0, 1.0))
+    named = share >= MIN_SHARE and constant.score - best.score >= MIN_SCORE_GAIN
+    found_errors = law_errors if named else curve_errors
+    unlisted = fit_law(decays, None, model_errors=UNKNOWN_LAW_ERRORS)
+    is_unknown = not named and constant.score - unlisted.score >= MIN_SCORE_GAIN
+    if not (named or is_unknown) or _is_worse(constant_errors, found_errors) or _is_worse(nominal_errors, found_errors):
+        loops = _open_loop(measured, nominal_errors, constant_errors)
+        return Diagnosis("consistent", (), None, improved, None, open_loop=loops)
+
+    finding = _finding(measured, axis, best, constant, laws, decays, share if named else 1.0, named)
+    before, after = (float(np.sqrt(_squares(errors) / len(errors))) for errors in (constant_errors, found_errors))
+    finding = replace(
+        finding,
+        where=f"the rate of decay changes over the free decay of {name}: a constant one misses the amplitude by "
+        f"{before:.2%} (rms), {'this law' if named else 'a free curve'} by {after:.2%}",
+        heldout={"metric": METRIC, "before": before, "after": after},
     )
+    if not named:
+        unexplained = f"the decay of {name} follows no listed law of damping"
+        loops = _open_loop(measured, nominal_errors, nominal_errors)
+        return Diagnosis("mismatch", (finding,), unexplained, device, None, open_loop=loops)
+    improved = device
+    if measured[0].in_rad and axis.mechanics is not None:
+        values = {each.name: each.value for each in finding.parameters}
+        improved = _with_law(device, name, best, decays).with_terms({name: {finding.effect: values}})
+    left = 1.0 - share
+    remainder = {"share": left, "stage": "mechanics", "channel": channel} if left > MIN_REMAINDER else None
+    loops = _open_loop(measured, nominal_errors, law_errors)
+    return Diagnosis("mismatch", (finding,), None, improved, None, remainder=remainder, open_loop=loops)
 
 
 def _finding(
-    name: str, device: Device, best: DecayFit, fits: Sequence[DecayFit], constant: DecayFit, share: float,
-    time: Array, first: float, in_rad: bool,
+    measured: Sequence[SlowDecay], axis: Axis, best: DecayFit, constant: DecayFit, laws: Sequence[DecayFit],
+    decays: Decays, share: float, named: bool,
 ) -> Finding:  # fmt: skip
-    law, n = best.law, time.size
+    law = best.law
     assert law is not None
-    term, named = catalogue()[law.effect], share >= MIN_SHARE
-    weights = {fit.law.effect: float(np.exp(-0.5 * min(fit.score - best.score, 1400.0))) for fit in fits if fit.law}
-    total = sum(weights.values()) + float(np.exp(-0.5 * min(constant.score - best.score, 1400.0)))
-    rivals = [Rival(effect, weight / total) for effect, weight in weights.items() if effect != law.effect]
-    rivals = [rival for rival in rivals if rival.probability > 1e-4]
-    if not named:
-        rivals = [Rival(law.effect, 0.5 * share), *rivals]
-    rivals.append(Rival("gain-drift", 0.0))
+    term = catalogue()[law.effect]
+    weights = {fit.law.effect: float(np.exp(-0.5 * (fit.score - best.score))) for fit in laws if fit.law}
+    total = sum(weights.values()) + float(np.exp(-0.5 * (constant.score - best.score)))
+    others = {effect: weight / total for effect, weight in weights.items() if named and effect != law.effect}
+    rivals = [Rival(effect, p) for effect, p in others.items() if p > MIN_RIVAL_PROBABILITY]
+    advice = None
+    if fit_curve(decays, common=True).score < best.score + MIN_SCORE_GAIN or len(decays.parts) == 1:
+        rivals.append(Rival("gain-drift", 0.0))
+        advice = f"gain-drift: {GAIN_DRIFT}"
     return Finding(
-        axis=name,
+        axis=axis.name,
         stage="mechanics",
         effect=law.effect if named else "unknown",
         equation=term.equation if named else "d ln A / dt = -f(A)",
-        parameters=_parameters(law, best, device.axes[name], float(time[-1]), first, in_rad) if named else (),
-        where=f"the rate of decay changes over the free decay of {name}: a constant one misses the amplitude by "
-        f"{constant.rms:.2%} (rms), this law by {best.rms:.2%}",
+        parameters=_parameters(law, best, axis, decays, measured[0].in_rad) if named else (),
+        where="",
         probability=weights[law.effect] / total if named else 1.0,
         rivals=tuple(rivals),
-        heldout={"metric": METRIC, "before": constant.chi2 / n, "after": best.chi2 / n},
-        channel=f"amplitude_{name}",
-        source=term.source,
+        heldout={},
+        channel=measured[0].channel,
+        source=term.source if named else "free curve of the decay",
         share=share,
-        advice=f"gain-drift: {GAIN_DRIFT}",
+        advice=advice,
     )
 
 
-def _parameters(
-    law: Law, fit: DecayFit, axis: Axis, duration: float, first: float, in_rad: bool
-) -> tuple[ParameterEstimate, ...]:
+def _squares(errors: Sequence[OpenLoop]) -> float:
+    """Sum over decays of the squared error as a fraction of the amplitude."""
+    return sum((each.error / each.deviation) ** 2 for each in errors)
+
+
+def _is_worse(before: Sequence[OpenLoop], after: Sequence[OpenLoop]) -> bool:
+    first, second = ({str(i): error for i, error in enumerate(errors)} for errors in (before, after))
+    return is_worse(first, second)
+
+
+def _open_loop(
+    measured: Sequence[SlowDecay], nominal: Sequence[OpenLoop], improved: Sequence[OpenLoop]
+) -> dict[str, object]:
+    """Error of the amplitude on held-out samples, by channel and device; rms over the decays of a channel."""
+    loops: dict[str, object] = {}
+    for channel in dict.fromkeys(each.channel for each in measured):
+        rows = [i for i, each in enumerate(measured) if each.channel == channel]
+        by_device = {}
+        for key, errors in (("nominal", nominal), ("improved", improved)):
+            error, deviation = (
+                float(np.sqrt(np.mean([(getattr(errors[i], of) * measured[i].scale) ** 2 for i in rows])))
+                for of in ("error", "deviation")
+            )
+            by_device[key] = {"rmse": error, "fraction": error / max(deviation, 1e-300)}
+        loops[channel] = by_device
+    return loops
+
+
+def _parameters(law: Law, fit: DecayFit, axis: Axis, decays: Decays, in_rad: bool) -> tuple[ParameterEstimate, ...]:
     """Parameters of a law in SI units; without an angle, the rate of decay that it adds at the first amplitude."""
-    sd = 1.96 * np.sqrt(np.maximum(np.diag(fit.covariance)[3:], 0.0))
+    sd = 1.96 * np.sqrt(np.maximum(np.diag(fit.covariance)[1:], 0.0))
+    duration, first = decays.duration, decays.reference
     if law.power is None:
-        beta, log_tau = float(fit.x[3]), float(fit.x[4])
+        beta, log_tau = float(fit.shared[1]), float(fit.shared[2])
         tau = duration * np.exp(log_tau)
         ends = tau * np.exp(-sd[1]), tau * np.exp(sd[1])
         return (
             ParameterEstimate("beta", beta, (beta - float(sd[0]), beta + float(sd[0])), "1"),
             ParameterEstimate("tau", float(tau), (float(ends[0]), float(ends[1])), "s"),
         )
-    rate = float(fit.x[3]) / duration
+    rate = float(fit.shared[1]) / duration
     if not in_rad or axis.mechanics is None:
         ends = rate - float(sd[0]) / duration, rate + float(sd[0]) / duration
         return (ParameterEstimate("rate_at_first_amplitude", rate, ends, "1/s"),)
@@ -190,19 +278,10 @@ def _parameters(
     return tuple(found)
 
 
-def _with_constants(device: Device, name: str, fit: DecayFit, duration: float) -> Device:
+def _with_law(device: Device, name: str, fit: DecayFit, decays: Decays) -> Device:
     """The device with the damping of the fit, where it states mechanics."""
     axis = device.axes[name]
     if axis.mechanics is None:
         return device
-    b = 2.0 * axis.mechanics.J * float(np.exp(fit.x[1])) / duration
+    b = 2.0 * axis.mechanics.J * float(np.exp(fit.shared[0])) / decays.duration
     return replace(device, axes={**device.axes, name: replace(axis, mechanics=replace(axis.mechanics, b=b))})
-
-
-def _errors(name: str, nominal: DecayFit, improved: DecayFit) -> dict[str, object]:
-    """Error of the amplitude with constant damping and with the law, as fractions of the amplitude."""
-    return {
-        f"amplitude_{name}": {
-            key: {"rmse": fit.rms, "fraction": fit.rms} for key, fit in (("nominal", nominal), ("improved", improved))
-        }
-    }

@@ -1,10 +1,14 @@
-"""Which law explains a free decay: generalised least squares with a small model error beside every law.
+"""Which law explains the free decays of one axis: generalised least squares with a model error beside every law.
 
-The whitened misfit of a law is chi2 = r' C^-1 r with C = white noise + delta^2 K. K is a squared-exponential covariance
-in time: the error that every model of a real detector leaves. It grows with the square root of the amplitude that is
-lost, because detectors have offsets and leakage too. A law is judged by
+The whitened misfit of a law is chi2 = r' C^-1 r with C = white noise + delta^2 K. K is a Matern 3/2 covariance in time:
+the error that every model of a real detector leaves. It grows with the square root of the amplitude that is lost,
+because detectors have offsets and leakage too. Its size delta is unknown; each law is judged by its evidence over all
+sizes,
 
-    score = chi2 + (parameters) ln n + 2 ln(number of laws)
+    score = -2 ln mean_delta exp(-(chi2 + ln det C) / 2) + (parameters) ln n + 2 ln(number of laws).
+
+A law is therefore needed only where no error of a detector explains the decay as well. Laws are fitted to two thirds of
+the samples, in blocks; the errors that are reported are those on the other blocks.
 
 Sources: Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001) 425 (model error); Schwarz, Ann. Stat. 6 (1978) 461.
 """
@@ -13,18 +17,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from estimation.diagnosis.open_loop import OpenLoop
 from estimation.slow.decay import LAWS, Decay, Law, log_amplitude
 from scanner.arrays import Array
 from scanner.errors import BadInput
 
-MODEL_ERROR = 0.004
-"""Relative error of amplitude that is expected of every model: logarithmic detectors follow their law to 0.05 dB."""
+MODEL_ERRORS: Array = 1e-3 * np.exp2(np.arange(5.0))
+"""Relative errors of amplitude that are expected of every model, equally probable: detectors follow their law to
+0.01 dB (0.1 %) at best, 0.15 dB (1.6 %) at worst."""
+
+UNKNOWN_LAW_ERRORS: Array = MODEL_ERRORS[-1] * np.exp2(np.arange(1.0, 6.0))
+"""Relative errors of amplitude that an unlisted law of damping leaves, equally probable: all that exceed a detector's,
+up to half of the amplitude."""
 
 MODEL_ERROR_LENGTH = 1.0 / 6.0
-"""Correlation time of the relative error ``MODEL_ERROR``, as a fraction of the duration."""
+"""Correlation time of the relative error, as a fraction of the duration."""
+
+HELD_OUT_BLOCKS = 21
+"""Blocks of equal time into which a decay is divided; every third is held out, the first and the last are not."""
 
 RELEASED_FRACTION = 0.97
 """Fraction of the largest amplitude at which the decay is taken to begin: a drive does not end within one sample."""
@@ -45,29 +59,51 @@ MAX_OUTLIER_SD = 5.0
 """Residual from a running median, in standard deviations, above which a point is left out: a glitch."""
 
 FREE_KNOTS = 9
-"""Knots of the cubic spline that stands for any law."""
+"""Knots of the cubic spline that stands for any law: fewer than the 14 blocks that are fitted."""
 
 START_COEFFICIENTS = (-0.3, 0.3, 3.0)
 """Starts of a law's coefficient times duration; of a drift the relative change."""
 
 
+class Decays(NamedTuple):
+    """Free decays of one axis, which share its law.
+
+    Attributes:
+        parts: each decay.
+        duration: T, the longest duration [s].
+        reference: largest first amplitude, in the unit of the measurement.
+    """
+
+    parts: tuple[Decay, ...]
+    duration: float
+    reference: float
+
+    @classmethod
+    def of(cls, parts: Sequence[Decay]) -> Decays:
+        longest = max(float(part.time[-1]) for part in parts)
+        return cls(tuple(parts), longest, max(part.first_amplitude for part in parts))
+
+    def log_relative(self, part: Decay) -> Array:
+        """ln of the amplitude of one decay over the reference amplitude, shape (n,)."""
+        return part.log_amplitude + np.log(part.first_amplitude / self.reference)
+
+
 @dataclass(frozen=True)
 class DecayFit:
-    """One law fitted to a decay.
+    """One law fitted to decays.
 
     Attributes:
         law: None for a constant rate.
-        x: parameters of ``log_amplitude``. covariance: of them.
-        chi2: whitened misfit. score: with the price of parameters and of the number of laws.
-        rms: residual of A relative to the rms of A.
+        shared: parameters that all decays have in common, see ``log_amplitude``. covariance: of them.
+        score: -2 ln evidence, with the price of parameters and of the number of laws.
+        predicted: ln of the amplitude of every decay over the reference amplitude.
     """
 
     law: Law | None
-    x: Array
+    shared: Array
     covariance: Array
-    chi2: float
     score: float
-    rms: float
+    predicted: tuple[Array, ...]
 
 
 def compress(time: Array, amplitude: Array) -> Decay:
@@ -113,61 +149,143 @@ def _white_noise(y: Array) -> Array:
     return np.maximum(np.interp(np.arange(y.size), middles, sds), 1e-6)
 
 
-def covariance_root(decay: Decay) -> Array:
-    """Cholesky root of the covariance of ln A, shape (n, n)."""
-    unit = decay.time / decay.time[-1]
-    lag = (unit[:, None] - unit) / MODEL_ERROR_LENGTH
-    error = MODEL_ERROR * np.exp(-0.5 * decay.log_amplitude)
-    return np.linalg.cholesky(np.outer(error, error) * np.exp(-0.5 * lag**2) + np.diag(decay.noise_sd**2))
+def held_out(part: Decay) -> Array:
+    """Blocks of the samples that are held out, -1 for samples that are fitted, shape (n,)."""
+    block = np.minimum(part.time / part.time[-1] * HELD_OUT_BLOCKS, HELD_OUT_BLOCKS - 1).astype(int)
+    return np.where(block % 3 == 1, block, -1)
 
 
-def fit_law(decay: Decay, law: Law | None, root: Array, laws: Sequence[Law] = LAWS) -> DecayFit:
-    """Fit a law by generalised least squares, from several starts."""
+def covariance_root(part: Decay, model_error: float) -> Array:
+    """Cholesky root of the covariance of ln A at the fitted samples, shape (n, n)."""
+    fitted = held_out(part) < 0
+    unit = part.time[fitted] / part.time[-1]
+    lag = np.sqrt(3.0) * np.abs(unit[:, None] - unit) / MODEL_ERROR_LENGTH
+    error = model_error * np.exp(-0.5 * part.log_amplitude[fitted])
+    covariance = np.outer(error, error) * (1.0 + lag) * np.exp(-lag)
+    return np.linalg.cholesky(covariance + np.diag(part.noise_sd[fitted] ** 2))
+
+
+def fit_law(decays: Decays, law: Law | None, rate: float | None = None, model_errors: Array = MODEL_ERRORS) -> DecayFit:
+    """Fit a law to the samples that are not held out, from several starts, for every size of the model error.
+
+    Args:
+        decays: of one axis.
+        law: None for a constant rate.
+        rate: of the nominal decay [1/s] if it is not fitted.
+        model_errors: relative errors of amplitude that are equally probable beside the law.
+    """
     from scipy.linalg import solve_triangular
     from scipy.optimize import least_squares
 
-    unit, y = decay.time / decay.time[-1], decay.log_amplitude
-    half = unit > 0.5
-    slope = max(-float(np.polyfit(unit[half], y[half], 1)[0]), 1e-3)
-    begin = np.array([y[0], np.log(slope), min(float(y.min()) - 2.0, -4.0)])
+    units = [part.time / decays.duration for part in decays.parts]
+    measured = [decays.log_relative(part) for part in decays.parts]
+    fitted = [held_out(part) < 0 for part in decays.parts]
+    free = rate is None
+    known = [] if rate is None else [np.log(rate * decays.duration)]
+    first = [_late_slope(units[0][fitted[0]], measured[0][fitted[0]])] if free else []
+    ends = np.array([(y[0], min(float(y[rows].min()) - 2.0, -4.0)) for y, rows in zip(measured, fitted, strict=True)])
+    of_law = [[]] if law is None else [[c, np.log(0.3)][: law.parameters] for c in START_COEFFICIENTS]
+    begins = [np.concatenate([first, start, ends.ravel()]) for start in of_law]
+    count = begins[0].size - ends.size  # shared parameters that are fitted
 
-    def residual(x: Array) -> Array:
-        return np.asarray(solve_triangular(root, y - log_amplitude(x, law, unit), lower=True))
+    def predict(x: Array) -> list[Array]:
+        shared = np.concatenate([known, x[:count]])
+        pairs = x[count:].reshape(-1, 2)
+        return [
+            log_amplitude(shared, start, floor, law, unit) for (start, floor), unit in zip(pairs, units, strict=True)
+        ]
 
-    starts = [begin] if law is None else [np.append(begin, np.zeros(law.parameters)) for _ in START_COEFFICIENTS]
-    if law is not None:
-        for start, coefficient in zip(starts, START_COEFFICIENTS, strict=True):
-            start[3] = coefficient
-            start[4:] = np.log(0.3)
-    low = np.full(starts[0].size, -np.inf)
-    low[2] = -30.0
-    high = np.full(starts[0].size, np.inf)
-    low[1], high[1] = np.log(1e-6), np.log(60.0)
+    low, high = np.full(begins[0].size, -np.inf), np.full(begins[0].size, np.inf)
+    low[count + 1 :: 2] = -30.0
+    if free:
+        low[0], high[0] = np.log(1e-6), np.log(60.0)
     if law is not None and law.power is None:
-        low[3:], high[3:] = (-0.95, np.log(MIN_DRIFT_TIME)), (50.0, np.log(5.0))
-    fits = [least_squares(residual, start, bounds=(low, high), x_scale="jac") for start in starts]
-    best = min(fits, key=lambda fit: fit.cost)
-    chi2, added = 2.0 * float(best.cost), 0 if law is None else law.parameters
-    price = added * np.log(y.size) + (2.0 * np.log(len(laws)) if added else 0.0)
-    rms = _amplitude_error(y, log_amplitude(best.x, law, unit))
-    return DecayFit(law, best.x, np.linalg.pinv(best.jac.T @ best.jac), chi2, chi2 + price, rms)
+        low[count - 2 : count], high[count - 2 : count] = (-0.95, np.log(MIN_DRIFT_TIME)), (50.0, np.log(5.0))
+    added = 0 if law is None else law.parameters
+    n = sum(int(rows.sum()) for rows in fitted)
+    price = added * np.log(n) + (2.0 * np.log(len(LAWS)) if added else 0.0)
+    scores, solutions = [], []
+    for model_error in model_errors:
+        roots = [covariance_root(part, model_error) for part in decays.parts]
+
+        def residual(x: Array, roots: list[Array] = roots) -> Array:
+            whole = zip(roots, measured, predict(x), fitted, strict=True)
+            return np.concatenate([solve_triangular(root, (y - p)[rows], lower=True) for root, y, p, rows in whole])
+
+        fits = [least_squares(residual, begin, bounds=(low, high), x_scale="jac") for begin in begins]
+        fit = min(fits, key=lambda each: each.cost)
+        begins = [fit.x]  # of the next size of the model error
+        log_determinant = 2.0 * sum(float(np.log(np.diag(root)).sum()) for root in roots)
+        scores.append(2.0 * float(fit.cost) + log_determinant + price)
+        solutions.append(fit)
+    best = solutions[int(np.argmin(scores))]
+    covariance = np.linalg.pinv(best.jac.T @ best.jac)[:count, :count]
+    shared = np.concatenate([known, best.x[:count]])
+    return DecayFit(law, shared, covariance, _average_score(scores), tuple(predict(best.x)))
 
 
-def _amplitude_error(measured: Array, fitted: Array) -> float:
-    """Difference of two amplitudes, rms over the rms of the first, from their logarithms."""
-    return float(np.sqrt(np.mean((np.exp(measured) - np.exp(fitted)) ** 2) / np.mean(np.exp(2.0 * measured))))
+def _late_slope(unit: Array, measured: Array) -> float:
+    """ln of the rate of decay times T in the second half of a decay."""
+    late = unit > 0.5 * unit[-1]
+    return float(np.log(max(-float(np.polyfit(unit[late], measured[late], 1)[0]), 1e-3)))
 
 
-def fit_free_curve(decay: Decay, root: Array) -> tuple[float, float]:
-    """Score of a spline in place of any law, and its residual as ``DecayFit.rms``."""
+def fit_curve(decays: Decays, common: bool = False) -> DecayFit:
+    """Splines of ln A over time in place of any law; no parameters are stated.
+
+    Args:
+        decays: of one axis.
+        common: one function of the time from the start for all decays, which differ by a factor alone, as a drift of
+            the gain allows; otherwise each decay has its own.
+    """
     from scipy.interpolate import BSpline
-    from scipy.linalg import solve_triangular
+    from scipy.linalg import block_diag, solve_triangular
 
-    unit = decay.time / decay.time[-1]
-    knots = np.concatenate([np.zeros(3), np.linspace(0.0, 1.0, FREE_KNOTS), np.ones(3)])
-    basis = BSpline.design_matrix(np.clip(unit, 0.0, 1.0 - 1e-12), knots, 3).toarray()
-    A, b = (solve_triangular(root, each, lower=True) for each in (basis, decay.log_amplitude))
-    coefficients = np.linalg.lstsq(A, b, rcond=None)[0]
-    chi2 = float(np.sum((b - A @ coefficients) ** 2))
-    rms = _amplitude_error(decay.log_amplitude, basis @ coefficients)
-    return chi2 + (basis.shape[1] - 3) * np.log(unit.size), rms
+    knots, parts = np.concatenate([np.zeros(3), np.linspace(0.0, 1.0, FREE_KNOTS), np.ones(3)]), decays.parts
+    units = [part.time / (decays.duration if common else part.time[-1]) for part in parts]
+    bases = [BSpline.design_matrix(np.clip(unit, 0.0, 1.0 - 1e-12), knots, 3).toarray() for unit in units]
+    factors = block_diag(*[np.ones((unit.size, 1)) for unit in units])
+    design = np.column_stack([factors[:, 1:], np.concatenate(bases)]) if common else block_diag(*bases)
+    y = np.concatenate([decays.log_relative(part) for part in parts])
+    fitted = np.concatenate([held_out(part) < 0 for part in parts])
+    price = (design.shape[1] - 1 - 2 * len(parts)) * np.log(fitted.sum())  # more than those of a constant rate
+    scores, solutions = [], []
+    for model_error in MODEL_ERRORS:
+        root = block_diag(*[covariance_root(part, model_error) for part in parts])
+        A, b = (solve_triangular(root, each[fitted], lower=True) for each in (design, y))
+        solutions.append(np.linalg.lstsq(A, b, rcond=None)[0])
+        chi2 = float(np.sum((b - A @ solutions[-1]) ** 2))
+        scores.append(chi2 + 2.0 * float(np.log(np.diag(root)).sum()) + price)
+    predicted = design @ solutions[int(np.argmin(scores))]
+    ends = np.cumsum([unit.size for unit in units])[:-1]
+    return DecayFit(None, np.empty(0), np.empty((0, 0)), _average_score(scores), tuple(np.split(predicted, ends)))
+
+
+def rate_price(decays: Decays) -> float:
+    """Amount by which a fitted rate of decay has to lower the score below that of the nominal rate: ln n."""
+    return float(np.log(sum(int((held_out(part) < 0).sum()) for part in decays.parts)))
+
+
+def _average_score(scores: Sequence[float]) -> float:
+    """-2 ln of the mean evidence over the sizes of the model error."""
+    least = min(scores)
+    return least - 2.0 * float(np.log(np.mean(np.exp(-0.5 * (np.array(scores) - least)))))
+
+
+def prediction_errors(decays: Decays, predicted: Sequence[Array]) -> list[OpenLoop]:
+    """Error of the amplitude of every decay on the samples that are held out, in the unit of the measurement.
+
+    Args:
+        decays: of one axis.
+        predicted: ln of the amplitude of every decay over the reference amplitude.
+    """
+    errors = []
+    for part, log_a in zip(decays.parts, predicted, strict=True):
+        block = held_out(part)
+        amplitude = decays.reference * np.exp(decays.log_relative(part))
+        squares = (amplitude - decays.reference * np.exp(log_a)) ** 2
+        means = np.array([squares[block == each].mean() for each in np.unique(block[block >= 0])])
+        rms = float(np.sqrt(means.mean()))
+        sd = float(means.std() / np.sqrt(max(means.size - 1, 1))) / max(2.0 * rms, 1e-300)
+        errors.append(OpenLoop(rms, float(np.sqrt(np.mean(amplitude[block >= 0] ** 2))), sd))
+    return errors

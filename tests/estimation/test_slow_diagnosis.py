@@ -11,7 +11,8 @@ import pytest
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.estimate import default_estimator, estimate
-from estimation.slow.decay import solve_decay
+from estimation.slow.decay import LAWS, solve_decay
+from estimation.slow.selection import Decays, compress, fit_law, held_out, prediction_errors
 from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant
 from recon.cli import main
@@ -27,17 +28,21 @@ DEVICE = Device(
 )
 
 
-def diagnosed(coefficient: float, power: float, seed: int = 1, unit: str = "rad") -> Diagnosis:
-    """A decay over 8 s from 0.1 rad; ``coefficient``: rate that a law adds at the first amplitude [1/s]."""
+def envelope(coefficient: float, power: float, seed: int = 1, unit: str = "rad", first: float = 0.1) -> Recording:
+    """A decay over 8 s; ``coefficient``: rate that a law adds at 0.1 rad [1/s], ``first``: first amplitude [rad]."""
     rng, time = np.random.default_rng(seed), np.arange(0.0, 8.0, 0.01)
     rate = 8.0 * W / 2e4 / 2.0
-    log_a = np.interp(
-        time / 8.0, np.linspace(0, 1, 2001), solve_decay(0.0, rate, 8.0 * coefficient, power, 0.0, 1.0, 2000)
-    )
+    solved = solve_decay(np.log(first / 0.1), rate, 8.0 * coefficient, power, 0.0, 1.0, 2000)
+    log_a = np.interp(time / 8.0, np.linspace(0, 1, 2001), solved)
     amplitude = 0.1 * np.exp(log_a) * (1.0 + 1e-4 * rng.normal(size=time.size))
     values = amplitude if unit == "rad" else 10.0 * amplitude if unit == "V" else 20.0 * np.log10(10.0 * amplitude)
     extra = {"reference": 5000.0} | ({"level": 1.0} if unit == "dB" else {})
-    return diagnose_with_optics([Recording.from_arrays({"amplitude_x": (values, unit, 100.0, 0.0, extra)}, DEVICE)])
+    return Recording.from_arrays({"amplitude_x": (values, unit, 100.0, 0.0, extra)}, DEVICE)
+
+
+def diagnosed(coefficient: float, power: float, seed: int = 1, unit: str = "rad") -> Diagnosis:
+    """The diagnosis of one decay, see ``envelope``."""
+    return diagnose_with_optics([envelope(coefficient, power, seed, unit)])
 
 
 @pytest.mark.parametrize("unit", ["rad", "V", "dB"])
@@ -66,6 +71,48 @@ def test_constant_damping_is_consistent_and_takes_its_value() -> None:
     mechanics = found.device.axes["x"].mechanics
     assert mechanics is not None
     assert mechanics.b == pytest.approx(1e-10 * W / 2e4, rel=0.01)
+
+
+def test_decays_from_two_amplitudes_have_one_law_and_exclude_a_drift_of_the_gain() -> None:
+    found = diagnose_with_optics([envelope(0.5, 2.0), envelope(0.5, 2.0, seed=2, first=0.04)])
+    (finding,) = found.findings
+    assert finding.effect == "cubic-damping"
+    assert finding.parameters[0].value == pytest.approx(8.0 * 1e-10 * 0.5 / 0.1**2, rel=0.1)
+    assert "gain-drift" not in [rival.effect for rival in finding.rivals]
+    assert finding.advice is None
+
+
+def test_errors_are_those_of_samples_that_were_not_fitted() -> None:
+    recording = envelope(0.5, 2.0)
+    time, amplitude = recording["amplitude_x"].time(), recording["amplitude_x"].read()
+    part = compress(time, amplitude)
+    fitted = np.interp(
+        np.arange(part.time.size), np.flatnonzero(held_out(part) < 0), part.log_amplitude[held_out(part) < 0]
+    )
+    hidden = part._replace(log_amplitude=np.where(held_out(part) < 0, part.log_amplitude, fitted + 1.0))
+    laws = [fit_law(Decays.of([each]), LAWS[0]) for each in (part, hidden)]
+    assert np.array_equal(laws[0].shared, laws[1].shared)
+    errors = [
+        prediction_errors(Decays.of([each]), law.predicted)[0] for each, law in zip((part, hidden), laws, strict=True)
+    ]
+    assert errors[0].error < 0.01 * errors[0].deviation
+    assert errors[1].error > 0.1 * errors[1].deviation
+
+
+def test_the_open_loop_errors_of_a_decay_are_in_the_unit_of_the_channel() -> None:
+    in_rad, in_volt = (diagnosed(0.5, 2.0, unit=unit).open_loop["amplitude_x"] for unit in ("rad", "V"))
+    for key in ("nominal", "improved"):
+        assert in_volt[key]["rmse"] == pytest.approx(10.0 * in_rad[key]["rmse"], rel=1e-3)
+        assert in_volt[key]["fraction"] == pytest.approx(in_rad[key]["fraction"], rel=1e-3)
+    assert in_rad["improved"]["fraction"] < 0.1 * in_rad["nominal"]["fraction"]
+
+
+def test_an_error_of_the_detector_is_no_law() -> None:
+    recording = envelope(0.0, 1.0)
+    amplitude = recording["amplitude_x"].read()
+    curved = amplitude * (1.0 + 0.006 * np.sin(3.0 * np.log(amplitude)))
+    channels = {"amplitude_x": (curved, "rad", 100.0, 0.0, {"reference": 5000.0})}
+    assert diagnose_with_optics([Recording.from_arrays(channels, DEVICE)]).verdict == "consistent"
 
 
 @pytest.mark.slow
