@@ -30,6 +30,16 @@ DRIVE_ON_RATIO = 0.1
 LINE_RATIO = 10.0
 """Height of a line over the median of the spectrum from which it counts as an oscillation."""
 
+MAX_SLOW_SEARCH_SAMPLES = 1 << 22
+"""Samples in which a line far below the resonance is searched: 40 s at 100 kHz, and 32 MB of doubles."""
+
+SLOW_SAMPLES_PER_CYCLE = 8
+"""Means per cycle of the highest frequency of that search, which keep 97 % of its amplitude."""
+
+SLOW_LINE_SHARE = 0.5
+"""Share of a signal's variance from which one line is its main oscillation. The fundamental of a sawtooth has 0.61,
+that of an Archimedean spiral 0.75; each line of a step above 2 / duration has less than 0.1."""
+
 
 @dataclass(frozen=True)
 class PhaseReference:
@@ -119,6 +129,20 @@ def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf,
         if found is not None:
             return found
     raise BadInput("holds no oscillation", file=channel.file, channel=channel.name, hint="check that it was recorded")
+
+
+def has_slow_oscillation(channel: Channel, high: float) -> bool:
+    """Whether one line below ``high`` [Hz] has more than ``SLOW_LINE_SHARE`` of the variance of a signal."""
+    values = channel.read(0, min(channel.size, MAX_SLOW_SEARCH_SAMPLES))
+    length = max(1, int(channel.sample_rate / (SLOW_SAMPLES_PER_CYCLE * high)))
+    means = np.nan_to_num(values - np.nanmean(values))[: values.size // length * length].reshape(-1, length).mean(1)
+    found = _strongest(means, channel.sample_rate / length, 0.0, high)
+    if found is None:
+        return False
+    window = np.hanning(means.size)
+    turn = 2 * np.pi * found * length / channel.sample_rate * np.arange(means.size)
+    amplitude = 2.0 * abs(np.sum(window * means * np.exp(-1j * turn))) / window.sum()
+    return bool(0.5 * amplitude**2 > SLOW_LINE_SHARE * np.nanvar(values))
 
 
 def _strongest(values: Array, rate: float, low: float, high: float) -> float | None:

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.reference import PhaseReference, absolute_reference, dominant_frequency, drive_reference
+from estimation.reference import (
+    PhaseReference,
+    absolute_reference,
+    dominant_frequency,
+    drive_reference,
+    has_slow_oscillation,
+)
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
 from scanner.device import Device
@@ -113,7 +119,8 @@ def phase_reference(
     """The phase reference of one axis (see ``estimation.reference``).
 
     Args:
-        sense: a signal of the motion, for its frequency where no drive was recorded.
+        sense: a signal of the motion, for its frequency where no drive was recorded, and to confirm that a linear drive
+            moves the axis far below its resonance.
         even: the signal carries the motion's frequency twice (a capacitance).
 
     Raises:
@@ -125,7 +132,10 @@ def phase_reference(
         check_signal(drive, gaps_ok=True)
         low = 0.1 * stated.resonance if stated.mechanics else 0.0
         if stated.require_drive().kind == "linear":
-            return drive_reference(drive, "drive", low)
+            quasistatic = low > 0.0 and all(
+                has_slow_oscillation(signal, 2.0 * low) for signal in (drive, sense) if signal is not None
+            )
+            return drive_reference(drive, "drive", 0.0 if quasistatic else low)
         reference = drive_reference(drive, "half-drive", low)
         if stated.mechanics and not 0.75 < reference.frequency / stated.resonance < 1.33:
             raise BadInput(

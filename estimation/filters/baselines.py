@@ -112,7 +112,7 @@ def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[C
 def reference_from_drive_or_signal(recording: Recording, device: Device, name: str, channel: Channel) -> PhaseReference:
     """The phase reference of one axis from its drive, or from a position signal where no drive is known."""
     if f"drive_{name}" in recording and device.axis(name).drive is not None:
-        return phase_reference(recording, device, name)
+        return phase_reference(recording, device, name, channel)
     axis = device.axis(name)
     band = (0.8 * axis.resonance, 1.25 * axis.resonance) if axis.mechanics else (0.0, np.inf)
     return absolute_reference(dominant_frequency(channel, *band), channel.start, channel.end)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimation.reference import PhaseReference
 from estimation.signals import SenseChannel, intensity_clock, is_capacitive, phase_reference, sense_channels
 from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noise, expand_clipped_blocks
 from estimation.tracker.initial_state import initial_estimate, resolve_signs
@@ -28,6 +29,10 @@ from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
+
+MIN_RELATIVE_FREQUENCY = 0.2
+"""Frequency of a motion over the resonance below which the tracker refuses it: the spring then balances the drive, and
+the inertia, on whose exchange of energy with the spring the averaged dynamics rest, has 4 % of its force."""
 
 SECTION_BLOCKS = 16384
 """Blocks whose samples are projected at a time, some 10 s: bounds the memory of a long recording."""
@@ -66,6 +71,7 @@ def track(
     for sense in sense_channels(recording, device, gaps_ok=True):
         even = is_capacitive(sense.readout)
         references = {name: phase_reference(recording, device, name, sense.channel, even) for name in sense.axes}
+        _check_resonant(sense, device, references)
         layout = lay_out_blocks(recording, device, sense, references)
         signs, prior, densities = [""] * len(sense.axes), None, _previous_densities(previous, sense)
         knots: list[list[AxisKnots]] = [[] for _ in sense.axes]
@@ -107,6 +113,20 @@ class SectionResult(NamedTuple):
     noise_var: float
     mean_nis: float
     log_likelihood: float
+
+
+def _check_resonant(sense: SenseChannel, device: Device, references: Mapping[str, PhaseReference]) -> None:
+    """Raise BadInput for an axis that moves far below its resonance, where the averaged dynamics do not hold."""
+    for name in sense.axes:
+        frequency, resonance = references[name].frequency, device.axis(name).resonance
+        if frequency < MIN_RELATIVE_FREQUENCY * resonance:
+            raise BadInput(
+                f"moves at {frequency:.6g} Hz, far below its resonance of {resonance:.6g} Hz, "
+                "where the tracker's model does not hold",
+                file=sense.channel.file,
+                channel=sense.channel.name,
+                hint="use --estimator sensor or ukf; if it should resonate, check the drive, and J and k of the device",
+            )
 
 
 def section_ranges(drive_share: Array) -> Iterator[tuple[int, int]]:
