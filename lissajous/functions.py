@@ -159,6 +159,7 @@ def estimate(
         recording: a recording or a file.
         device: in place of the recording's own.
         estimator: ``"tracker"``, ``"ukf"``, ...; chosen by what was recorded where None.
+        sample_motion: estimate a motion of the sample and remove it.
         mapping: needed where ``recording`` is an instrument's file.
         flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
 
@@ -185,6 +186,7 @@ def reconstruct(
     allow_outside: bool = False,
     sample_rate: float | None = None,
     intensity_drift: DriftKind | None = None,
+    sample_motion: bool = False,
     mapping: MappingSource | None = None,
     truth: Mapping[str, Any] | None = None,
 ) -> Reconstruction:
@@ -230,6 +232,7 @@ def reconstruct(
         sense_only=sense_only,
         allow_outside=allow_outside,
         intensity_drift=intensity_drift,
+        sample_motion=sample_motion,
     )
     if isinstance(recording, Mapping):
         recording = _recording_of_arrays(recording, sample_rate)

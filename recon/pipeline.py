@@ -28,6 +28,8 @@ from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.picture_estimate import estimate_picture
 from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
+from recon.imaging.sample_motion import SampleMotion
+from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion, relative_to_sample
 from recon.notes import describe_ambiguous_signs, describe_clock_jumps
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
@@ -60,7 +62,7 @@ class EstimatedMotion:
         grid: the pixels over the device's field of view, else over the range of the motion.
         field_notes, motion_notes: what a reader has to know of the field and of the motion, a line each.
         phase_errors: of the motion, as the picture shows them; None where they were not measured.
-        readout_phase, intensity_drift: as in ``Reconstruction``.
+        readout_phase, intensity_drift, sample_motion: as in ``Reconstruction``.
     """
 
     prepared: PreparedRecording
@@ -71,11 +73,13 @@ class EstimatedMotion:
     phase_errors: list[PhaseError] | None = None
     readout_phase: Mapping[str, ReadoutPhase] = field(default_factory=dict)
     intensity_drift: Sequence[IntensityDrift | None] = ()
+    sample_motion: SampleMotion | None = None
 
     @property
     def beam(self) -> Motion:
-        """Motion of the beam over the sample: the mirror's, corrected for the optics terms of the device."""
-        return beam_motion(self.motion, self.prepared.device, self.prepared.origin)
+        """Motion of the beam over the sample: the mirror's, corrected for the optics and for a motion of the sample."""
+        beam = beam_motion(self.motion, self.prepared.device, self.prepared.origin)
+        return relative_to_sample(beam, self.sample_motion, self.grid)
 
 
 @dataclass(frozen=True)
@@ -130,10 +134,12 @@ def _reconstruct_prepared(
         estimated = estimate_motion(prepared, replace(options, estimator=estimator))
         progress.update()
         progress.set_postfix_str("registration")
-        estimated = correct_readout_phase(estimated, options)
+        # The sample's motion does not depend on phase errors, which a moving sample would disturb: it comes first.
+        estimated = correct_readout_phase(correct_sample_motion(estimated, options), options)
         progress.update()
         progress.set_postfix_str("gridding")
-        gridded = grid_scan(correct_intensity_drift(estimated, options), options)
+        estimated = correct_intensity_drift(estimated, options)
+        gridded = grid_scan(estimated, options)
         progress.update()
         progress.set_postfix_str("assessment")
         result = assess(gridded, options, truth)
@@ -190,6 +196,16 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
 
 
+def correct_sample_motion(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
+    """Take the motion of the sample out of the beam's positions if it is asked for."""
+    if not options.sample_motion:
+        return estimated
+    intensity = estimated.prepared.intensity
+    found = measure_sample_motion(estimated.beam, intensity, estimated.grid, _unlocated(estimated))
+    notes = [*estimated.motion_notes, describe_sample_motion(found, intensity.sample_rate)]
+    return replace(estimated, sample_motion=found, motion_notes=notes)
+
+
 def correct_intensity_drift(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
     """Remove the drift of the detectors from the intensity if it is asked for."""
     if options.intensity_drift is None:
@@ -212,7 +228,7 @@ def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
         BadInput: no sample was mapped.
     """
     prepared, beam, grid = estimated.prepared, estimated.beam, estimated.grid
-    unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
+    unlocated = _unlocated(estimated)
     picture = grid_intensity(beam, prepared.intensity, grid, unlocated)
     field_notes = check_field(picture, estimated.motion, options.allow_outside)
     if not picture.coverage.any():
@@ -249,6 +265,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         phase_errors=estimated.phase_errors or [],
         readout_phase=estimated.readout_phase,
         intensity_drift=estimated.intensity_drift,
+        sample_motion=estimated.sample_motion,
         evaluation={axis: evaluate_axis(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles}
         if truth
         else {},
@@ -296,6 +313,12 @@ def _repair_dropped_samples(
         "of the intensity were lost, or the specimen changed"
     )
     return replace(result, notes=[*result.notes, doubt])
+
+
+def _unlocated(estimated: EstimatedMotion) -> SampleRanges:
+    """Samples of the intensity during which the mirror's angle is unknown."""
+    prepared = estimated.prepared
+    return to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
 
 
 def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:

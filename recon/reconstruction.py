@@ -16,6 +16,7 @@ from recon.imaging.picture import Picture
 from recon.imaging.picture_estimate import PictureKind
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.readout_phase import ReadoutPhase
+from recon.imaging.sample_motion import SampleMotion
 from recon.preparation import DeviceSource
 from recon.quality.defects import Defect
 from scanner.channel import Channel
@@ -40,6 +41,7 @@ class Options:
         allow_outside: make the picture although most samples lie outside the field of view.
         sense_only: keep the phase of the estimator, without the correction by the phase error that the picture shows.
         intensity_drift: drift of the detector to remove, "offset" or "gain"; None removes none.
+        sample_motion: estimate the motion of the sample and remove it.
         frames: number of frames to write; None for none.
         frame_time: duration of a frame to write [s], instead of ``frames``.
         zarr: write the frames as OME-Zarr too.
@@ -57,6 +59,7 @@ class Options:
     sense_only: bool = False
     allow_outside: bool = False
     intensity_drift: DriftKind | None = None
+    sample_motion: bool = False
     frames: int | None = None
     frame_time: float | None = None
     zarr: bool = False
@@ -69,7 +72,7 @@ class Reconstruction:
 
     Attributes:
         motion: of the mirror.
-        beam: motion of the beam over the sample, which the picture is made with.
+        beam: motion of the beam over the sample, which the picture is made with; relative to a sample that moves.
         picture: intensity and sample count of each pixel.
         picture_kind: as ``picture`` in ``Options``.
         picture_sd: standard deviation of each pixel, of the shape of the picture; NaN where it is unknown.
@@ -83,6 +86,7 @@ class Reconstruction:
         readout_phase: phase error of the readout that the picture showed and that was removed, by axis; without the
             axes of which nothing determined it.
         intensity_drift: drift that was removed, by detector; empty unless it was asked for.
+        sample_motion: motion of the sample; None unless it was asked for and the scan has crossings.
         evaluation: estimate against the truth, by axis; empty without a truth.
         truth: of a simulation; None without one.
         defects: clock jumps, gaps, clipping and missing parts of the recording.
@@ -108,6 +112,7 @@ class Reconstruction:
     phase_errors: list[PhaseError]
     readout_phase: Mapping[str, ReadoutPhase]
     intensity_drift: Sequence[IntensityDrift | None]
+    sample_motion: SampleMotion | None
     evaluation: Mapping[str, AxisEvaluation]
     truth: Truth | None
     defects: list[Defect]

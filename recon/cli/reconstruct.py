@@ -88,6 +88,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="remove a drift of the detector's offset (1/f noise) or gain (bleaching), found at crossings of the scan",
     )
     parser.add_argument(
+        "--sample-motion", action="store_true", help="remove a motion of the sample, found at crossings of the scan"
+    )
+    parser.add_argument(
         "--spot", type=parse_positive, metavar="PX", help="sd of the beam's spot in pixels, for the blur's account"
     )
     parser.add_argument("--seed", type=int, default=0, help="of whatever is drawn at random (nothing is, at present)")
@@ -110,6 +113,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         sense_only=args.sense_only,
         allow_outside=args.allow_outside,
         intensity_drift=args.intensity_drift,
+        sample_motion=args.sample_motion,
         frames=args.frames,
         frame_time=args.frame_time,
         zarr=args.zarr,
@@ -125,8 +129,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if len(args.recordings) > 1 or args.recordings[0].is_dir() or args.scheduler or args.workers:
         return _run_many(args, options)
     live = None
-    if args.follow and args.intensity_drift:
-        raise BadInput("needs a whole recording", channel="--intensity-drift", hint="leave out --follow")
+    for option in ("--intensity-drift", "--sample-motion"):
+        if args.follow and getattr(args, option[2:].replace("-", "_")):
+            raise BadInput("needs a whole recording", channel=option, hint="leave out --follow")
     if args.follow:
         from recon.follow import follow_recording
 
@@ -172,7 +177,7 @@ def reconstruct_file(
     from recon.frames import write_scan_frames
     from recon.imaging.picture import fill_holes
     from recon.io.convert import open_any
-    from recon.io.output import finite, replacing_folder, write_json, write_motion, write_tiff
+    from recon.io.output import finite, replacing_folder, write_json, write_motion, write_sample_motion, write_tiff
     from recon.pipeline import reconstruct
     from recon.report.conclusions import conclude_reconstruction
     from recon.report.figures import save_picture
@@ -200,6 +205,8 @@ def reconstruct_file(
         if options.frames or options.frame_time:
             write_scan_frames(folder, result, options)
         write_motion(folder / "motion.h5", result.motion, grid)
+        if result.sample_motion is not None and result.sample_motion.moving:
+            write_sample_motion(folder / "sample_motion.csv", result.sample_motion, result.intensity, grid)
         write_json(folder / "summary.json", summary)
         save_picture(folder / "image.png", result.picture, result.affected, options.fill_radius)
         (folder / "report.html").write_text(

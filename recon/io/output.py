@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.picture import Grid, Picture
+from recon.imaging.sample_motion import SampleMotion
+from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.files import check_writable
 from scanner.hdf5 import new_hdf5
@@ -95,6 +97,24 @@ def write_motion(path: Path, motion: Motion, grid: Grid) -> None:
                 stop = min(first + CHUNK_SAMPLES, axis.angle.size)
                 angle[first:stop] = grid.angle_scale * axis.angle.read(first, stop)
             angle.attrs.update({"unit": "rad", "sample_rate": axis.angle.sample_rate, "start": axis.angle.start})
+
+
+def write_sample_motion(path: Path, motion: SampleMotion, intensity: Channel, grid: Grid) -> None:
+    """Write sample_motion.csv: time [s], displacement of the sample [px], its standard deviation [px], and both as an
+    angle of the mirror [rad].
+
+    Args:
+        path: the file.
+        motion: of the sample.
+        intensity: whose clock the motion has.
+        grid: the pixels; angles are mechanical or optical, as it states.
+    """
+    time = motion.times(intensity)
+    angle = np.array(grid.pixel_angle) * grid.angle_scale
+    table = np.column_stack([time, motion.shift, motion.sd, motion.shift * angle, motion.sd * angle])
+    columns = [f"{quantity}_{unit}" for unit in ("px", "rad") for quantity in ("x", "y", "x_sd", "y_sd")]
+    formats = ["%.9g", *["%.4f"] * 4, *["%.6g"] * 4]
+    np.savetxt(path, table, formats, delimiter=",", header=",".join(["time_s", *columns]), comments="")
 
 
 def pixel_size(grid: Grid) -> tuple[float, float, str]:

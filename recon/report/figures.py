@@ -210,6 +210,26 @@ def phase_figure(
     return figure_uri(drawing)
 
 
+def sample_motion_figure(time: Array, shift: Array, sd: Array) -> str:
+    """Displacement of the sample in x and y over time with its ±2 sd band.
+
+    Args:
+        time: shape (n,) [s].
+        shift, sd: shape (n, 2) [px].
+    """
+    drawing, axes = new_figure(size=(NARROW_WIDTH_IN, 2.4))
+    panel = axes[0, 0]
+    for name, values, spread, colour in zip("xy", shift.T, sd.T, COLOURS, strict=False):
+        at, low = min_max_envelope(time, values - 2 * spread)
+        high = min_max_envelope(time, values + 2 * spread)[1]
+        panel.fill_between(1e3 * at, low, high, color=colour, alpha=0.2, lw=0)
+        at, middle = min_max_envelope(time, values)
+        panel.plot(1e3 * at, middle, color=colour, lw=1.2, label=name)
+    panel.set(xlabel="time [ms]", ylabel="displacement [px]")
+    panel.legend(**LEGEND, ncols=2)
+    return figure_uri(drawing)
+
+
 def blur_figure(parts: Mapping[str, Mapping[str, float]], p: float) -> str:
     """Blur by cause [px], one group of bars a cause with one bar for each entry of ``parts``, and the tolerated p."""
     drawing, axes = new_figure(size=(NARROW_WIDTH_IN, 2.4))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.picture import Grid
+from recon.imaging.sample_motion_correction import describe_sample_motion
 from recon.io.output import pixel_size
 from recon.reconstruction import Reconstruction
 from recon.report.conclusions import conclude_reconstruction
@@ -22,6 +23,7 @@ from recon.report.figures import (
     encode_png,
     highlight_pixels,
     phase_figure,
+    sample_motion_figure,
     shown_image,
     to_rgb,
 )
@@ -73,6 +75,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fi
         Section("Picture", _fill_text(summary), figures=pictures, least="20rem", pixelated=True),
         Section("Phase", _phase_text(result), axis_table(summary), phases, "26rem"),
         Section("Blur", BLUR_TEXT, figures=[blur], least="30rem"),
+        *sample_motion_sections(result),
         phase_slider_section(result),
     ]
     return render(result.name, conclude_reconstruction(summary), sections, summary["notes"], subject)
@@ -175,6 +178,17 @@ def phase_figures(results: Mapping[str, Reconstruction]) -> list[Figure]:
             Figure(uri, f"axis {axis}: phase with ±2 standard deviations, and its error with the bound ±p/m")
         )
     return figures
+
+
+def sample_motion_sections(result: Reconstruction) -> list[Section]:
+    """The motion of the sample that was removed; empty where none was."""
+    motion = result.sample_motion
+    if motion is None or not motion.moving:
+        return []
+    uri = sample_motion_figure(motion.times(result.intensity), motion.shift, motion.sd)
+    figure = Figure(uri, "displacement of the sample with ±2 standard deviations; its mean is not determined")
+    text = describe_sample_motion(motion, result.intensity.sample_rate)
+    return [Section("Motion of the sample", f"{text[0].upper()}{text[1:]}.", figures=[figure], least="26rem")]
 
 
 def blur_figure_of(parts: Mapping[str, Mapping[str, float]], p: float) -> Figure:

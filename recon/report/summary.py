@@ -120,6 +120,20 @@ def intensity_drift_summary(result: Reconstruction) -> list[dict[str, Any] | Non
     ]
 
 
+def sample_motion_summary(result: Reconstruction) -> dict[str, Any] | None:
+    """Motion of the sample; None where it was not asked for or not determined."""
+    motion = result.sample_motion
+    if motion is None:
+        return None
+    return {
+        "moving": motion.moving,
+        "peak_to_peak_px": dict(zip(AXES, np.ptp(motion.shift, axis=0).tolist(), strict=True)),
+        "sd_px": dict(zip(AXES, np.sqrt(np.mean(motion.sd**2, axis=0)).tolist(), strict=True)),
+        "log_likelihood_gain": motion.gain,
+        "bandwidth_hz": 0.5 * result.intensity.sample_rate / motion.length,
+    }
+
+
 def summarise(result: Reconstruction) -> dict[str, Any]:
     """The summary: quantities by axis, and the same grouped by quantity as CONTRACT names them."""
     axes = {axis: axis_summary(result, axis) for axis in AXES}
@@ -143,6 +157,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "outside": result.picture.outside,
         "dropped": result.unlocated_samples,
         "intensity_drift": intensity_drift_summary(result),
+        "sample_motion": sample_motion_summary(result),
         "trouble": [asdict(each) for each in result.defects],
         "affected": float(np.mean(result.affected)),
         "seconds": result.seconds,

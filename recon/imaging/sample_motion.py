@@ -1,0 +1,136 @@
+"""Rigid motion of the sample during a scan, estimated at the crossings of the scan path.
+
+1. At rest: the equations of each block around no motion (``sample_motion_equations``), and the likelihood of a walk
+   over rest (``motion_smoother``). Without a gain of ``MIN_LOG_LIKELIHOOD_GAIN`` nothing is reported.
+2. Coarse: parts of ``SEARCH_PERIODS`` by exhaustive comparison (``sample_motion_search``).
+3. Fine: Gauss-Newton over blocks of one period of the slower axis. Every round maps the samples with the present
+   motion, and smooths the equations of all blocks. Kernels become narrower from round to round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.imaging.motion_smoother import SmoothedMotion, smooth_motion
+from recon.imaging.sample_motion_equations import ScanSamples, block_equations
+from recon.imaging.sample_motion_search import search_motion
+from scanner.arrays import Array
+from scanner.channel import Channel
+
+SEARCH_PERIODS = 12
+"""Periods of the slower axis in a part of the coarse search: fewer visit too little of the picture."""
+
+WIDTHS_PX = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
+"""Kernels that are compared [px]. Below 0.7 the gradient is that of single pixels."""
+
+COARSE_WIDTHS_PX = (4.0, 2.8, 2.0)
+"""Kernels of the first rounds after the search, whose error is up to its cell of two pixels."""
+
+MAX_ROUNDS = 8
+"""Rounds with the narrowest kernel at most; three or four are usual."""
+
+CONVERGED_SD = 0.1
+"""Change of the motion, in its standard deviations, below which the rounds end."""
+
+MIN_LOG_LIKELIHOOD_GAIN = 10.0
+"""Gain of the log likelihood from which a motion is reported. Chance exceeds it with a probability of exp(-10) = 5e-5
+for the two variances of the walk (Wilks 1938)."""
+
+MIN_BLOCKS = 16
+"""Least number of blocks: with fewer the noise of the equations is not known."""
+
+MIN_INFORMATION = 1e-8
+"""Information on a position in a scene without structure [1/px²]: the field is narrower than 10^4 pixels."""
+
+MIN_COMPARED = 0.5
+"""Fraction of the samples that need samples of other blocks within reach of the narrowest kernel, at crossings."""
+
+
+@dataclass(frozen=True)
+class SampleMotion:
+    """Translation of the sample over time; its mean over the recording is 0.
+
+    Attributes:
+        length: samples in a block, a period of the slower axis.
+        shift: x and y at the middle of each block, shape (blocks, 2) [px]; 0 for a sample at rest.
+        sd: of ``shift``, shape (blocks, 2) [px]; for a sample at rest that of the position of a single block.
+        moving: whether a motion was found.
+        gain: of the log likelihood by the motion over rest.
+    """
+
+    length: int
+    shift: Array
+    sd: Array
+    moving: bool
+    gain: float
+
+    def times(self, intensity: Channel) -> Array:
+        """Middle of each block on the clock of the intensity that it was estimated from, shape (blocks,) [s]."""
+        middle = (np.arange(len(self.shift)) + 0.5) * self.length - 0.5
+        return np.asarray(intensity.start + middle / intensity.sample_rate)
+
+
+def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int, int]) -> SampleMotion | None:
+    """Estimate the motion of the sample; None where the scan has too few crossings.
+
+    Args:
+        samples: of the scan.
+        period: of the slower axis [samples].
+        shape: height and width of the picture [px].
+    """
+    length = max(round(period), 4)
+    blocks = samples.x.size // length
+    if blocks < MIN_BLOCKS:
+        return None
+    shift = np.zeros((blocks, 2))
+    width, compared = choose_width(samples, shift, length, shape)
+    if compared < MIN_COMPARED:
+        return None
+    found = block_equations(samples, shift, length, shape, width)
+    smoothed = smooth_motion(found.score, found.information, shift, jumps=False)
+    gain = smoothed.gain
+    if gain < MIN_LOG_LIKELIHOOD_GAIN:
+        of_a_block = smoothed.scale * np.linalg.inv(found.information.mean(axis=0) + MIN_INFORMATION * np.eye(2))
+        sd = np.tile(np.sqrt(np.diag(of_a_block)), (blocks, 1))
+        return SampleMotion(length, shift, sd, False, gain)
+    shift = _coarse_motion(samples, length, blocks, shape)
+    for coarse in COARSE_WIDTHS_PX:
+        smoothed = _round(samples, shift, length, shape, coarse, smoothed.walk)
+        shift = smoothed.position
+    width, _ = choose_width(samples, shift, length, shape)
+    for _ in range(MAX_ROUNDS):
+        smoothed = _round(samples, shift, length, shape, width, smoothed.walk)
+        sd = np.sqrt(np.einsum("bii->bi", smoothed.covariance))
+        change = np.sqrt(np.mean((smoothed.position - shift) ** 2)) / np.sqrt(np.mean(sd**2))
+        shift = smoothed.position
+        if change < CONVERGED_SD:
+            break
+    return SampleMotion(length, shift, sd, True, gain)
+
+
+def choose_width(samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int]) -> tuple[float, float]:
+    """Return the kernel [px] whose picture of the other blocks predicts the samples best.
+
+    The fraction of the samples that the narrowest kernel compares with others is returned too.
+    """
+    found = [block_equations(samples, shift, length, shape, width) for width in WIDTHS_PX]
+    return WIDTHS_PX[int(np.argmin([each.misfit for each in found]))], found[0].compared
+
+
+def _round(
+    samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int], width: float, walk: tuple[int, int]
+) -> SmoothedMotion:
+    """A step of Gauss-Newton, without the mean, which no sample determines."""
+    found = block_equations(samples, shift, length, shape, width)
+    smoothed = smooth_motion(found.score, found.information, shift, walk)
+    return smoothed._replace(position=smoothed.position - smoothed.position.mean(axis=0))
+
+
+def _coarse_motion(samples: ScanSamples, length: int, blocks: int, shape: tuple[int, int]) -> Array:
+    """Translation of each block by the coarse search, linear between the middles of its parts."""
+    parts = max(blocks // SEARCH_PERIODS, 1)
+    coarse = search_motion(samples, SEARCH_PERIODS * length, parts, shape)
+    middle = SEARCH_PERIODS * (np.arange(parts) + 0.5)
+    return np.column_stack([np.interp(np.arange(blocks) + 0.5, middle, each) for each in coarse.T])

@@ -1,0 +1,146 @@
+"""The motion of a sample, found at the crossings of a scan with a known answer."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from phantoms.optics import sample_scene
+from recon.cli import main
+from recon.imaging.motion_smoother import smooth_motion
+from recon.imaging.sample_motion import MIN_LOG_LIKELIHOOD_GAIN, estimate_sample_motion
+from recon.imaging.sample_motion_correction import describe_sample_motion
+from recon.imaging.sample_motion_equations import ScanSamples, block_equations
+from tests.support.simulated import imaging
+
+RATE, PIXELS = 1.5e6, 96
+FREQUENCIES = 6700.0, 5450.0
+PERIOD = RATE / FREQUENCIES[1]
+BLOCKS = 160
+
+
+def scene() -> np.ndarray:
+    """Detail of a few pixels with a standard deviation of a fifth of the mean."""
+    noise = np.random.default_rng(0).standard_normal((PIXELS + 64, PIXELS + 64))
+    detail = cv2.GaussianBlur(noise, (0, 0), 2.5)
+    return np.asarray(1.0 + 0.2 * detail / detail.std())
+
+
+def scan(displacement: np.ndarray, photons: float = 300.0, blocks: int = BLOCKS) -> ScanSamples:
+    """A scan of a sample whose displacement [px] is given at equal times."""
+    time = np.arange(round(blocks * PERIOD)) / RATE
+    x, y = (0.5 * PIXELS * (1.0 + np.sin(2.0 * np.pi * f * time + f)) for f in FREQUENCIES)
+    at = np.linspace(0.0, len(displacement) - 1.0, time.size)
+    u, v = (np.interp(at, np.arange(len(displacement)), each) for each in displacement.T)
+    picture = scene()
+    half = 0.5 * len(picture)
+    light = sample_scene(picture, x - u - 0.5 * PIXELS, y - v - 0.5 * PIXELS, half, half)
+    counts = np.random.default_rng(1).poisson(photons * np.maximum(light, 0.0))
+    return ScanSamples(*(each.astype(np.float32) for each in (x, y, counts)))
+
+
+def error_of(found: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Error at the middle of each block, without its mean."""
+    at = (np.arange(len(found)) + 0.5) / BLOCKS * (len(displacement) - 1)
+    true = np.column_stack([np.interp(at, np.arange(len(displacement)), each) for each in displacement.T])
+    error = found - true
+    return np.asarray(error - np.median(error, axis=0))
+
+
+def test_a_sample_at_rest_is_reported_at_rest() -> None:
+    found = estimate_sample_motion(scan(np.zeros((2, 2))), PERIOD, (PIXELS, PIXELS))
+    assert found is not None
+    assert not found.moving
+    assert found.gain < 0.5 * MIN_LOG_LIKELIHOOD_GAIN
+    assert not found.shift.any()
+    assert "none was found" in describe_sample_motion(found, RATE)
+
+
+def test_a_breathing_sample_is_followed_within_its_standard_deviation() -> None:
+    phase = np.linspace(0.0, 2.0 * np.pi, 500)
+    displacement = np.column_stack([5.0 * np.sin(phase), 2.0 * np.cos(phase)])
+    found = estimate_sample_motion(scan(displacement), PERIOD, (PIXELS, PIXELS))
+    assert found is not None
+    assert found.moving
+    error = error_of(found.shift, displacement)
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert np.mean(np.abs(error) < 1.96 * found.sd) > 0.85
+
+
+def test_a_jump_is_found_between_two_blocks() -> None:
+    displacement = np.zeros((2001, 2))
+    displacement[900:] = 6.0, -3.0
+    found = estimate_sample_motion(scan(displacement), PERIOD, (PIXELS, PIXELS))
+    assert found is not None
+    error = np.abs(error_of(found.shift, displacement)).max(axis=1)
+    assert np.count_nonzero(error > 0.3) <= 2
+
+
+def test_a_phase_error_is_no_motion() -> None:
+    """It displaces forward and backward half-periods in opposite directions."""
+    samples = scan(np.zeros((2, 2)))
+    late = ScanSamples(np.roll(samples.x, 1), samples.y, samples.value)
+    found = estimate_sample_motion(late, PERIOD, (PIXELS, PIXELS))
+    assert found is not None
+    assert not found.moving
+
+
+def test_the_equations_show_a_known_translation() -> None:
+    samples = scan(np.zeros((2, 2)))
+    shift = np.zeros((BLOCKS, 2))
+    shift[50] = 0.5, -0.3
+    equations = block_equations(samples, shift, round(PERIOD), (PIXELS, PIXELS), 1.0)
+    found = np.linalg.solve(equations.information[50], equations.score[50])
+    sd = np.sqrt(np.diag(np.linalg.inv(equations.information[50])))
+    assert np.abs(found - (-0.5, 0.3)) == pytest.approx(0.0, abs=4.0 * sd.max())
+    assert sd.max() < 0.15
+
+
+def test_white_noise_of_the_position_is_smoothed_to_rest() -> None:
+    rng = np.random.default_rng(2)
+    information = np.tile(np.diag([50.0, 20.0]), (400, 1, 1))
+    score = rng.standard_normal((400, 2)) * np.sqrt([50.0, 20.0])
+    smoothed = smooth_motion(score, information, np.zeros((400, 2)))
+    assert smoothed.gain < 4.0
+    assert np.abs(smoothed.position).max() < 0.1
+    assert not smoothed.jumps
+
+
+def test_a_scene_without_structure_and_a_scan_without_crossings_are_stated() -> None:
+    samples = scan(np.zeros((2, 2)))
+    flat = samples._replace(value=np.random.default_rng(3).poisson(20.0, samples.value.size).astype(np.float32))
+    found = estimate_sample_motion(flat, PERIOD, (PIXELS, PIXELS))
+    assert found is not None
+    assert not found.moving
+    assert "too little structure" in describe_sample_motion(found, RATE)
+    line = (0.5 + 4.0 * (np.arange(samples.x.size) // 1800)).astype(np.float32)
+    raster = ScanSamples(samples.x, line, samples.value)
+    assert estimate_sample_motion(raster, 1800.0, (PIXELS, PIXELS)) is None
+    assert "too rarely" in describe_sample_motion(None, RATE)
+
+
+@pytest.mark.slow
+def test_the_command_removes_a_motion_and_states_it(tmp_path: Path) -> None:
+    recording, truth = imaging()
+    intensity, view = recording["intensity"], recording.device.require_scan()
+    drift = np.linspace(0.0, 0.02, intensity.size) * view.half_angle_x
+    light = sample_scene(
+        np.asarray(truth["scene"], float),
+        np.asarray(truth["angle_x"][0], float) - drift,  # type: ignore[index]
+        np.asarray(truth["angle_y"][0], float),  # type: ignore[index]
+        *view.mechanical_half_angles,
+    )
+    noise = 0.03 * np.random.default_rng(0).standard_normal(light.size)
+    recording.with_channel(replace(intensity, raw=light + noise)).write(tmp_path / "scan.h5")
+    out = tmp_path / "out"
+    assert main(["reconstruct", str(tmp_path / "scan.h5"), "-o", str(out), "--sample-motion"]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["sample_motion"]["moving"]
+    assert summary["sample_motion"]["peak_to_peak_px"]["x"] == pytest.approx(4.0, abs=0.5)
+    rows = list(csv.DictReader((out / "sample_motion.csv").open()))
+    assert abs(float(rows[-1]["x_px"]) - float(rows[0]["x_px"])) == pytest.approx(4.0, abs=0.5)
+    assert "Motion of the sample" in (out / "report.html").read_text()
