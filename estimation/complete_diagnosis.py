@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from estimation.diagnosis.diagnose import Diagnosis, Finding, diagnose, nominal_device
 from estimation.diagnosis.selection import Progress
 from estimation.slow.diagnose import diagnose_decays, slow_decays
+from estimation.slow.diagnose_response import diagnose_responses
+from estimation.slow.response import frequency_responses
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -70,6 +72,13 @@ def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress:
     pictures = any("intensity" in recording for recording in recordings)
     if pictures and not any(axis.mechanics for axis in nominal.axes.values()):
         return Diagnosis("consistent", (), None, nominal, None)
+    responses = [frequency_responses(recording, nominal) for recording in recordings]
+    if any(responses):
+        if len(recordings) > 1:
+            hint = "diagnose frequency responses one at a time"
+            raise BadInput("a frequency response takes one recording", file=recordings[0].path, hint=hint)
+        progress("frequency response")
+        return diagnose_responses(responses[0], nominal)
     decays = [slow_decays(recording, nominal) for recording in recordings]
     if any(decays):
         if not all(decays):

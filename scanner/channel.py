@@ -54,6 +54,9 @@ CONVERSIONS = {
 AMPLITUDE_CHANNELS = ("amplitude_x", "amplitude_y")
 """Amplitudes of a lock-in amplifier or an envelope detector: an angle, or a voltage behind the device's readout."""
 
+PHASE_CHANNELS = ("phase_x", "phase_y")
+"""Phases of a lock-in amplifier, which belong to the amplitudes."""
+
 DBM_LEVEL_V = float(np.sqrt(2.0 * 50.0 * 1e-3))
 """Amplitude of a sine of 1 mW in 50 ohm [V]: 0 dBm as spectrum analysers and lock-in amplifiers state it."""
 

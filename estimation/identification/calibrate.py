@@ -19,6 +19,8 @@ from estimation.identification.fits import (
     fit_ringdown,
 )
 from estimation.reference import drive_reference
+from estimation.slow.response import Response, frequency_responses
+from estimation.slow.response_selection import select_effects
 from scanner.arrays import Array
 from scanner.channel import check_signal
 from scanner.clock import on_clock
@@ -94,7 +96,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         if result.values:
             axes[name], values[name], used[name] = result.device_axis(), result.marginal(), result.used
     if not values:
-        what = "no recording shows a rest, a free decay or a driven motion with a reference angle"
+        what = "no recording shows a rest, a free decay, steady tones or a driven motion with a reference angle"
         names = ", ".join(sorted({name for recording in recordings for name in recording.channels}))
         hint = f"record angle_x together with sense_x; the recording contains {names or 'nothing'}"
         raise BadInput(what, file=recordings[0].path if recordings else None, hint=hint)
@@ -115,6 +117,12 @@ class _AxisIdentification:
 
     def add(self, recording: Recording) -> None:
         """Use one recording, if it shows this axis."""
+        responses = frequency_responses(recording, Device("", {self.name: self.axis}))
+        if responses:
+            self.used.append(f"{recording.name}: frequency response")
+            self.values = combine_values([self.values, fit_steady_tones(responses[0])])
+            self.notes.append(f"{self.name}: J is the nominal one; steady tones determine only k/J and b/J")
+            return
         kind = classify_recording(recording, self.name)
         if kind is None:
             return
@@ -241,6 +249,18 @@ def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, 
         mean = float(np.average([each.value for each in same], weights=weights))
         values[key] = IdentifiedValue(mean, float(weights.sum() ** -0.5) if len(same) > 1 else same[0].sd)
     return values
+
+
+def fit_steady_tones(response: Response) -> dict[str, IdentifiedValue]:
+    """k/J and b/J from the first mode of a frequency response."""
+    fit = select_effects(response)
+    (frequency, quality), (frequency_sd, quality_sd) = fit.modes[0], fit.mode_sd[0]
+    rate, floor = 2.0 * np.pi * float(frequency), np.finfo(float).tiny
+    relative = float(np.hypot(frequency_sd / frequency, quality_sd / quality))
+    return {
+        "k_over_J": IdentifiedValue(rate**2, max(2.0 * rate**2 * float(frequency_sd / frequency), floor)),
+        "b_over_J": IdentifiedValue(rate / float(quality), max(rate / float(quality) * relative, floor)),
+    }
 
 
 def mechanics_from_decays(axis: Axis, decays: Sequence[Decay]) -> dict[str, IdentifiedValue]:

@@ -127,11 +127,12 @@ def _format_diagnosis(summary: dict[str, Any]) -> str:
 
     lines = [conclude_diagnosis(summary), f"{summary['output']}: {summary['verdict']}"]
     for finding in summary["findings"]:
-        chi2 = finding["heldout"]
+        heldout = finding["heldout"]
         lines.append(
             f"  {finding['axis']} {finding['stage']}: {finding['effect']} (probability "
             f"{format_probability(finding['probability'])}), "
-            f"held-out chi-square {chi2['before']:.3g} -> {chi2['after']:.3g}"
+            f"held-out {'chi-square' if 'chi-square' in heldout['metric'] else 'error'} "
+            f"{heldout['before']:.3g} -> {heldout['after']:.3g}"
         )
         lines += [
             f"    {p['name']} = {format_interval(p['value'], p['ci95'][0], p['ci95'][1], p['unit'])}"

@@ -6,7 +6,7 @@ A mapping (TOML) states for each channel the variable, its unit and its clock; i
     name = "afm-spiral"
 
     [channels.sense_x]
-    variable = "x"                  # or a list: the detectors of an intensity
+    variable = "x"                  # or a list: detectors of an intensity; in-phase and quadrature of a lock-in
     unit = "V"                      # after scaling
     sample_rate = 20000.0           # Hz; or time = "t", the variable that holds the times [s]
     start = 0.0                     # s
@@ -33,7 +33,8 @@ import numpy as np
 from recon.io.readers import read
 from recon.io.readers.column_names import TIME_UNITS, split_label
 from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock, matrix_row
-from scanner.channel import Channel, LazySamples, make_channel
+from scanner.arrays import Array
+from scanner.channel import AMPLITUDE_CHANNELS, PHASE_CHANNELS, Channel, LazySamples, make_channel
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput
@@ -199,6 +200,8 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
         found.append(contents.variables[variable_name])
     variables, times = found[: len(names)], found[len(names) :]
     variable = variables[0] if len(variables) == 1 else join_columns(variables, names, bad)
+    if len(variables) > 1 and name in (*AMPLITUDE_CHANNELS, *PHASE_CHANNELS):
+        variable = _from_quadratures(variable, name in PHASE_CHANNELS, bad)
     scaled = "scale" in spec or "offset" in spec
     scale, offset = _number(spec.get("scale", 1.0)), _number(spec.get("offset", 0.0))
     if not scale or offset is None:
@@ -225,6 +228,20 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
     return make_channel(
         name, raw, unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file, **lock_in
     )
+
+
+def _from_quadratures(variable: Variable, wants_phase: bool, bad: Callable[[str, str], BadInput]) -> Variable:
+    """Phase [rad] or amplitude from the in-phase and the quadrature part, the two columns of a variable."""
+    if variable.raw.shape[-1] != 2:
+        raise bad("variable lists other than two names", 'write variable = ["in-phase", "quadrature"]')
+
+    def fetch(low: int, stop: int) -> Array:
+        real, imaginary = np.asarray(variable.raw[low:stop], float).T
+        return np.arctan2(imaginary, real) if wants_phase else np.hypot(real, imaginary)
+
+    samples = LazySamples((variable.raw.shape[0],), np.dtype(float), fetch)
+    unit = "rad" if wants_phase else variable.unit
+    return Variable(samples, unit, variable.sample_rate, variable.start, variable.note)
 
 
 def _edges(name: str, spec: Any, contents: Contents, source: Path, plan_source: object) -> Edges:

@@ -92,9 +92,10 @@ def read_csv(path: Path) -> Contents:
         if first is None:
             raise BadInput("holds no table of numbers", file=path, hint="name its format in the mapping")
         separator, decimal = _marks(head[first])
+        head = [_single_blanks(line, separator) for line in head]
         above = [split_fields(line.lstrip("#"), separator) for line in head[:first]]
         layout = _layout(path, above, head[first], separator)
-    rows = islice(read_lines(path), layout.first, None)
+    rows = (_single_blanks(line, separator) for line in islice(read_lines(path), layout.first, None))
     table = map_blocks(parse_number_blocks(rows, path, separator, layout.columns, layout.first + 1, decimal), path)
     return Contents(layout.kind, _variables(layout, table), layout.about)
 
@@ -129,7 +130,12 @@ def _marks(line: str) -> tuple[str, str]:
     for separator in ("\t", ";"):
         if separator in line:
             return separator, "," if "," in line else "."
-    return ",", "."
+    return (" " if "," not in line and len(line.split()) > 1 else ","), "."
+
+
+def _single_blanks(line: str, separator: str) -> str:
+    """The line without repeated blanks where blanks separate its fields."""
+    return " ".join(line.split()) if separator == " " else line
 
 
 def _fields(line: str) -> list[str]:

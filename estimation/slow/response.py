@@ -1,0 +1,316 @@
+"""Frequency response of one axis as a list of steady tones, and its fit by harmonic balance.
+
+The angle A sin(2 pi f t + phase) at every tone is a complex number z. With w = 2 pi f, the linear device and the laws
+that depend on amplitude give
+
+    z = sum_m R_m / (w_m^2 - w^2 + i w w_m / Q_m + sum_l c_l phi_l(w, A)) + feedthrough,
+
+where phi_l is the describing function of a law, A the measured amplitude over the largest one, and R_m complex
+residues: gain and phase of drive and lock-in amplifier are not known. Residues and feedthrough are eliminated.
+
+Sources: Ewins, Modal Testing (Research Studies Press 2000), section 4.3 (residues of modes); Golub and Pereyra, SIAM J.
+Numer. Anal. 10 (1973) 413 (elimination); Nayfeh and Mook, Nonlinear Oscillations (Wiley 1979), section 4.1 (harmonic
+balance).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.lock_in_channels import lock_in_amplitude
+from scanner.arrays import Array
+from scanner.device import Device
+from scanner.errors import BadInput
+from scanner.recording import Recording
+
+Complex = NDArray[np.complexfloating[Any, Any]]
+
+MIN_TONES = 10
+"""Tones that are needed: a fit has up to ten parameters and a tone has two numbers, and some tones are held out."""
+
+HELD_OUT_EVERY = 4
+"""One tone in so many is held out, the first and the last are not."""
+
+MODEL_ERROR = 1e-3
+"""Error of the response, relative to its rms, that is expected of every model: the accuracy of a lock-in amplifier."""
+
+MAX_QUALITY = 1e6
+"""Largest quality factor of a fitted mode."""
+
+SECOND_MODE_SHIFTS = (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)
+"""Starts of the second mode's frequency relative to the largest peak, in widths of that peak."""
+
+START_LAW = 0.1
+"""Start of a law's shift of frequency or of its damping, in widths of the peak."""
+
+SECOND_MODE, FEEDTHROUGH = "second-mode", "feedthrough"
+
+AMPLITUDE_LAWS: Mapping[str, Callable[[Array, Array], Complex]] = {
+    "cubic-stiffness": lambda w, a: 0.75 * a**2 + 0j,
+    "cubic-damping": lambda w, a: 0.25j * w * a**2,
+    "quadratic-drag": lambda w, a: 8.0j / (3.0 * np.pi) * w**2 * a,
+    "coulomb-friction": lambda w, a: 4.0j / np.pi / a + 0.0 * w,
+}
+"""Describing function phi(w, A) of a law whose torque over J is c theta^3, c theta^2 theta', c |theta'| theta' or
+c sign(theta')."""
+
+EFFECTS = (SECOND_MODE, FEEDTHROUGH, *AMPLITUDE_LAWS)
+"""Effects that a frequency response may show. A law of amplitude is not combined with a second mode: the amplitudes of
+the modes differ from that of the angle."""
+
+SUBSETS = tuple(
+    (*of_motion, *readout)
+    for of_motion in ((), (SECOND_MODE,), *combinations(AMPLITUDE_LAWS, 1), *combinations(AMPLITUDE_LAWS, 2))
+    for readout in ((), (FEEDTHROUGH,))
+)
+"""Combinations of effects that are compared."""
+
+
+class Response(NamedTuple):
+    """Frequency response of one axis.
+
+    Attributes:
+        name: of the axis.
+        frequency: of the tones [Hz], ascending, shape (n,).
+        values: complex amplitude, shape (n,), in rad or in another unit.
+        in_rad: whether it is in rad.
+        scale: unit of the channel over the unit of ``values``.
+    """
+
+    name: str
+    frequency: Array
+    values: Complex
+    in_rad: bool
+    scale: float
+
+    @property
+    def held_out(self) -> NDArray[np.bool_]:
+        """Tones that are held out, shape (n,)."""
+        index = np.arange(self.frequency.size)
+        return np.asarray((index % HELD_OUT_EVERY == HELD_OUT_EVERY // 2) & (index < self.frequency.size - 1))
+
+    @property
+    def largest(self) -> float:
+        """Largest amplitude."""
+        return float(np.abs(self.values).max())
+
+
+@dataclass(frozen=True)
+class ResponseFit:
+    """Modes and laws fitted to a response.
+
+    Attributes:
+        effects: beside the first mode.
+        modes: frequency [Hz] and quality factor of every mode, that of the largest peak first, shape (modes, 2).
+        feedthrough: a constant of the response, 0 where it is not fitted.
+        laws: by effect its coefficient c with its standard deviation, for amplitudes relative to the largest.
+        mode_sd: standard deviations of ``modes``.
+        score: N ln(misfit) + (parameters) ln N + 2 ln(number of subsets of that size).
+        predicted: the response at all tones, shape (n,).
+    """
+
+    effects: tuple[str, ...]
+    modes: Array
+    feedthrough: complex
+    laws: Mapping[str, tuple[float, float]]
+    mode_sd: Array
+    score: float
+    predicted: Complex
+
+
+def frequency_responses(recording: Recording, device: Device) -> list[Response]:
+    """The axes of a recording whose amplitude and phase were taken at steady tones, whose frequencies a channel holds.
+
+    Raises:
+        BadInput: too few tones, or channels of different lengths.
+    """
+    found = []
+    for name, axis in device.axes.items():
+        key, phase_key = f"amplitude_{name}", f"phase_{name}"
+        if key not in recording or phase_key not in recording:
+            continue
+        reference = recording[phase_key].reference or recording[key].reference
+        if not isinstance(reference, str):
+            continue
+        held = recording.require(reference, f"it is the reference of {phase_key}")
+        _, amplitude, in_rad = lock_in_amplitude(recording, axis)
+        phase, frequency = recording[phase_key].read(), held.read()
+        if not amplitude.size == phase.size == frequency.size:
+            hint = "state one amplitude, phase and frequency for every tone"
+            raise BadInput("differs from its phase or its frequency in length", channel=key, hint=hint)
+        order = np.argsort(frequency)
+        good = order[np.isfinite(amplitude[order]) & np.isfinite(phase[order]) & (amplitude[order] > 0.0)]
+        if np.unique(frequency[good]).size < MIN_TONES:
+            what = f"holds {np.unique(frequency[good]).size} steady tones, {MIN_TONES} are needed"
+            raise BadInput(what, channel=key, hint="measure tones on both sides of the resonance")
+        scale = float(np.abs(recording[key].read()).max() / amplitude[good].max())
+        found.append(Response(name, frequency[good], amplitude[good] * np.exp(1j * phase[good]), in_rad, scale))
+    return found
+
+
+class _Model(NamedTuple):
+    """Response by its nonlinear parameters: relative frequency shift and ln Q of every fitted mode, then the laws.
+
+    Attributes:
+        response: of one axis, or the first of several.
+        values: complex amplitudes of the axes that have these modes, shape (n, axes).
+        effects: of ``EFFECTS``.
+        center: frequency of the largest amplitude [Hz].
+        nominal: frequency [Hz] and quality factor of the first mode if they are not fitted.
+    """
+
+    response: Response
+    values: Complex
+    effects: tuple[str, ...]
+    center: float
+    nominal: tuple[float, float] | None
+
+    @property
+    def laws(self) -> list[str]:
+        return [effect for effect in self.effects if effect in AMPLITUDE_LAWS]
+
+    @property
+    def modes(self) -> int:
+        """Number of modes."""
+        return 1 + (SECOND_MODE in self.effects)
+
+    @property
+    def fitted_modes(self) -> int:
+        return self.modes - (self.nominal is not None)
+
+    def shapes(self) -> list[Complex]:
+        """Describing functions of the laws over w_center^2, each with a largest magnitude of 1."""
+        w, size = 2.0 * np.pi * self.response.frequency, np.abs(self.response.values) / self.response.largest
+        made = [AMPLITUDE_LAWS[law](w, size) for law in self.laws]
+        return [each / np.abs(each).max() for each in made]
+
+    def law_scales(self) -> list[float]:
+        """Coefficient c of every law over its parameter."""
+        w, size = 2.0 * np.pi * self.response.frequency, np.abs(self.response.values) / self.response.largest
+        return [float((2 * np.pi * self.center) ** 2 / np.abs(AMPLITUDE_LAWS[law](w, size)).max()) for law in self.laws]
+
+    def mode_values(self, x: Array) -> Array:
+        """Frequency [Hz] and quality factor of every mode, shape (modes, 2)."""
+        pairs = x[: 2 * self.fitted_modes].reshape(-1, 2)
+        fitted = np.column_stack([self.center * (1.0 + pairs[:, 0]), np.exp(pairs[:, 1])])
+        return fitted if self.nominal is None else np.vstack([self.nominal, fitted])
+
+    def solve(self, x: Array) -> tuple[Complex, Complex]:
+        """Heights of the modes and the feedthrough, by linear least squares, and the response at all tones.
+
+        Returns:
+            Shapes (modes, or one more, axes) and (n, axes).
+        """
+        w, used = 2.0 * np.pi * self.response.frequency, ~self.response.held_out
+        added = np.zeros(w.size, complex)
+        for value, shape in zip(x[2 * self.fitted_modes :], self.shapes(), strict=True):
+            added += value * (2.0 * np.pi * self.center) ** 2 * shape
+        columns = []
+        for f0, quality in self.mode_values(x):
+            w0 = 2.0 * np.pi * f0
+            columns.append(w0**2 / quality / (w0**2 - w**2 + 1j * w0 * w / quality + added))
+        if FEEDTHROUGH in self.effects:
+            columns.append(np.ones(w.size, complex))
+        table = np.array(columns).T
+        heights = np.linalg.lstsq(table[used], self.values[used], rcond=None)[0]
+        return heights, table @ heights
+
+    def residual(self, x: Array) -> Array:
+        """Error at the fitted tones over the rms of each response, shape (2 tones axes,)."""
+        used = ~self.response.held_out
+        error = (self.values - self.solve(x)[1])[used] / np.sqrt(np.mean(np.abs(self.values) ** 2, axis=0))
+        return np.concatenate([error.real, error.imag]).T.ravel()
+
+
+def fit_response(
+    response: Response, effects: tuple[str, ...], nominal: tuple[float, float] | None = None
+) -> ResponseFit:
+    """Fit a response with some effects to the tones that are not held out.
+
+    Args:
+        response: of one axis.
+        effects: of ``EFFECTS``.
+        nominal: frequency [Hz] and quality factor of the first mode if they are not fitted.
+    """
+    return _fit(response, response.values[:, None], effects, nominal)[1][0]
+
+
+def fit_common_modes(responses: Sequence[Response], effects: tuple[str, ...]) -> tuple[float, list[ResponseFit]]:
+    """Fit responses at the same tones with common modes; the score of all, and the fit of each.
+
+    Args:
+        responses: of several axes.
+        effects: of ``EFFECTS`` without laws of amplitude.
+    """
+    values = np.column_stack([response.values for response in responses])
+    return _fit(responses[0], values, effects, None)
+
+
+def _fit(
+    response: Response, values: Complex, effects: tuple[str, ...], nominal: tuple[float, float] | None
+) -> tuple[float, list[ResponseFit]]:
+    power = np.sum(np.abs(values) ** 2 / np.mean(np.abs(values) ** 2, axis=0), axis=1)
+    model = _Model(response, values, effects, float(response.frequency[np.argmax(power)]), nominal)
+    x, jacobian = _minimise(model)
+    heights, predicted = model.solve(x)
+    squares = np.sum(model.residual(x).reshape(values.shape[1], -1) ** 2, axis=1)
+    n = 2 * int((~response.held_out).sum())
+    free = x.size + 2 * heights.size
+    variance = float(squares.sum()) / max(n * squares.size - free, 1) + MODEL_ERROR**2
+    sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance, 0.0))
+    modes, count = model.mode_values(x), 2 * model.fitted_modes
+    mode_sd = np.zeros_like(modes)
+    mode_sd[model.modes - model.fitted_modes :] = sd[:count].reshape(-1, 2)
+    mode_sd *= np.column_stack([np.full(model.modes, model.center), modes[:, 1]])
+    coefficients = zip(model.laws, x[count:], sd[count:], model.law_scales(), strict=True)
+    laws = {law: (float(value * scale), float(spread * scale)) for law, value, spread, scale in coefficients}
+    price = 2.0 * float(np.log(comb(len(EFFECTS), len(effects)))) + free * float(np.log(n * squares.size))
+    score = n * float(np.sum(np.log(squares / n + MODEL_ERROR**2))) + price
+    fits = []
+    for i in range(values.shape[1]):
+        order = np.argsort(-np.abs(heights[: model.modes, i]))
+        feedthrough = complex(heights[-1, i]) if FEEDTHROUGH in effects else 0j
+        fits.append(ResponseFit(effects, modes[order], feedthrough, laws, mode_sd[order], score, predicted[:, i]))
+    return score, fits
+
+
+def _minimise(model: _Model) -> tuple[Array, Array]:
+    """The parameters of the least misfit from several starts, and the Jacobian of the residual there."""
+    from scipy.optimize import least_squares
+
+    width = _half_width(model.response.frequency, np.linalg.norm(model.values, axis=1)) / model.center
+    log_quality, count = float(np.log(0.5 / width)), model.fitted_modes
+    if not count + len(model.laws):
+        return np.empty(0), np.empty((1, 0))
+    signed = [law == "cubic-stiffness" for law in model.laws]
+    begins = [
+        np.array(
+            [*np.ravel([(0.0, log_quality), (shift * width, log_quality)][model.modes - count : model.modes])]
+            + [START_LAW * width * (sign if each else 1) for each in signed]
+        )
+        for shift in (SECOND_MODE_SHIFTS if model.modes == 2 else (0.0,))
+        for sign in ((-1, 1) if any(signed) else (1,))
+    ]
+    low = np.array([*([-0.5, 0.0] * count), *(-0.5 if each else 0.0 for each in signed)])
+    high = np.array([*([0.5, np.log(MAX_QUALITY)] * count), *([0.5] * len(signed))])
+    scale = np.array([*([width, 1.0] * count), *([START_LAW * width] * len(signed))])
+    fits = [least_squares(model.residual, begin, bounds=(low, high), x_scale=scale) for begin in begins]
+    best = min(fits, key=lambda fit: fit.cost)
+    return np.asarray(best.x), np.asarray(best.jac)
+
+
+def _half_width(frequency: Array, size: Array) -> float:
+    """Distance [Hz] between the tones around the peak at which the power is half of it, at least that of two tones."""
+    top = int(np.argmax(size))
+    below = size < size[top] / np.sqrt(2.0)
+    left, right = np.flatnonzero(below[:top]), np.flatnonzero(below[top:])
+    low = frequency[left[-1]] if left.size else frequency[0]
+    high = frequency[top + right[0]] if right.size else frequency[-1]
+    return float(high - low)

@@ -1,0 +1,70 @@
+"""Selection of the effects that a frequency response shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from estimation.diagnosis.open_loop import OpenLoop, is_worse
+from estimation.slow.response import (
+    FEEDTHROUGH,
+    SECOND_MODE,
+    SUBSETS,
+    Response,
+    ResponseFit,
+    fit_common_modes,
+    fit_response,
+)
+
+MIN_SCORE_GAIN = 12.0
+"""Gain of the score over a single linear mode from which effects are claimed: odds of 400 to 1."""
+
+
+def fit_subsets(response: Response) -> dict[tuple[str, ...], ResponseFit]:
+    """A fit of every combination of effects."""
+    return {effects: fit_response(response, effects) for effects in SUBSETS}
+
+
+def select_effects(response: Response, table: Mapping[tuple[str, ...], ResponseFit] | None = None) -> ResponseFit:
+    """The fit of the lowest score, without effects that predict worse than the same fit without them.
+
+    Args:
+        response: of one axis.
+        table: fits of all combinations; None computes them.
+    """
+    table = table or fit_subsets(response)
+    best = min(table.values(), key=lambda fit: fit.score)
+    if table[()].score - best.score < MIN_SCORE_GAIN:
+        return table[()]
+    for effect in best.effects:
+        without = table[tuple(each for each in best.effects if each != effect)]
+        if predicts_worse(prediction_error(response, without), prediction_error(response, best)):
+            return without
+    return best
+
+
+def with_common_modes(responses: Sequence[Response], selected: list[ResponseFit]) -> list[ResponseFit]:
+    """The fits with two modes that all axes have in common, unless those of single axes have a clearly lower score.
+
+    Modes belong to the structure. A single axis determines a weak mode less well than all of them.
+    """
+    same = all(np.array_equal(response.frequency, responses[0].frequency) for response in responses)
+    if len(responses) < 2 or not same or not any(SECOND_MODE in fit.effects for fit in selected):
+        return selected
+    variants = [fit_common_modes(responses, (SECOND_MODE, *more)) for more in ((), (FEEDTHROUGH,))]
+    score, fits = min(variants, key=lambda variant: variant[0])
+    return fits if score < sum(fit.score for fit in selected) + MIN_SCORE_GAIN else selected
+
+
+def prediction_error(response: Response, fit: ResponseFit) -> OpenLoop:
+    """Error of a fit on the tones that are held out, in the unit of the response."""
+    rows = response.held_out
+    squares = np.abs(response.values - fit.predicted)[rows] ** 2
+    rms = float(np.sqrt(squares.mean()))
+    sd = float(squares.std() / np.sqrt(max(squares.size - 1, 1))) / max(2.0 * rms, 1e-300)
+    return OpenLoop(rms, float(np.sqrt(np.mean(np.abs(response.values[rows]) ** 2))), sd)
+
+
+def predicts_worse(before: OpenLoop, after: OpenLoop) -> bool:
+    return is_worse({"response": before}, {"response": after})

@@ -1,0 +1,114 @@
+"""Frequency responses as lists of steady tones: simulated effects, the measured fibre scanner, wrong input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.diagnosis.diagnose import Diagnosis
+from estimation.identification.calibrate import identify
+from recon.io.convert import convert
+from scanner.arrays import Array
+from scanner.device import Axis, Device
+from scanner.errors import BadInput
+from scanner.recording import Recording
+from scanner.stages import Mechanics, Position
+
+F0, Q = 800.0, 300.0
+W0 = 2 * np.pi * F0
+AXIS = Axis(Mechanics(2.0, 2.0 * W0 / Q, 2.0 * W0**2), readout=Position(10.0, 1e-4), name="x")
+FREQUENCY = np.linspace(795.0, 805.0, 25)
+
+
+def recording(angle: Array, frequency: Array = FREQUENCY, f0: float = F0) -> Recording:
+    w = 2 * np.pi * f0
+    axis = Axis(Mechanics(2.0, 2.0 * w / Q, 2.0 * w**2), readout=Position(10.0, 1e-4), name="x")
+    rng = np.random.default_rng(1)
+    angle = angle + 5e-5 * (rng.normal(size=angle.size) + 1j * rng.normal(size=angle.size))
+    extra = {"reference": "frequency"}
+    channels = {
+        "frequency": (frequency, "Hz", 1.0),
+        "amplitude_x": (np.abs(angle), "rad", 1.0, 0.0, extra),
+        "phase_x": (np.angle(angle), "rad", 1.0, 0.0, extra),
+    }
+    return Recording.from_arrays(channels, Device("lever", {"x": axis}))
+
+
+def mode(f0: float, quality: float, height: float, detuning: Array | float = 0.0) -> Array:
+    r = FREQUENCY / f0
+    return np.asarray(height / quality / (1 - r**2 + 1j * r / quality + detuning))
+
+
+def names(diagnosis: Diagnosis) -> list[str]:
+    return [finding.effect for finding in diagnosis.findings]
+
+
+def test_a_linear_response_is_consistent_and_corrects_resonance_and_damping() -> None:
+    found = diagnose_with_optics([recording(mode(F0, Q, 0.1), f0=800.5)])
+    assert (found.verdict, names(found)) == ("consistent", [])
+    assert found.device.axes["x"].resonance == pytest.approx(F0, abs=0.01)
+    loop = found.open_loop["amplitude_x"]
+    assert loop["improved"]["fraction"] < 0.1 * loop["nominal"]["fraction"]
+
+
+def test_two_modes_are_found_with_their_frequencies() -> None:
+    found = diagnose_with_optics([recording(mode(F0, Q, 0.1) + mode(801.5, 400.0, 0.03j))])
+    assert names(found) == ["second-mode"]
+    values = {each.name: each for each in found.findings[0].parameters}
+    assert values["f2"].value == pytest.approx(801.5, abs=0.05)
+    assert values["f2"].ci95[0] < 801.5 < values["f2"].ci95[1]
+    assert "drive each axis alone" in str(found.findings[0].advice)
+
+
+@pytest.mark.parametrize("k3", [1e7, -1e7])
+def test_a_cubic_spring_is_found_with_its_size(k3: float) -> None:
+    amplitude = np.full(FREQUENCY.size, 1e-3)
+    for _ in range(400):  # harmonic balance, by a damped fixed point
+        shift = 0.75 * k3 * amplitude**2 / (2.0 * W0**2)
+        amplitude = 0.9 * amplitude + 0.1 * np.abs(mode(F0, Q, 0.1, shift))
+    found = diagnose_with_optics([recording(mode(F0, Q, 0.1, 0.75 * k3 * amplitude**2 / (2.0 * W0**2)))])
+    assert names(found) == ["cubic-stiffness"]
+    assert found.findings[0].parameters[0].value == pytest.approx(k3, rel=0.05)
+    assert found.device.axes["x"].terms["cubic-stiffness"]["k3"] == pytest.approx(k3, rel=0.05)
+
+
+def test_feedthrough_is_found() -> None:
+    assert names(diagnose_with_optics([recording(mode(F0, Q, 0.1) + 0.01j)])) == ["feedthrough"]
+
+
+def test_identify_takes_steady_tones() -> None:
+    made = recording(mode(801.0, 250.0, 0.1))
+    assert made.device is not None
+    found = identify([made], made.device)
+    assert found.values["x"]["k_over_J"].value == pytest.approx((2 * np.pi * 801.0) ** 2, rel=1e-5)
+    assert found.values["x"]["b_over_J"].value == pytest.approx(2 * np.pi * 801.0 / 250.0, rel=0.02)
+
+
+def test_too_few_tones_are_refused() -> None:
+    few = slice(0, 5)
+    with pytest.raises(BadInput, match="holds 5 steady tones, 10 are needed"):
+        diagnose_with_optics([recording(mode(F0, Q, 0.1)[few], FREQUENCY[few])])
+
+
+def test_the_fibre_scanner_has_two_modes(measured_data: Path) -> None:
+    source = measured_data / "fibre_scanner/lockin_sweep.txt"
+    lock_in = {"sample_rate": 1.0, "reference": "frequency"}
+    channels: dict[str, object] = {"frequency": {"variable": "FreqR_Hz", "unit": "Hz", "sample_rate": 1.0}}
+    for axis in "xy":
+        parts = [f"L{axis}i_mm", f"L{axis}q_mm"]
+        channels[f"amplitude_{axis}"] = {"variable": parts, "unit": "V", **lock_in}
+        channels[f"phase_{axis}"] = {"variable": parts, "unit": "rad", **lock_in}
+    w = 2 * np.pi * 805.0
+    mechanics = {"mechanics": {"J": 1.0, "b": w / 300.0, "k": w**2}}
+    with convert(source, {"channels": channels, "device": {"x": mechanics, "y": mechanics}}) as made:
+        assert made["amplitude_x"].read()[0] == pytest.approx(np.hypot(0.12990, 0.06241))
+        found = diagnose_with_optics([made])
+    seconds = [finding for finding in found.findings if finding.effect == "second-mode"]
+    assert [finding.axis for finding in seconds] == ["x", "y"]
+    for finding in seconds:
+        values = {each.name: each.value for each in finding.parameters}
+        assert 0.7 < abs(values["f1"] - values["f2"]) < 2.2
+        assert finding.rivals[0].effect == "cross-axis-coupling"
