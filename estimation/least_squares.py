@@ -257,3 +257,35 @@ def fit_linear(basis: Array, target: Array) -> tuple[Array, Array]:
     residual = target - np.einsum("ni,i->n", scaled, coefficients)
     covariance = gram * np.einsum("n,n->", residual, residual) / (target.size - coefficients.size)
     return coefficients / size, covariance / np.outer(size, size)
+
+
+class Regression(NamedTuple):
+    """Least squares with Gaussian priors, by an orthogonal factorisation.
+
+    Attributes:
+        factor: upper triangular, shape (q, q); the posterior covariance is the inverse of its square.
+        projected: the targets in the space of the columns, shape (q, t). Minus the estimate solves ``factor`` for it.
+        remainder: the targets beside the columns, shape (s, t), with the same inner products as what is left of them.
+    """
+
+    factor: Array
+    projected: Array
+    remainder: Array
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the inverse of the posterior covariance."""
+        return 2.0 * float(np.log(np.abs(np.diag(self.factor))).sum())
+
+
+def triangular_factor(columns: Array) -> Array:
+    """Upper triangular matrix with the inner products of ``columns``, shape (n, q)."""
+    return np.asarray(np.linalg.qr(columns, mode="r"))
+
+
+def regress(columns: Array, targets: Array, precision: Array) -> Regression:
+    """Regress targets (n, t) on columns (n, q) with prior precisions (q,)."""
+    size = precision.size
+    prior = np.column_stack([np.diag(np.sqrt(precision)), np.zeros((size, targets.shape[1]))])
+    triangle = triangular_factor(np.vstack([np.column_stack([columns, targets]), prior]))
+    return Regression(triangle[:size, :size], triangle[:size, size:], triangle[size:, size:])

@@ -3,8 +3,8 @@
 Around a fit that has the phase of the motion right, every named law and every discrepancy term is linear. All
 hypotheses contain the discrepancy terms of all stages, each with one scale that is estimated by maximum evidence, and
 differ in the named laws beside them. A named law is favoured because the discrepancy that is left to explain is
-smaller: every coefficient of it gains the logarithm of the ratio of the scales. All of it works on one matrix of inner
-products.
+smaller: every coefficient of it gains the logarithm of the ratio of the scales. All of it works on one triangular
+factor of the sensitivities; inner products would square their condition number, and rounding would decide.
 
 Source: model discrepancy, Kennedy & O'Hagan, J. R. Stat. Soc. B 63, 425 (2001); scales by MacKay's fixed point, Neural
 Computation 4, 415 (1992).
@@ -33,6 +33,7 @@ from estimation.diagnosis.screening import (
     score_candidate_starts,
     set_amplitudes,
 )
+from estimation.least_squares import regress, triangular_factor
 from scanner.arrays import Array
 
 SCALE_ITERATIONS = 12
@@ -83,7 +84,7 @@ class LinearTerm:
 
     Attributes:
         candidate: the term.
-        columns: of the matrix of inner products, shape (q,).
+        columns: of the triangular factor, shape (q,).
         test: where it is linearised, None if the fit contains it.
         cost: -2 log of the share of its time constants and frequencies that the recording leaves possible.
     """
@@ -117,18 +118,19 @@ def _score(hypothesis: Hypothesis) -> float:
 
 @dataclass(frozen=True)
 class LinearModel:
-    """A misfit, named laws and discrepancies as inner products.
+    """A misfit, named laws and discrepancies, compressed by an orthogonal factorisation.
 
     Attributes:
-        gram: of all columns and, last, of the misfit without any of them, shape (q + 1, q + 1). What every hypothesis
-            contains is projected out.
+        factor: upper triangular, of all columns and, last, of the misfit without any of them, shape (q + 1, q + 1).
+            Its columns have the inner products of the sensitivities, from which what every hypothesis contains is
+            projected out.
         profile: what every hypothesis contains, as it follows the columns and the misfit: minus its estimate beside
             each, shape (p, q + 1).
         laws: named laws.
         discrepancies: discrepancy terms of all stages.
     """
 
-    gram: Array
+    factor: Array
     profile: Array
     laws: tuple[LinearTerm, ...]
     discrepancies: tuple[LinearTerm, ...]
@@ -148,27 +150,27 @@ class LinearModel:
         of_laws = [column for i in laws for column in self.laws[i].columns]
         at = np.concatenate([np.array(of_laws, int), *groups])
         ends = len(of_laws) + np.cumsum([0, *(group.size for group in groups)])
-        normal, gradient, power = self.gram[np.ix_(at, at)], self.gram[at, -1], float(self.gram[-1, -1])
+        reduced = triangular_factor(self.factor[:, [*at, -1]])
         start = np.full(len(self._groups), INITIAL_SCALE**2) if scales is None else scales
         values = np.array([v for i, v in enumerate(start) if i not in without])
         for turn in range(iterations + 1):
             precision = np.ones(at.size)
             for value, (low, high) in zip(values, pairwise(ends), strict=True):
                 precision[low:high] = 1.0 / value
-            factor = np.linalg.cholesky(normal + np.diag(precision))
-            half = np.linalg.solve(factor, np.column_stack([gradient, np.eye(at.size)]))
-            estimate = -half[:, 1:].T @ half[:, 0]
+            regression = regress(reduced[:, :-1], reduced[:, -1:], precision)
+            inverse = np.linalg.inv(regression.factor)
+            estimate = -inverse @ regression.projected[:, 0]
             if turn == iterations:
                 break
-            variance = np.einsum("ij,ij->j", half[:, 1:], half[:, 1:])
+            variance = np.einsum("ij,ij->i", inverse, inverse)
             new = values.copy()
             for i, (low, high) in enumerate(pairwise(ends)):
                 determined = (high - low) - float(variance[low:high].sum()) / values[i]
                 new[i] = float(estimate[low:high] @ estimate[low:high]) / max(determined, 1e-3)
             values = np.clip(new, MIN_SCALE**2, MAX_SCALE**2)
-        misfit = power + float(gradient @ estimate)
+        misfit = float(np.sum(regression.remainder**2))
         shapes = sum(self.laws[i].cost for i in laws)
-        cost = 2.0 * float(np.log(np.diag(factor)).sum()) - float(np.log(precision).sum())
+        cost = regression.log_determinant - float(np.log(precision).sum())
         all_scales = np.array(start, float)
         all_scales[[i for i in range(len(self._groups)) if i not in without]] = values
         return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes, misfit)
@@ -207,18 +209,13 @@ class LinearModel:
         precision = np.concatenate(
             [np.ones(len(of_laws)), *(np.full(g.size, 1.0 / v) for g, v in zip(self._groups, scales, strict=True))]
         )
-        inner = self.gram[np.ix_(at, at)] + np.diag(precision)
-        new = np.array([c for i in others for c in self.laws[i].columns])
-        wanted = np.append(new, -1)
-        left = self.gram[np.ix_(wanted, wanted)] - self.gram[np.ix_(wanted, at)] @ np.linalg.solve(
-            inner, self.gram[np.ix_(at, wanted)]
-        )
+        new = [c for i in others for c in self.laws[i].columns]
+        left = regress(self.factor[:, at], self.factor[:, [*new, -1]], precision).remainder
         gains, first = [], 0
         for i in others:
             last = first + len(self.laws[i].columns)
-            block = left[first:last, first:last] + np.eye(last - first)
-            gradient = left[first:last, -1]
-            gain = float(gradient @ np.linalg.solve(block, gradient)) - np.linalg.slogdet(block)[1]
+            regression = regress(left[:, first:last], left[:, -1:], np.ones(last - first))
+            gain = float(np.sum(regression.projected**2)) - regression.log_determinant
             gains.append(gain - self.laws[i].cost)
             first = last
         return np.array(gains)
@@ -229,7 +226,8 @@ class LinearModel:
         The estimates of the laws follow each other in the order of ``laws``.
         """
         at = np.array([column for i in laws for column in self.laws[i].columns], int)
-        of_laws = -np.linalg.solve(self.gram[np.ix_(at, at)] + np.eye(at.size), self.gram[at, -1])
+        regression = regress(self.factor[:, at], self.factor[:, -1:], np.ones(at.size))
+        of_laws = np.asarray(-np.linalg.solve(regression.factor, regression.projected[:, 0]))
         return of_laws, -(self.profile[:, at] @ of_laws + self.profile[:, -1])
 
     def share(self, hypothesis: Hypothesis, law: int) -> float:
@@ -290,11 +288,8 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
         cost = 2.0 * float(np.log(len(tests)))
         blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
     whole = np.column_stack([*(columns[rows] for _, columns, *_ in blocks), residual[rows]])
-    nuisance = fit.jacobian[rows][:, base]
-    cross = nuisance.T @ whole
-    inner = nuisance.T @ nuisance + np.diag(fit.model.precision[base])
-    profile = np.asarray(np.linalg.solve(inner, cross))
-    gram = whole.T @ whole - cross.T @ profile
+    common = regress(fit.jacobian[rows][:, base], whole, fit.model.precision[base])
+    profile = np.asarray(np.linalg.solve(common.factor, common.projected))
     ends = np.cumsum([0, *(columns.shape[1] for _, columns, *_ in blocks)])
     terms = [
         LinearTerm(candidate, np.arange(low, high), test, cost)
@@ -302,7 +297,7 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     ]
     discrepancies = tuple(term for term in terms if term.candidate.term.effect in DISCREPANCY_TERMS)
     laws = tuple(term for term in terms if term.candidate.term.effect not in DISCREPANCY_TERMS)
-    return LinearModel(gram, profile, laws, discrepancies)
+    return LinearModel(common.remainder, profile, laws, discrepancies)
 
 
 def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:

@@ -30,9 +30,9 @@ def linear_model(weights: dict[str, float], discrepancy: float, seed: int = 3) -
         LinearTerm(Candidate(term, "x", "sense"), np.arange(low, high), None)
         for term, low, high in zip(terms, ends[:-1], ends[1:], strict=True)
     ]
-    whole = np.column_stack([*columns, misfit])
-    nothing_else = np.zeros((0, whole.shape[1]))
-    return LinearModel(whole.T @ whole, nothing_else, tuple(linear[: len(LAWS)]), tuple(linear[len(LAWS) :]))
+    factor = np.linalg.qr(np.column_stack([*columns, misfit]), mode="r")
+    nothing_else = np.zeros((0, factor.shape[1]))
+    return LinearModel(factor, nothing_else, tuple(linear[: len(LAWS)]), tuple(linear[len(LAWS) :]))
 
 
 def selected(model: LinearModel) -> set[str]:
@@ -66,3 +66,17 @@ def test_a_discrepancy_keeps_the_part_of_its_stage_that_no_law_takes() -> None:
     model = linear_model({"sensor-cubic": 0.4}, 0.2)
     at = [each.candidate.term.effect for each in model.laws].index("sensor-cubic")
     assert model.bulk(model.hypothesis((at,)), at) < 0.7
+
+
+def test_rounding_does_not_decide_between_laws_of_nearly_the_same_effect() -> None:
+    rng = np.random.default_rng(4)
+    common, difference = rng.normal(size=(2, SAMPLES))
+    columns = [1e8 * common, 1e8 * common + difference, rng.normal(size=SAMPLES), rng.normal(size=SAMPLES)]
+    terms = [*(catalogue()[name] for name in LAWS), DISCREPANCY_TERMS["free-readout"]]
+    linear = tuple(LinearTerm(Candidate(term, "x", "sense"), np.array([i]), None) for i, term in enumerate(terms))
+    factor = np.linalg.qr(np.column_stack([*columns, 3.0 * columns[1]]), mode="r")
+    model = LinearModel(factor, np.zeros((0, 5)), linear[:3], linear[3:])
+    exact, near = (model.hypothesis((law,)).misfit for law in (1, 0))
+    assert exact == pytest.approx(9.0, abs=0.1)  # of the prior
+    assert near - exact == pytest.approx(9.0 * SAMPLES, rel=0.2)
+    assert selected(model) == {"cubic-damping"}
