@@ -139,9 +139,10 @@ def _stated_term(axis: Axis, effect: str, values: dict[str, Any], known: dict[st
         hint = f"{effect} needs {', '.join(p.name for p in term.parameters)}"
         raise BadInput(f"lacks {missing[0]}", file=axis.source, channel=key, hint=hint)
     variant = int(values.get("variant", 0))
-    if not 0 <= variant < len(term.channels):
+    channels = (*term.channels, *term.stated_channels)
+    if not 0 <= variant < len(channels):
         raise BadInput(f"variant {variant} is unknown", file=axis.source, channel=key, hint="count from 0")
-    return ActiveTerm(term, tuple(values[p.name] for p in term.parameters), term.channels[variant])
+    return ActiveTerm(term, tuple(values[p.name] for p in term.parameters), channels[variant])
 
 
 def in_stage_order(terms: Iterable[ActiveTerm]) -> list[ActiveTerm]:

@@ -1,9 +1,10 @@
-"""Detection of clipped readouts before any fit: many samples exactly at the largest value, the rail."""
+"""Detection of clipped readouts before any fit: many samples exactly at the largest or the smallest value."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,27 +25,63 @@ NEIGHBOURS = 8
 """Distinct values next to the extreme one whose sample counts are compared with its own."""
 
 
-def rail(signal: Array) -> float | None:
-    """Magnitude at which a signal of shape (n,) is clipped, None where it is not."""
-    magnitude = np.abs(signal)
-    values, counts = np.unique(magnitude, return_counts=True)
+SAME_LIMIT = 0.02
+"""Relative difference of two rails up to which they are one limit: converters are as symmetric."""
+
+
+class Rail(NamedTuple):
+    """Where a signal is clipped.
+
+    Attributes:
+        limit: L of the saturation term [V].
+        channel: of the term: ``"sense"`` (-L and L), ``"sense:upper"`` (L alone) or ``"sense:lower"`` (-L alone).
+        samples: that stand exactly at the rail.
+    """
+
+    limit: float
+    channel: str
+    samples: int
+
+
+def _upper_rail(signal: Array) -> tuple[float, int] | None:
+    """Largest value of a signal and the number of samples there, None where it is no rail."""
+    values, counts = np.unique(signal, return_counts=True)
     if values.size <= NEIGHBOURS or counts[-1] < MIN_CLIPPED_SAMPLES:
         return None
     if counts[-1] < MIN_CLIPPED_RATIO * counts[-1 - NEIGHBOURS : -1].max():
         return None
-    return float(values[-1])
+    return float(values[-1]), int(counts[-1])
+
+
+def find_rail(signal: Array) -> Rail | None:
+    """The rail of a signal of shape (n,), None where it is not clipped.
+
+    Two rails of one magnitude are one limit. Of two others the one with more samples is taken. A single rail is one of
+    two, of which the other was not reached, where no sample exceeds its magnitude on the other side.
+    """
+    upper, lower = _upper_rail(signal), _upper_rail(-signal)
+    if upper and lower and np.isclose(upper[0], lower[0], rtol=SAME_LIMIT):
+        return Rail(max(upper[0], lower[0]), "sense", upper[1] + lower[1])
+    found = [
+        Rail(rail[0], "sense" if rail[0] > 0.0 and opposite.max() <= rail[0] else channel, rail[1])
+        for rail, opposite, channel in ((upper, -signal, "sense:upper"), (lower, signal, "sense:lower"))
+        if rail
+    ]
+    return max(found, key=lambda rail: rail.samples, default=None)
 
 
 def rail_resolution(runs: Sequence[Run], candidate: Candidate) -> float:
-    """Uncertainty of a limit read from the rail: half the step to the next lower value; 0 for a fitted candidate."""
+    """Uncertainty of a limit read from the rail: half the step to the next value; 0 for a fitted candidate."""
     if candidate.term.free_parameters:
         return 0.0
-    steps = [
-        float(np.diff(np.unique(np.abs(output.full))[-2:])[0])
-        for run in runs
-        for output in run.outputs
-        if output.kind == candidate.channel and candidate.axis in output.axes and rail(output.full) is not None
-    ]
+    steps = []
+    for run in runs:
+        for output in run.outputs:
+            if output.kind == "sense" and candidate.axis in output.axes and find_rail(output.full) is not None:
+                signal = {"sense:upper": output.full, "sense:lower": -output.full}.get(
+                    candidate.channel, np.abs(output.full)
+                )
+                steps.append(float(np.diff(np.unique(signal)[-2:])[0]))
     return 0.5 * max(steps, default=0.0)
 
 
@@ -57,9 +94,10 @@ def clipped_readouts(runs: Sequence[Run], saturation: Term | None) -> list[Candi
     by_axis: dict[str, Candidate] = {}
     for run in runs:
         for output in run.outputs:
-            limit = rail(output.full) if saturation is not None and output.kind == "sense" else None
-            if limit is not None and saturation is not None:
-                fixed = Parameter("limit", "V", lambda scales, limit=limit: limit, kind="fixed")  # type: ignore[misc]
-                term = replace(saturation, parameters=(fixed,))
-                by_axis.setdefault(output.axes[0], Candidate(term, output.axes[0], "sense"))
+            rail = find_rail(output.full) if saturation is not None and output.kind == "sense" else None
+            if rail is not None and saturation is not None:
+                fixed = Parameter("limit", "V", lambda scales, limit=rail.limit: limit, kind="fixed")  # type: ignore[misc]
+                channels = (*saturation.channels, *saturation.stated_channels)
+                term = replace(saturation, parameters=(fixed,), channels=channels)
+                by_axis.setdefault(output.axes[0], Candidate(term, output.axes[0], rail.channel))
     return list(by_axis.values())

@@ -24,16 +24,20 @@ def _clipped(size: Array, limit: float, noise: float) -> Array:
 def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
     (limit,) = p
     noise = context.readout.noise_sd if context.readout else 0.0
+    if context.variant:
+        side = 1.0 if context.variant == "upper" else -1.0
+        return side * _clipped(side * signal, limit, noise)
     return np.sign(signal) * _clipped(np.abs(signal), limit, noise)
 
 
 TERM = Term(
     effect="saturation",
     stage="readout",
-    equation="y = clip(y_nominal, −L, L)",
+    equation="y = clip(y_nominal, −L, L); variant 1: min(y_nominal, L), variant 2: max(y_nominal, −L)",
     parameters=(Parameter("limit", "V", lambda s: s.sense_peak, kind="log", spread=0.2, starts=(0.0, -0.4, -1.2)),),
     source="converter data sheets: input range",
     confounders={"sensor-cubic": "a cubic sensor makes no flat top in the histogram: look at the largest samples"},
     output=output,
+    stated_channels=("sense:upper", "sense:lower"),  # min(y, L) and max(y, -L): one rail alone, at a level of any sign
     after_noise=True,
 )

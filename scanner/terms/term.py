@@ -167,6 +167,8 @@ class Term:
         applies: whether an axis can show the effect at all, from the axis and its scales.
         channels: kinds of channel that ``output`` may act on: ``"sense"``, ``"angle"``, ``"intensity"`` or ``"place"``.
             A device file selects one by its index, ``variant``.
+        stated_channels: further kinds of channel, for device files and for effects that are read from the samples
+            themselves; no fit searches them.
         after_noise: whether ``output`` acts on the sum of signal and noise, as the converter does.
         per_axis: on an electrode that all combs share, whether each axis may have the effect separately.
         coupled: whether ``torque`` depends on the angle of the other axis.
@@ -190,6 +192,7 @@ class Term:
     initial_seeds: tuple[tuple[float, ...], ...] = ()
     applies: Callable[[Axis, NaturalScales], bool] = lambda axis, scales: True
     channels: tuple[str, ...] = ("sense",)
+    stated_channels: tuple[str, ...] = ()
     after_noise: bool = False
     per_axis: bool = False
     coupled: bool = False

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimation.diagnosis.clipping import rail
+from estimation.diagnosis.clipping import find_rail
 from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.fit import Likelihood, fit_model
 from estimation.diagnosis.identifiability import determined_parameters
@@ -38,10 +38,21 @@ def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> No
 def test_a_rail_is_detected_from_samples_at_one_value() -> None:
     rng = np.random.default_rng(3)
     wave = np.sin(np.linspace(0.0, 60.0, 4000)) + 0.01 * rng.normal(size=4000)
-    assert rail(np.clip(wave, None, 0.8)) is None  # the lower half is not clipped
-    assert rail(np.clip(wave + 0.5, None, 1.2)) == pytest.approx(1.2)
-    assert rail(wave) is None
-    assert rail(np.round(wave * 64) / 64) is None  # a converter's steps are no rail
+    for level in (0.8, -0.2):
+        upper = find_rail(np.clip(wave, None, level))
+        assert upper is not None
+        assert upper[:2] == (pytest.approx(level), "sense:upper")
+    lower = find_rail(np.clip(wave, -0.6, None))
+    assert lower is not None
+    assert lower[:2] == (pytest.approx(0.6), "sense:lower")
+    both = find_rail(np.clip(wave, -0.7, 0.7))
+    assert both is not None
+    assert both[:2] == (pytest.approx(0.7), "sense")
+    unreached = find_rail(np.clip(wave + 0.5, None, 1.2))
+    assert unreached is not None
+    assert unreached[:2] == (pytest.approx(1.2), "sense")
+    assert find_rail(wave) is None
+    assert find_rail(np.round(wave * 64) / 64) is None  # a converter's steps are no rail
 
 
 def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
