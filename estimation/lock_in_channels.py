@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanner.arrays import Array
+from scanner.arrays import Array, Complex
 from scanner.channel import check_signal
 from scanner.device import Axis
 from scanner.errors import BadInput
@@ -34,21 +34,40 @@ def lock_in_angle(recording: Recording, axis: Axis, time: Array) -> Array:
         ChannelMissing: no phase. BadInput: the amplitude is no angle, or no reference frequency is stated.
     """
     at, amplitude, in_rad = lock_in_amplitude(recording, axis)
-    phase = recording.require(f"phase_{axis.name}", "the angle needs it beside the amplitude")
-    reference = phase.reference if phase.reference is not None else recording[f"amplitude_{axis.name}"].reference
     if not in_rad:
         hint = "record it in rad, or state a position, velocity or acceleration readout"
         raise BadInput("is a voltage behind no sensor of the motion", channel=f"amplitude_{axis.name}", hint=hint)
+    phase = recording.require(f"phase_{axis.name}", "the angle needs it beside the amplitude")
+    unwrapped = np.unwrap(phase.read())
+    turn, _ = _reference_turn(recording, axis, time)
+    size = np.interp(time, at, amplitude)
+    return np.asarray(size * np.sin(turn + np.interp(time, phase.time(), unwrapped)))
+
+
+def lock_in_phasor(recording: Recording, axis: Axis) -> tuple[Array, Complex, float]:
+    """Times (n,) [s], complex amplitude against the mean reference frequency (n,) [rad or V], and that frequency [Hz].
+
+    Raises:
+        ChannelMissing: no phase. BadInput: no reference frequency is stated.
+    """
+    time, amplitude, _ = lock_in_amplitude(recording, axis)
+    phase = recording.require(f"phase_{axis.name}", "the frequency of the decay needs it beside the amplitude")
+    turn, frequency = _reference_turn(recording, axis, time)
+    angle = np.interp(time, phase.time(), np.unwrap(phase.read())) + turn - 2 * np.pi * frequency * time
+    known = np.isfinite(amplitude) & np.isfinite(angle)
+    return time[known], amplitude[known] * np.exp(1j * angle[known]), frequency
+
+
+def _reference_turn(recording: Recording, axis: Axis, time: Array) -> tuple[Array, float]:
+    """Phase of the reference at ``time`` [rad], and its mean frequency [Hz]."""
+    phase = recording[f"phase_{axis.name}"]
+    reference = phase.reference if phase.reference is not None else recording[f"amplitude_{axis.name}"].reference
     if reference is None:
         hint = "state the attribute reference: the frequency in Hz, or the channel that holds it"
         raise BadInput("states no reference frequency", file=phase.file, channel=phase.name, hint=hint)
-    if isinstance(reference, str):
-        held = recording.require(reference, f"it is the reference of {phase.name}")
-        frequency = held.read()
-        cycles = np.concatenate([[0.0], np.cumsum(0.5 * (frequency[1:] + frequency[:-1]))]) / held.sample_rate
-        turn = 2 * np.pi * np.interp(time, held.time(), cycles)
-    else:
-        turn = 2 * np.pi * float(reference) * time
-    unwrapped = np.unwrap(phase.read())
-    size = np.interp(time, at, amplitude)
-    return np.asarray(size * np.sin(turn + np.interp(time, phase.time(), unwrapped)))
+    if not isinstance(reference, str):
+        return 2 * np.pi * float(reference) * time, float(reference)
+    held = recording.require(reference, f"it is the reference of {phase.name}")
+    frequency = held.read()
+    cycles = np.concatenate([[0.0], np.cumsum(0.5 * (frequency[1:] + frequency[:-1]))]) / held.sample_rate
+    return 2 * np.pi * np.interp(time, held.time(), cycles), float(np.nanmean(frequency))

@@ -18,11 +18,9 @@ from estimation.filters.inputs import FilterInput, prepare_filter_inputs
 from estimation.filters.run import PUBLISHED_ACCELERATION_VARIANCE, run_compiled
 from estimation.identification.fits import (
     DrivenRecord,
-    ReadoutFit,
     fit_mechanics,
-    fit_readout,
-    readout_features,
 )
+from estimation.identification.readout_fit import ReadoutFit, fit_readout, readout_features
 from phantoms.amdm import digitise, record_through_circuit
 from phantoms.circuit import AmdmCircuit, envelope_section, match_gain
 from phantoms.waveforms import Sine

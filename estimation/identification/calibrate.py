@@ -10,6 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation.identification.classification import (
+    UNREFERENCED_DECAY,
+    UNREFERENCED_DRIVE,
+    classify_recording,
+    lock_in_only,
+)
 from estimation.identification.decay_without_angle import fit_decay_without_angle
 from estimation.identification.fits import (
     DrivenRecord,
@@ -18,17 +24,19 @@ from estimation.identification.fits import (
     fit_mechanics,
     fit_ringdown,
 )
+from estimation.identification.lock_in_decay import fit_lock_in_decay
+from estimation.identification.reference_angle import ReferenceAngle, find_reference_angle, with_angle
+from estimation.identification.sweep import SweptRecord, fit_swept
 from estimation.reference import drive_reference
 from estimation.slow.response import Response, frequency_responses
 from estimation.slow.response_selection import select_effects
 from scanner.arrays import Array
-from scanner.channel import check_signal
 from scanner.clock import on_clock
 from scanner.device import DEFAULT_TOLERANCE, Axis, Device
 from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
-from scanner.stages import Amdm, MotionSensor
+from scanner.stages import Amdm, MotionSensor, Readout
 
 SEGMENT_CYCLES = 200.0
 """Cycles per segment of a driven recording: a sweep changes little within one, which counts as one frequency."""
@@ -40,14 +48,6 @@ TORQUE_SCALE = (("capacitance", "C0"), ("capacitance", "theta0"), ("drive", "tor
 
 Decay = tuple[Array, float, float]
 """Angle of a free decay [rad], shape (n,), its rate [Hz], and the voltage on the combs [V]."""
-
-UNREFERENCED_DECAY = "free decay without a reference angle"
-
-MIN_DRIVE_VARIATION = 1e-3
-"""Standard deviation of a drive relative to its largest value below which it counts as constant."""
-
-WHITE_NOISE_MARGIN = 1.2
-"""Standard deviation of a signal over that of white noise with the same differences, above which it shows motion."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,8 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         what = "no recording shows a rest, a free decay, steady tones or a driven motion with a reference angle"
         names = ", ".join(sorted({name for recording in recordings for name in recording.channels}))
         hint = f"record angle_x together with sense_x; the recording contains {names or 'nothing'}"
+        if notes:
+            what, hint = "the recordings determine no constant", "; ".join(notes)
         raise BadInput(what, file=recordings[0].path if recordings else None, hint=hint)
     return Identification(replace(device, axes=axes), values, used, notes)
 
@@ -112,6 +114,8 @@ class _AxisIdentification:
         self.used: list[str] = []
         self.notes: list[str] = []
         self.driven: list[DrivenRecord] = []
+        self.swept: list[SweptRecord] = []
+        self.gain_tolerance = 0.0  # of the reference angle of driven motion
         self.decays: list[Decay] = []
         self.by_torque: dict[str, float] = {}  # standard deviation that the drive's torque adds to a value
 
@@ -126,45 +130,74 @@ class _AxisIdentification:
         kind = classify_recording(recording, self.name)
         if kind is None:
             return
-        self.used.append(f"{recording.name}: {kind}")
+        if kind == UNREFERENCED_DRIVE and not isinstance(self.axis.require_readout(), MotionSensor):
+            self.notes.append(
+                f"{self.name}: {recording.name} is not used: driven motion behind a capacitive readout needs a "
+                f"reference angle; record angle_{self.name} or velocity_{self.name}"
+            )
+            return
+        source = "" if kind in ("rest", UNREFERENCED_DECAY) else self._use_reference(recording, kind)
+        self.used.append(f"{recording.name}: {kind}{source}")
         if kind == "rest":
             self._rest(recording)
-            return
-        if kind == UNREFERENCED_DECAY:
-            self._unreferenced(recording)
-            return
+        elif kind == UNREFERENCED_DECAY:
+            channel, readout = recording[f"sense_{self.name}"], self.axis.require_readout()
+            self._take_ratios(fit_decay_without_angle(self.axis, channel), readout)
+
+    def _use_reference(self, recording: Recording, kind: str) -> str:
+        """Use a free decay or driven motion with a reference; the words that name it if it is no angle channel."""
+        if kind == "free decay" and lock_in_only(recording, self.name):
+            self._take_ratios(fit_lock_in_decay(recording, self.axis), None)
+            return f", from amplitude_{self.name} and phase_{self.name}"
+        reference = find_reference_angle(recording, self.axis, DEFAULT_TOLERANCE)
+        if reference is None:
+            raise AssertionError(f"{kind} without a reference")
+        recording = with_angle(recording, reference)
         names = [f"angle_{self.name}", *[n for n in (f"sense_{self.name}", f"drive_{self.name}") if n in recording]]
         clock, values = on_clock(recording, names)
         angle = values[f"angle_{self.name}"]
-        if kind == "free decay":
+        frequency = self.axis.resonance
+        if kind == "free decay" and reference.sensor is None:
             self.decays.append((angle, clock.rate, self._volt(recording)))
-            frequency = self.axis.resonance
+        elif kind == "free decay":
+            measured = replace(self.axis, readout=reference.sensor)
+            self._take_ratios(fit_decay_without_angle(measured, recording[reference.source]), reference.sensor)
         else:
-            reference = drive_reference(
-                recording[f"drive_{self.name}"],
-                "half-drive" if self.axis.require_drive().kind == "electrostatic" else "drive",
-            )
-            frequency = reference.frequency
-            time = clock.time
-            self.driven += steady_segments(
-                angle, values[f"drive_{self.name}"], reference.frequency_at(time), clock.rate
-            )
+            frequency = self._use_driven(recording, clock.time, angle, values[f"drive_{self.name}"], reference)
         sense = values.get(f"sense_{self.name}")
         if sense is not None and not isinstance(self.axis.require_readout(), MotionSensor):
             found = fit_capacitance_profile(self.axis, angle, sense, clock.rate, frequency).values
             self.values = combine_values([self.values, found])
+            if reference.order:
+                self.notes.append(
+                    f"{self.name}: {reference.source} does not contain the mean angle; theta_th is relative to it"
+                )
+        return "" if reference.source.startswith("angle") else f", from {reference.source}"
 
-    def _unreferenced(self, recording: Recording) -> None:
-        """Ratios of the mechanics from a free decay of the readout's signal alone, with a note on the other values."""
-        readout = self.axis.require_readout()
-        found = fit_decay_without_angle(self.axis, recording[f"sense_{self.name}"])
+    def _use_driven(
+        self, recording: Recording, time: Array, angle: Array, drive: Array, reference: ReferenceAngle
+    ) -> float:
+        """Keep driven motion for ``conclude``; the frequency of the motion [Hz]."""
+        electrostatic = self.axis.require_drive().kind == "electrostatic"
+        phase = drive_reference(recording[f"drive_{self.name}"], "half-drive" if electrostatic else "drive")
+        rate = 1.0 / float(time[1] - time[0])
+        self.driven += steady_segments(angle, drive, phase.frequency_at(time), rate)
+        self.swept.append(SweptRecord(DrivenRecord(angle, drive, phase.frequency, rate), time, phase))
+        self.gain_tolerance = max(self.gain_tolerance, reference.gain_tolerance)
+        return phase.frequency
+
+    def _take_ratios(self, found: dict[str, IdentifiedValue], readout: Readout | None) -> None:
+        """Take ratios of the mechanics from a free decay without an angle, with a note on the values that stay open."""
         self.values = combine_values([self.values, found])
-        open_values = "J, and the gain of the readout"
-        if not isinstance(readout, MotionSensor):
+        open_values = "J"
+        if isinstance(readout, MotionSensor) and readout is self.axis.readout:
+            open_values = "J, and the gain of the readout"
+        elif readout is not None and not isinstance(readout, MotionSensor):
             open_values = "J, theta0, C0, the gain of the readout, and the sign of the angle"
         self.notes.append(
             f"{self.name}: without a reference angle a free decay determines k/J and b/J (resonance and Q) only; "
-            f"{open_values} stay as stated; record angle_{self.name}, and driven motion for J"
+            f"{open_values} stay{'s' if open_values == 'J' else ''} as stated; record angle_{self.name}, and driven "
+            "motion for J"
         )
 
     def _rest(self, recording: Recording) -> None:
@@ -195,8 +228,18 @@ class _AxisIdentification:
         several = len({round(record.frequency) for record in self.driven}) > 1
         if several:
             self._take(axis, lambda axis: fit_mechanics(axis, self.driven))
-        elif self.driven:
-            self.notes.append(f"{self.name}: one drive frequency does not determine J; record two or more")
+        elif self.swept:
+            before = dict(self.values)
+            self._take(axis, lambda axis: fit_swept(axis, self.swept))
+            several = self.values != before
+        if self.swept and not several:
+            self.notes.append(
+                f"{self.name}: the driven motion does not determine J; record two or more drive frequencies, or a "
+                "sweep through the resonance"
+            )
+        if several and self.gain_tolerance:
+            for key in ("J", "b", "k"):
+                self.by_torque[key] = float(np.hypot(self.by_torque[key], self.gain_tolerance * self.values[key].value))
         if self.decays and not several and not any(volt for _, _, volt in self.decays):
             self.notes.append(
                 f"{self.name}: J is the nominal one; a free decay determines only k/J and b/J, driven motion also J"
@@ -215,7 +258,7 @@ class _AxisIdentification:
             sd = axis.tolerance.get(key, DEFAULT_TOLERANCE) * abs(value)
             off = fit(replace(axis, **{stage: replace(part, **{key: value + sd})})) if sd else found
             for name in found:
-                moved = off[name].value - found[name].value
+                moved = off[name].value - found[name].value if name in off else 0.0
                 self.by_torque[name] = float(np.hypot(self.by_torque[name], moved))
 
     def marginal(self) -> dict[str, IdentifiedValue]:
@@ -271,29 +314,6 @@ def mechanics_from_decays(axis: Axis, decays: Sequence[Decay]) -> dict[str, Iden
         ratio = found[f"{key}_over_J"]
         found[key] = IdentifiedValue(ratio.value * J.value, float(np.hypot(ratio.sd * J.value, ratio.value * J.sd)))
     return found
-
-
-def classify_recording(recording: Recording, name: str) -> str | None:
-    """What a recording shows of one axis; None if nothing is of use.
-
-    ``"rest"``, ``"free decay"`` or ``"driven"`` with a reference angle, or ``UNREFERENCED_DECAY``.
-    """
-    drive, angle, sense = (recording.channels.get(f"{kind}_{name}") for kind in ("drive", "angle", "sense"))
-    oscillates = False
-    if drive is not None:
-        values = drive.read()
-        oscillates = bool(np.std(values) > MIN_DRIVE_VARIATION * max(np.abs(values).max(), 1e-300))
-    if angle is not None and shows_motion(angle.read()):
-        return "driven" if oscillates else "free decay"
-    if sense is None or oscillates:
-        return None
-    check_signal(sense)
-    return UNREFERENCED_DECAY if shows_motion(sense.read()) else "rest"
-
-
-def shows_motion(values: Array) -> bool:
-    """Whether a signal is more than white noise: neighbouring samples of noise differ as much as distant ones."""
-    return bool(np.std(values) > WHITE_NOISE_MARGIN * np.std(np.diff(values)) / np.sqrt(2.0))
 
 
 def steady_segments(angle: Array, voltage: Array, frequency: Array, rate: float) -> list[DrivenRecord]:

@@ -16,10 +16,10 @@ from scanner.arrays import Array
 from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.integrator.trajectories import integrate
-from scanner.laws import capacitance, capacitance_slope, electrostatic_torque
+from scanner.laws import capacitance_slope, electrostatic_torque
 from scanner.lock_in import block_length, block_phasors
 from scanner.lowpass import run_section, section_coefficients
-from scanner.stages import Amdm, Capacitance, Mechanics, MotionSensor, Transimpedance
+from scanner.stages import Amdm, Mechanics, MotionSensor, Transimpedance
 
 BLOCK_CYCLES = 20.0
 """Cycles of the motion per block of a driven record, whose phasors are one equation: harmonics and noise average
@@ -73,7 +73,7 @@ def drive_torque(axis: Axis, record: DrivenRecord) -> Array:
 
 
 def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, IdentifiedValue]:
-    """``J``, ``b`` and ``k`` from driven motion by the equation of motion (chen2020 eq 9) at the motion's frequency.
+    """``J``, ``b``, ``k`` and their ratios from driven motion, by chen2020 eq 9 at the motion's frequency.
 
     A block's phasors of angle and torque obey (k/J - w^2 + j w b/J) Θ = T / J, linear in k/J, b/J and 1/J. Phase and
     amplitude at one drive frequency give two equations, so two frequencies are needed.
@@ -101,13 +101,20 @@ def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, Iden
         row = np.stack([np.abs(theta), 1j * w * np.abs(theta), -torque * unit], axis=1)
         rows += [row.real, row.imag]
         targets += [w**2 * np.abs(theta), np.zeros(theta.size)]
-    (stiff, loss, inverse), covariance = fit_linear(np.concatenate(rows), np.concatenate(targets))
+    return values_from_ratios(*fit_linear(np.concatenate(rows), np.concatenate(targets)))
+
+
+def values_from_ratios(ratios: Array, covariance: Array) -> dict[str, IdentifiedValue]:
+    """``J``, ``b``, ``k``, ``k_over_J`` and ``b_over_J`` from (k/J, b/J, 1/J) and their covariance."""
+    stiff, loss, inverse = ratios
     jacobian = {
         "J": np.array([0.0, 0.0, -1.0 / inverse**2]),
         "b": np.array([0.0, 1.0 / inverse, -loss / inverse**2]),
         "k": np.array([1.0 / inverse, 0.0, -stiff / inverse**2]),
+        "k_over_J": np.array([1.0, 0.0, 0.0]),
+        "b_over_J": np.array([0.0, 1.0, 0.0]),
     }
-    values = {"J": 1.0 / inverse, "b": loss / inverse, "k": stiff / inverse}
+    values = {"J": 1.0 / inverse, "b": loss / inverse, "k": stiff / inverse, "k_over_J": stiff, "b_over_J": loss}
     return {key: IdentifiedValue(float(values[key]), float(np.sqrt(g @ covariance @ g))) for key, g in jacobian.items()}
 
 
@@ -188,72 +195,6 @@ def _first_guess(angle: Array, rate: float, mechanics: Mechanics) -> tuple[float
     slope = np.polyfit(time[keep], np.unwrap(np.angle(z[keep])), 1)[0]
     decay = np.polyfit(time[keep], np.log(np.abs(z[keep])), 1)[0]
     return 2 * np.pi * f + float(slope), max(-2.0 * float(decay), 1e-3)
-
-
-@dataclass(frozen=True)
-class ReadoutFit:
-    """An AMDM readout fitted to a reference angle.
-
-    Attributes:
-        values: ``a_cir`` [V/F], ``b_cir`` [V], ``delay`` [s] beyond the sections, ``square`` [V/F^2] of the squared
-            capacitance, ``feed`` [1] and ``feed_rate`` [s] of the drive that leaks through.
-        coefficients: of all ``readout_features``, 0 for a term left out, shape (6,).
-        noise_sd: of the residual [V].
-    """
-
-    values: Mapping[str, IdentifiedValue]
-    coefficients: Array
-    noise_sd: float
-
-
-def readout_features(comb: Capacitance, angle: Array, voltage: Array, rate: float, sections: Sequence[float]) -> Array:
-    """Regressors of an AMDM output: C, 1, C' and C^2 after the sections, the drive and its rate; shape (n, 6)."""
-    C = capacitance(angle, comb.C0, comb.Cb, comb.theta0, comb.theta_th)
-    square = C * C
-    for cutoff in sections:
-        coefficients = section_coefficients(cutoff, 1.0 / rate)
-        run_section(C, *coefficients, C[0], C[0])
-        run_section(square, *coefficients, square[0], square[0])
-    one = np.ones_like(C)
-    swing = voltage - voltage.mean()
-    return np.stack([C, one, np.gradient(C, 1 / rate), square, swing, np.gradient(voltage, 1 / rate)], axis=1)
-
-
-READOUT_FEATURES = ("a_cir", "b_cir", "delay", "square", "feed", "feed_rate")
-
-
-def fit_readout(
-    comb: Capacitance,
-    records: Sequence[DrivenRecord],
-    senses: Sequence[Array],
-    sections: Sequence[float],
-    terms: Sequence[str] = READOUT_FEATURES,
-    skip: float = SETTLE_TIME_S,
-) -> ReadoutFit:
-    """Gain and offset of an AMDM readout, with corrections to the formula a_cir C + b_cir, by least squares.
-
-    Args:
-        records: with the reference angle. senses: the output at the same samples [V].
-        sections: corner of every low-pass section [Hz].
-        terms: which of ``READOUT_FEATURES``; the paper's own fit is ``("a_cir", "b_cir")`` and no sections.
-        skip: start of each record that is left out while the sections settle [s].
-    """
-    columns = [READOUT_FEATURES.index(term) for term in terms]
-    basis, target = [], []
-    for record, sense in zip(records, senses, strict=True):
-        first = round(skip * record.rate)
-        features = readout_features(comb, record.angle, record.voltage, record.rate, sections)
-        basis.append(features[first:, columns])
-        target.append(sense[first:])
-    stacked, y = np.concatenate(basis), np.concatenate(target)
-    fitted, covariance = fit_linear(stacked, y)
-    values = {term: IdentifiedValue(float(fitted[i]), float(np.sqrt(covariance[i, i]))) for i, term in enumerate(terms)}
-    coefficients = np.zeros(len(READOUT_FEATURES))
-    coefficients[columns] = fitted
-    if "delay" in values:  # C(t - delay) = C - delay C'
-        slope, a_cir = values["delay"], values["a_cir"].value
-        values["delay"] = IdentifiedValue(-slope.value / a_cir, slope.sd / abs(a_cir))
-    return ReadoutFit(values, coefficients, float(np.std(y - stacked @ fitted)))
 
 
 @dataclass(frozen=True)

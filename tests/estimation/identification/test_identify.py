@@ -10,7 +10,8 @@ import pytest
 
 from benchmarks.papers.sine import driven, linear_axis
 from benchmarks.papers.threshold import sensing_axis
-from estimation.identification.calibrate import classify_recording, identify
+from estimation.identification.calibrate import identify
+from estimation.identification.classification import classify_recording
 from estimation.identification.fits import DrivenRecord, fit_capacitance_profile, fit_mechanics, fit_ringdown
 from phantoms.forward import InitialState, Plan, settled_state, simulate, simulate_trajectory
 from phantoms.waveforms import Constant, Sine
@@ -244,7 +245,8 @@ def test_a_recording_is_classified_as_rest_free_decay_or_driven(decay):
     assert classify_recording(made(angle=swinging, sense=swinging), "x") == "free decay"
     assert classify_recording(made(angle=swinging, drive=swinging), "x") == "driven"
     assert classify_recording(made(sense=swinging), "x") == "free decay without a reference angle"
-    assert classify_recording(made(sense=swinging, drive=swinging), "x") is None
+    assert classify_recording(made(sense=swinging, drive=swinging), "x") == "driven motion without a reference angle"
+    assert classify_recording(made(sense=still, drive=swinging), "x") is None
     assert classify_recording(made(sense=still), "y") is None
 
 

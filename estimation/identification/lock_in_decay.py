@@ -1,0 +1,69 @@
+"""Resonance and damping from a free decay that a lock-in amplifier recorded as amplitude and phase."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, IdentifiedValue
+from estimation.lock_in_channels import lock_in_phasor
+from scanner.arrays import Array, Complex
+from scanner.device import Axis
+from scanner.errors import BadInput
+from scanner.recording import Recording
+
+DECAY_START = 0.97
+"""Amplitude over the largest at which the decay begins: the drive is off by then."""
+
+
+def fit_lock_in_decay(recording: Recording, axis: Axis) -> dict[str, IdentifiedValue]:
+    """``k_over_J`` [1/s2] and ``b_over_J`` [1/s] from ``amplitude_x`` and ``phase_x``, by Z = Z0 exp((i d - g) t).
+
+    The filter of a lock-in amplifier makes neighbouring samples depend on each other: standard deviations are increased
+    by the correlation of neighbouring residuals.
+
+    Raises:
+        BadInput: the amplitude does not decay, or not exponentially.
+    """
+    from scipy.optimize import least_squares
+
+    channel = recording[f"amplitude_{axis.name}"]
+    time, phasor, frequency = lock_in_phasor(recording, axis)
+    size = np.abs(phasor)
+    first = int(np.argmax(size))
+    first += int(np.argmax(size[first:] < DECAY_START * size[first]))
+    time, phasor = time[first:] - time[first], phasor[first:]
+    if phasor.size < 8:
+        hint = "record the decay for longer, with the drive off"
+        raise BadInput("shows no free decay", file=channel.file, channel=channel.name, hint=hint)
+    size = np.abs(phasor)
+    decay, detuning = _first_guess(time, phasor, size)
+
+    def residual(x: Array) -> Array:
+        shape = np.exp((1j * x[1] - np.exp(x[0])) * time)
+        left = phasor - shape * (np.vdot(shape, phasor) / np.vdot(shape, shape))
+        return np.concatenate([left.real, left.imag])
+
+    fit = least_squares(residual, [np.log(decay), detuning], x_scale="jac")
+    left = fit.fun.reshape(2, -1)
+    if np.sqrt(2.0 * np.mean(left**2)) > MAX_RINGDOWN_RESIDUAL_RATIO * np.sqrt(np.mean(size[: size.size // 4] ** 2)):
+        hint = "cut the record to the decay alone; `lissajous diagnose` finds a damping that depends on the amplitude"
+        raise BadInput("does not follow an exponential decay", file=channel.file, channel=channel.name, hint=hint)
+    correlation = float(np.clip(np.sum(left[:, 1:] * left[:, :-1]) / max(np.sum(left**2), 1e-300), 0.0, 0.99))
+    variance = float(np.sum(left**2)) / (left.size - 4) * (1.0 + correlation) / (1.0 - correlation)
+    sd = np.sqrt(variance * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
+    g, w = float(np.exp(fit.x[0])), 2 * np.pi * frequency + float(fit.x[1])
+    return {
+        "k_over_J": IdentifiedValue(w**2 + g**2, float(2.0 * w * sd[1])),
+        "b_over_J": IdentifiedValue(2.0 * g, float(2.0 * g * sd[0])),
+    }
+
+
+def _first_guess(time: Array, phasor: Complex, size: Array) -> tuple[float, float]:
+    """Decay rate [1/s] and detuning [rad/s], by straight lines through log amplitude and phase above the noise."""
+    large = size > 0.1 * size[0]
+    large[np.argmin(large) if not large.all() else large.size :] = False
+    if large.sum() < 3:
+        large[:3] = True
+    slope = np.polyfit(time[large], np.log(np.maximum(size[large], 1e-300)), 1)[0]
+    detuning = np.polyfit(time[large], np.unwrap(np.angle(phasor[large])), 1)[0]
+    return max(-float(slope), 1e-3 / float(time[-1])), float(detuning)

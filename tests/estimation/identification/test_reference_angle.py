@@ -1,0 +1,112 @@
+"""Velocity, acceleration, lock-in output and a readout of the motion as references, and swept drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimation.identification.calibrate import identify
+from phantoms.forward import InitialState, Plan, simulate
+from phantoms.waveforms import Constant, Sweep, Waveform
+from scanner.device import Axis, Device
+from scanner.errors import BadInput
+from scanner.recording import Recording
+from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position, Velocity
+
+RATE, RESONANCE_HZ, QUALITY, INERTIA = 5e4, 1000.0, 50.0, 1e-10
+W = 2 * np.pi * RESONANCE_HZ
+TRUE = {"J": INERTIA, "b": INERTIA * W / QUALITY, "k": INERTIA * W**2}
+SENSORS = {
+    "angle": Position(10.0, 0.01),
+    "velocity": Velocity(10.0 / W, 0.01),
+    "acceleration": Acceleration(10.0 / W**2, 0.01),
+}
+
+
+def measure(readout: MotionSensor, drive: Waveform, seconds: float, start: InitialState, seed: int = 4) -> Recording:
+    axis = Axis(Mechanics(**TRUE), drive=Drive("linear", 1e-7), readout=readout, name="x")
+    recording, _ = simulate(
+        Device("true", {"x": axis}), Plan({"x": drive}, seconds, RATE), start={"x": start}, seed=seed
+    )
+    return recording
+
+
+def nominal(readout: MotionSensor | None = None) -> Device:
+    """Resonance 1 % off, Q 30 instead of 50, inertia 20 % off."""
+    mechanics = Mechanics(1.2 * INERTIA, 1.2 * INERTIA * W / 30.0, 1.224 * INERTIA * W**2)
+    axis = Axis(mechanics, drive=Drive("linear", 1e-7), readout=readout or Position(1.0, 0.0), name="x")
+    return Device("nominal", {"x": axis})
+
+
+def as_reference(recording: Recording, kind: str) -> Recording:
+    values = recording["sense_x"].read() / SENSORS[kind].gain
+    channels = {f"{kind}_x": (values, {"angle": "rad", "velocity": "rad/s", "acceleration": "rad/s2"}[kind], RATE)}
+    if np.ptp(recording["drive_x"].read()):
+        channels["drive_x"] = (recording["drive_x"].read(), "V", RATE)
+    return Recording.from_arrays(channels)
+
+
+def lock_in(recording: Recording, seconds: float) -> Recording:
+    """Amplitude and phase against 1 kHz, at 500 Hz."""
+    time = recording["sense_x"].time()
+    mixed = 2j * recording["sense_x"].read() / SENSORS["angle"].gain * np.exp(-1j * W * time)
+    length = round(RATE / 500.0)
+    phasor = mixed[: mixed.size // length * length].reshape(-1, length).mean(axis=1)
+    about = {"reference": RESONANCE_HZ}
+    first = 0.5 * (length - 1) / RATE
+    return Recording.from_arrays(
+        {
+            "amplitude_x": (np.abs(phasor), "rad", 500.0, first, about),
+            "phase_x": (np.angle(phasor), "rad", 500.0, first, about),
+        }
+    )
+
+
+def assert_within(values: dict, names: list[str], relative_sd: float = 0.05) -> None:
+    true = TRUE | {"k_over_J": W**2, "b_over_J": W / QUALITY}
+    for key in names:
+        assert values[key].value == pytest.approx(true[key], abs=4.5 * values[key].sd + 1e-3 * true[key])
+        assert values[key].sd < relative_sd * true[key]
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_a_fast_sweep_determines_the_mechanics(kind: str) -> None:
+    sweep = Sweep(950.0, 1050.0, 0.4, 10.0)
+    found = identify([as_reference(measure(SENSORS[kind], sweep, 0.4, InitialState(0.0, 0.0)), kind)], nominal())
+    assert_within(found.values["x"], ["k_over_J", "b_over_J"])
+    values = found.values["x"]
+    assert values["J"].value == pytest.approx(INERTIA, rel=5e-3)
+    assert 0.019 < values["J"].sd / values["J"].value < 0.022  # the tolerance of the torque
+
+
+def test_the_stated_gain_of_a_readout_scales_the_inertia() -> None:
+    sweep = Sweep(950.0, 1050.0, 0.4, 10.0)
+    recording = measure(SENSORS["velocity"], sweep, 0.4, InitialState(0.0, 0.0))
+    found = identify([recording], nominal(SENSORS["velocity"]))
+    assert found.used["x"] == [f"{recording.name}: driven motion without a reference angle, from sense_x"]
+    assert found.values["x"]["J"].sd / INERTIA == pytest.approx(np.hypot(0.02, 0.02), rel=0.05)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "acceleration"])
+def test_a_decay_of_velocity_or_acceleration_determines_the_ratios(kind: str) -> None:
+    decay = measure(SENSORS[kind], Constant(0.0), 0.1, InitialState(0.1, 0.0))
+    found = identify([as_reference(decay, kind)], nominal())
+    assert_within(found.values["x"], ["k_over_J", "b_over_J"])
+    assert any("J stays as stated" in note for note in found.notes)
+
+
+def test_a_decay_behind_a_lock_in_amplifier_determines_the_ratios() -> None:
+    recording = measure(SENSORS["angle"], Constant(0.0), 0.1, InitialState(0.1, 0.0))
+    found = identify([lock_in(recording, 0.1)], nominal())
+    assert_within(found.values["x"], ["k_over_J", "b_over_J"])
+    assert found.used["x"] == ["recording: free decay, from amplitude_x and phase_x"]
+
+
+def test_a_steady_tone_leaves_the_inertia_open() -> None:
+    tone = Sweep(1003.0, 1003.0, 0.4, 10.0)
+    steady = as_reference(measure(SENSORS["velocity"], tone, 0.4, InitialState(0.0, 0.0)), "velocity")
+    settled = Recording.from_arrays(
+        {name: (steady[name].read()[10_000:], steady[name].unit, RATE) for name in ("velocity_x", "drive_x")}
+    )
+    with pytest.raises(BadInput, match="does not determine J; record two or more drive frequencies, or a sweep"):
+        identify([settled], nominal())
