@@ -135,8 +135,7 @@ def estimated_motion(result: Reconstruction, size: int) -> Array:
     motion = result.sample_motion
     if motion is None or not motion.moving:
         return np.zeros((2, size))
-    middle = (np.arange(len(motion.shift)) + 0.5) * motion.length - 0.5
-    return np.stack([np.interp(np.arange(size), middle, each) for each in motion.shift.T])
+    return motion.at(np.arange(size))
 
 
 def centred(values: Array) -> Array:
@@ -186,8 +185,8 @@ def measure_scan(kind: str, photons: float, seed: int) -> dict[str, float]:
         row[f"{name} px"] = float(np.sqrt(np.mean(np.sum((motion - truth) ** 2, axis=0))))
         row[f"{name} picture"] = picture_error(motion, angles) / known
     if result.sample_motion is not None and row["moving"]:
-        at = (np.arange(len(result.sample_motion.shift)) + 0.5) * result.sample_motion.length
-        error = found[:, at.astype(int)] - truth[:, at.astype(int)]
+        at = np.round(result.sample_motion.sample).astype(int)
+        error = found[:, at] - truth[:, at]
         row["within 95 %"] = float(np.mean(np.abs(error.T) < 1.96 * result.sample_motion.sd))
     return row
 

@@ -145,7 +145,7 @@ def _find_jumps(
             near = slice(max(block - JUMP_WINDOW, 0), block + JUMP_WINDOW + 1)
             if likelihood > best + MIN_JUMP_GAIN:
                 walk, best, variance, found = its_walk, likelihood, trial, [*found, block]
-                free[max(block - 1, 0) : block + 3] = False
+                free[near] = False
                 break
             size[near] = 0.0
         else:

@@ -15,6 +15,7 @@ import numpy as np
 
 from recon.imaging.motion_smoother import SmoothedMotion, smooth_motion
 from recon.imaging.sample_motion_equations import ScanSamples, block_equations
+from recon.imaging.sample_motion_jumps import place_jumps
 from recon.imaging.sample_motion_search import search_motion
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -54,22 +55,28 @@ class SampleMotion:
 
     Attributes:
         length: samples in a block, a period of the slower axis.
-        shift: x and y at the middle of each block, shape (blocks, 2) [px]; 0 for a sample at rest.
-        sd: of ``shift``, shape (blocks, 2) [px]; for a sample at rest that of the position of a single block.
+        sample: sample numbers of the knots between which the displacement is linear: the middles of blocks, and two
+            knots at each jump, shape (knots,).
+        shift: x and y at the knots, shape (knots, 2) [px]; 0 for a sample at rest.
+        sd: of ``shift``, shape (knots, 2) [px]; for a sample at rest that of the position of a single block.
         moving: whether a motion was found.
         gain: of the log likelihood by the motion over rest.
     """
 
     length: int
+    sample: Array
     shift: Array
     sd: Array
     moving: bool
     gain: float
 
     def times(self, intensity: Channel) -> Array:
-        """Middle of each block on the clock of the intensity that it was estimated from, shape (blocks,) [s]."""
-        middle = (np.arange(len(self.shift)) + 0.5) * self.length - 0.5
-        return np.asarray(intensity.start + middle / intensity.sample_rate)
+        """Times of the knots on the clock of the intensity that the motion was estimated from, shape (knots,) [s]."""
+        return np.asarray(intensity.start + self.sample / intensity.sample_rate)
+
+    def at(self, sample: Array) -> Array:
+        """Displacement at sample numbers, shape (2, n) [px]."""
+        return np.stack([np.interp(sample, self.sample, each) for each in self.shift.T])
 
 
 def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int, int]) -> SampleMotion | None:
@@ -94,7 +101,8 @@ def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int
     if gain < MIN_LOG_LIKELIHOOD_GAIN:
         of_a_block = smoothed.scale * np.linalg.inv(found.information.mean(axis=0) + MIN_INFORMATION * np.eye(2))
         sd = np.tile(np.sqrt(np.diag(of_a_block)), (blocks, 1))
-        return SampleMotion(length, shift, sd, False, gain)
+        middle: Array = np.asarray((np.arange(blocks) + 0.5) * length - 0.5, np.float64)
+        return SampleMotion(length, middle, shift, sd, False, gain)
     shift = _coarse_motion(samples, length, blocks, shape)
     for coarse in COARSE_WIDTHS_PX:
         smoothed = _round(samples, shift, length, shape, coarse, smoothed.walk)
@@ -107,7 +115,8 @@ def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int
         shift = smoothed.position
         if change < CONVERGED_SD:
             break
-    return SampleMotion(length, shift, sd, True, gain)
+    knots = place_jumps(samples, shift, sd, smoothed.jumps, length, shape, width)
+    return SampleMotion(length, *knots, True, gain)
 
 
 def choose_width(samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int]) -> tuple[float, float]:

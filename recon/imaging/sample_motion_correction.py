@@ -33,14 +33,12 @@ class SampleAngle:
 
     Attributes:
         track: of the beam.
-        first: number of the sample at the first of ``shift``.
-        step: samples from one of ``shift`` to the next.
-        shift: displacement of the sample, shape (n,) [rad]; linear between its times, constant before and after them.
+        sample: increasing sample numbers, shape (n,).
+        shift: displacement of the sample there, shape (n,) [rad]; linear between them, constant before and after.
     """
 
     track: AngleTrack
-    first: float
-    step: int
+    sample: Array
     shift: Array
 
     @property
@@ -61,8 +59,7 @@ class SampleAngle:
     def read(self, first: int = 0, stop: int | None = None) -> Array:
         """Return the positions of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
         index = np.arange(*slice(first, stop).indices(self.size))
-        shift = np.interp((index - self.first) / self.step, np.arange(self.shift.size), self.shift)
-        return self.track.read(first, stop) - shift
+        return self.track.read(first, stop) - np.interp(index, self.sample, self.shift)
 
     def negated(self) -> SampleAngle:
         """Return the positions for the motion of the mirror and of the sample with the opposite sign."""
@@ -108,7 +105,7 @@ def relative_to_sample(beam: Motion, motion: SampleMotion | None, grid: Grid) ->
         return beam
     axes = dict(beam.axes)
     for name, shift, pixel in zip(AXES, motion.shift.T, grid.pixel_angle, strict=True):
-        angle = SampleAngle(axes[name].angle, 0.5 * (motion.length - 1), motion.length, shift * pixel)
+        angle = SampleAngle(axes[name].angle, motion.sample, shift * pixel)
         axes[name] = replace(axes[name], angle=angle)
     return replace(beam, axes=axes)
 

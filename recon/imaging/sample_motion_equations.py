@@ -70,9 +70,7 @@ def block_equations(
         shape: height and width of the picture.
         width: standard deviation of the kernel [px].
     """
-    sums = np.zeros((FOLDS, *shape, 4))
-    _accumulate(*samples, shift, length, sums)
-    reference = np.stack([_reference(sums.sum(axis=0) - own, width) for own in sums])
+    reference = fold_references(samples, shift, length, shape, width)
     moments = np.zeros((len(shift), 2 + NUISANCES + 1, 2 + NUISANCES + 1))
     counts = np.zeros((len(shift), 2))
     centre = 0.5 * np.array(shape[::-1], float)
@@ -91,6 +89,17 @@ def block_equations(
     information = moments[:, :2, :2] / misfit - gain @ np.swapaxes(coupling, 1, 2)
     score = moments[:, :2, -1] / misfit - (gain @ (moments[:, 2:-1, -1:] / misfit / scale[..., None]))[..., 0]
     return BlockEquations(score, information, misfit, compared)
+
+
+def fold_references(samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int], width: float) -> Array:
+    """Return the picture of the samples of all other folds, by fold, shape (FOLDS, height, width, 5).
+
+    It holds kernel mean, mean place x and y, and gradient in x and y of the intensity by pixel; NaN where unknown.
+    Block k belongs to fold k modulo ``FOLDS``. Args as in :func:`block_equations`.
+    """
+    sums = np.zeros((FOLDS, *shape, 4))
+    _accumulate(*samples, shift, length, sums)
+    return np.stack([_reference(sums.sum(axis=0) - own, width) for own in sums])
 
 
 def _reference(sums: Array, width: float) -> Array:

@@ -1,0 +1,78 @@
+"""Moments at which the sample jumps, to single samples of the scan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.imaging.sample_motion_equations import FOLDS, ScanSamples, fold_references
+from scanner.arrays import Array
+
+MARGIN_BLOCKS = 2
+"""Blocks from that of a jump to those whose displacements hold before and after it: noise may show it a block away."""
+
+
+class MotionKnots(NamedTuple):
+    """Displacement that is linear between its knots: sample numbers (n,), displacement and sd (n, 2) [px]."""
+
+    sample: Array
+    shift: Array
+    sd: Array
+
+
+def place_jumps(
+    samples: ScanSamples,
+    shift: Array,
+    sd: Array,
+    jumps: Sequence[int],
+    length: int,
+    shape: tuple[int, int],
+    width: float,
+) -> MotionKnots:
+    """Return the motion with knots in the middles of blocks, and two knots at each jump in place of those around it.
+
+    The jump lies where the squared residuals under the displacement before it, up to there, and under that after it,
+    from there on, have the least sum.
+
+    Args:
+        samples: of the scan.
+        shift, sd: displacement of each block and its standard deviation, shape (blocks, 2) [px].
+        jumps: blocks that contain a jump.
+        length, shape, width: as for :func:`recon.imaging.sample_motion_equations.block_equations`.
+    """
+    middle = (np.arange(len(shift)) + 0.5) * length - 0.5
+    inside = sorted(block for block in jumps if MARGIN_BLOCKS <= block < len(shift) - MARGIN_BLOCKS)
+    references = fold_references(samples, shift, length, shape, width) if inside else np.empty(0)
+    keep, knots, places = np.ones(len(shift), bool), [], []
+    for block in inside:
+        before, after = block - MARGIN_BLOCKS, block + MARGIN_BLOCKS
+        part = np.arange((before + 1) * length, after * length)
+        fold = part // length % FOLDS
+        errors = [_residuals(samples, part, shift[at], references, fold) ** 2 for at in (before, after)]
+        change = np.nan_to_num(errors[0] - errors[1])
+        misfit = np.concatenate([[0.0], np.cumsum(change)])
+        least = np.flatnonzero(misfit == misfit.min())  # several where samples lie outside the picture
+        place = part[0] + int(least[[0, -1]].mean())
+        keep[before + 1 : after] = False
+        knots += [before, after]
+        places += [place - 1.0, float(place)]
+    at = np.concatenate([middle[keep], places])
+    source = np.concatenate([np.flatnonzero(keep), np.array(knots, int)])
+    order = np.argsort(at, kind="stable")
+    return MotionKnots(at[order], shift[source[order]], sd[source[order]])
+
+
+def _residuals(
+    samples: ScanSamples, part: NDArray[np.int64], shift: Array, references: Array, fold: NDArray[np.int64]
+) -> Array:
+    """Intensity less the picture of the other blocks under a displacement; NaN where it is not known."""
+    x, y = samples.x[part] - shift[0], samples.y[part] - shift[1]
+    height, width = references.shape[1:3]
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    row, column = np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)
+    value, cx, cy, gx, gy = np.moveaxis(references[fold, row, column], -1, 0)
+    residual = samples.value[part] - value - gx * (x - cx) - gy * (y - cy)
+    return np.where(inside, residual, np.nan)
