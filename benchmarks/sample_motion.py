@@ -13,17 +13,18 @@ rest at 10, 100 or 1000 photons, the scans last 0.06 s, and those reported as mo
 from __future__ import annotations
 
 import argparse
-import time
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
+from estimation.estimate import default_estimator
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector, blur_by_spot, detect, sample_scene
 from phantoms.targets import TISSUES, make_target
 from recon.imaging.gridding import map_samples
-from recon.pipeline import reconstruct
+from recon.pipeline import correct_sample_motion, estimate_motion, reconstruct
+from recon.preparation import prepare
 from recon.reconstruction import Options, Reconstruction
 from scanner.arrays import Array
 from scanner.recording import Recording
@@ -110,12 +111,11 @@ def simulate_scan(kind: str, photons: float, seed: int, duration: float = DURATI
     return Scan(recording.with_channel(replace(recording["intensity"], raw=intensity)), moved, angles, picture)
 
 
-def register_frames(scan: Scan, result: Reconstruction) -> Array:
+def register_frames(x: Array, y: Array, result: Reconstruction) -> Array:
     """Displacement of the samples by phase correlation of successive mean pictures, shape (2, n) [px]."""
     from skimage.registration import phase_cross_correlation
 
     intensity, grid = result.intensity.read(), result.picture.grid
-    x, y = (result.beam.axes[axis].angle.read() for axis in "xy")
     edges = np.arange(0, intensity.size + 1, round(FRAME_S * result.intensity.sample_rate))
     middles, shifts, reference = 0.5 * (edges[1:] + edges[:-1]), [], np.zeros((PIXELS, PIXELS))
     for k, (first, stop) in enumerate(pairwise(edges)):
@@ -143,21 +143,17 @@ def centred(values: Array) -> Array:
 
 
 def measure_scan(kind: str, photons: float, seed: int) -> dict[str, float]:
-    """Errors of motion [px] and of pictures by method, and computing time."""
+    """Errors of motion [px] and of pictures by method."""
     scan = simulate_scan(kind, photons, seed)
-    options = Options(pixels=(PIXELS, PIXELS))
-    plain = reconstruct(scan.recording, options, quiet=True)
-    flips = {axis: float(plain.beam.axes[axis].angle.read() @ scan.truth[axis]) < 0.0 for axis in "xy"}
-    options = replace(options, flips=flips)  # the sense signal does not determine the signs
-    if any(flips.values()):
-        plain = reconstruct(scan.recording, options, quiet=True)
-    began = time.process_time()
-    result = reconstruct(scan.recording, replace(options, sample_motion=True), quiet=True)
-    seconds = time.process_time() - began
-    intensity, grid, truth = plain.intensity.read(), plain.picture.grid, centred(scan.displacement)
+    result = reconstruct(scan.recording, Options(pixels=(PIXELS, PIXELS), sample_motion=True), quiet=True)
+    intensity, grid, truth = result.intensity.read(), result.picture.grid, centred(scan.displacement)
+    mirror = [result.motion.axes[axis].angle.read() for axis in "xy"]
+    # The sense signal does not determine the signs of the axes.
+    signs = [np.sign(angle @ scan.truth[axis]) for axis, angle in zip("xy", mirror, strict=True)]
+    mirror = [sign * angle for sign, angle in zip(signs, mirror, strict=True)]
     pixel = np.array(grid.pixel_angle)
     offset = scan.displacement.mean(axis=1)  # no sample determines it; taken out for the comparison with the scene
-    beam = {name: [each.beam.axes[axis].angle for axis in "xy"] for name, each in (("own", result), ("plain", plain))}
+    own = [sign * result.beam.axes[axis].angle.read() for sign, axis in zip(signs, "xy", strict=True)]
 
     def picture_error(motion: Array, angles: list[Array]) -> float:
         x, y = (
@@ -169,15 +165,12 @@ def measure_scan(kind: str, photons: float, seed: int) -> dict[str, float]:
         used[:12] = used[-12:] = used[:, :12] = used[:, -12:] = False  # other parts of the sample move into the edge
         return float(np.sqrt(np.mean((image - scan.picture)[used] ** 2)))
 
-    mirror = [each.read() for each in beam["plain"]]
     true_mirror = [scan.truth[axis] for axis in "xy"]
-    correlated = centred(register_frames(scan, plain))
-    found = centred(estimated_motion(result, intensity.size))
-    corrected = [each.read() + shift * size for each, shift, size in zip(beam["own"], found, pixel, strict=True)]
+    correlated = centred(register_frames(*mirror, result))
+    found = centred(np.array(signs)[:, None] * estimated_motion(result, intensity.size))
+    corrected = [angle + shift * size for angle, shift, size in zip(own, found, pixel, strict=True)]
     known = picture_error(truth, true_mirror)
-    row = {"moving": float(result.sample_motion is not None and result.sample_motion.moving), "seconds": seconds}
-    row |= {"gain": result.sample_motion.gain if result.sample_motion else np.nan}
-    row |= {"known": known}
+    row = {"moving": float(result.sample_motion is not None and result.sample_motion.moving), "known": known}
     methods = {
         "none": (np.zeros_like(truth), mirror), "correlation": (correlated, mirror), "own": (found, corrected)
     }  # fmt: skip
@@ -196,7 +189,11 @@ def measure_rest(seed: int) -> tuple[bool, float]:
     photons = REST_PHOTONS[seed // len(SCENES) % len(REST_PHOTONS)]
     scan = simulate_scan("rest", photons, seed, REST_DURATION_S)
     options = Options(pixels=(PIXELS, PIXELS), sample_motion=True)
-    motion = reconstruct(scan.recording, options, quiet=True).sample_motion
+    prepared = prepare(scan.recording, None)
+    estimated = estimate_motion(
+        prepared, replace(options, estimator=default_estimator(prepared.recording, prepared.device))
+    )
+    motion = correct_sample_motion(estimated, options).sample_motion
     return (motion.moving, motion.gain) if motion is not None else (False, 0.0)
 
 
@@ -211,7 +208,11 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.scans)
     if arguments.rest:
-        found = [measure_rest(seed) for seed in seeds]
+        found = []
+        for seed in seeds:
+            found.append(measure_rest(seed))
+            if arguments.verbose:
+                print(seed, found[-1], flush=True)
         gains = np.sort([gain for _, gain in found])
         print(f"at rest: {sum(moving for moving, _ in found)} of {len(found)} reported as moving")
         print(f"gains of the log likelihood: median {np.median(gains):.2g}, largest {gains[-3:].round(2)}")
