@@ -12,7 +12,7 @@ Computation 4, 415 (1992).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -26,6 +26,7 @@ from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import estimate_whiteners
 from estimation.diagnosis.model import Model, uncertain
 from estimation.diagnosis.parameters import Candidate
+from estimation.diagnosis.pruning import refit_without
 from estimation.diagnosis.screening import (
     ScoreTest,
     amplitude_indices,
@@ -52,8 +53,9 @@ MIN_SCORE_GAIN = 10.0
 """Fall of -2 log evidence from which a law is added: 150 in probability, which leaves a margin for the choice among
 the catalogue."""
 
-MAX_SCALE_BESIDE = 0.3
-"""Scale of a discrepancy, in units of its prior, up to which it is small enough to be linear beside a law."""
+MAX_SCALE_BESIDE = 0.1
+"""Largest scale of a discrepancy beside which laws are selected, in units of its prior: a tenth of a discrepancy that
+explains a misfit by itself."""
 
 MAX_LAWS = 3
 """Laws that are selected together."""
@@ -70,12 +72,6 @@ MAX_RESIDUAL_RATIO = 0.3
 MAX_CHI2_RATIO = 100.0
 """Chi-square of the selected laws over that of the fit around which they were selected, above which they were not
 linear."""
-
-MIN_SHARE = 0.03
-"""Share of the misfit below which a law beside others is left to the remainder: unlisted imperfections take as much."""
-
-MIN_BULK = 0.5
-"""Share that a named law has to take of what it and a free correction of its stage take together."""
 
 
 @dataclass(frozen=True)
@@ -140,11 +136,12 @@ class LinearModel:
         return [term.columns for term in self.discrepancies]
 
     def hypothesis(self, laws: Sequence[int], scales: Array | None = None, iterations: int = SCALE_ITERATIONS,
-                   without: Collection[int] = ()) -> Hypothesis:  # fmt: skip
+                   without: Collection[int] = (), max_scale: float = MAX_SCALE) -> Hypothesis:  # fmt: skip
         """The laws beside the discrepancy, its scales by maximum evidence from ``scales`` on.
 
         Args:
             without: discrepancy terms that are left out.
+            max_scale: upper bound of the scales.
         """
         groups = [group for i, group in enumerate(self._groups) if i not in without]
         of_laws = [column for i in laws for column in self.laws[i].columns]
@@ -167,7 +164,7 @@ class LinearModel:
             for i, (low, high) in enumerate(pairwise(ends)):
                 determined = (high - low) - float(variance[low:high].sum()) / values[i]
                 new[i] = float(estimate[low:high] @ estimate[low:high]) / max(determined, 1e-3)
-            values = np.clip(new, MIN_SCALE**2, MAX_SCALE**2)
+            values = np.clip(new, MIN_SCALE**2, max_scale**2)
         misfit = float(np.sum(regression.remainder**2))
         shapes = sum(self.laws[i].cost for i in laws)
         cost = regression.log_determinant - float(np.log(precision).sum())
@@ -176,8 +173,11 @@ class LinearModel:
         return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes, misfit)
 
     def select(self) -> Hypothesis:
-        """The laws that no addition, removal or exchange improves; each has to gain ``MIN_SCORE_GAIN``."""
-        best = self.hypothesis(())
+        """The laws beside a small discrepancy that no addition, removal or exchange improves.
+
+        Each has to gain ``MIN_SCORE_GAIN``.
+        """
+        best = self.hypothesis((), max_scale=MAX_SCALE_BESIDE)
         while True:
             better = min(self._moves(best), key=_score, default=best)
             if _score(better) > _score(best) - MIN_EXCHANGE_GAIN:
@@ -189,7 +189,7 @@ class LinearModel:
             yield from self.beside(best.laws, best.scales)
         for i in best.laws:
             rest = tuple(law for law in best.laws if law != i)
-            yield self.hypothesis(rest, best.scales)
+            yield self.hypothesis(rest, best.scales, max_scale=MAX_SCALE_BESIDE)
             yield from self.beside(rest, best.scales)
 
     def beside(self, laws: tuple[int, ...], scales: Array) -> list[Hypothesis]:
@@ -200,7 +200,7 @@ class LinearModel:
         for factor in SCREENING_FACTORS:
             gains = self._gains(laws, np.maximum(scales * factor**2, MIN_SCALE**2), others)
             chosen |= {others[i] for i in np.argsort(-gains)[:SCREENED_LAWS]}
-        return [self.hypothesis((*laws, i), scales) for i in sorted(chosen)]
+        return [self.hypothesis((*laws, i), scales, max_scale=MAX_SCALE_BESIDE) for i in sorted(chosen)]
 
     def _gains(self, laws: Sequence[int], scales: Array, others: Sequence[int]) -> Array:
         """Fall of -2 log evidence by each of ``others`` beside ``laws``, at fixed scales."""
@@ -230,23 +230,9 @@ class LinearModel:
         of_laws = np.asarray(-np.linalg.solve(regression.factor, regression.projected[:, 0]))
         return of_laws, -(self.profile[:, at] @ of_laws + self.profile[:, -1])
 
-    def share(self, hypothesis: Hypothesis, law: int) -> float:
-        """Share of the misfit that only this law of a hypothesis explains, without a discrepancy."""
-        everything = range(len(self.discrepancies))
-        sets = (), tuple(i for i in hypothesis.laws if i != law), hypothesis.laws
-        nothing, without, whole = (self.hypothesis(laws, hypothesis.scales, 0, everything).misfit for laws in sets)
-        return (without - whole) / max(nothing - whole, 1e-300)
-
-    def without_small(self, hypothesis: Hypothesis) -> Hypothesis:
-        """Without laws that explain less than an unlisted imperfection may."""
-        exact = self.hypothesis(hypothesis.laws, np.full(len(self.discrepancies), MIN_SCALE**2), 0)
-        if len(hypothesis.laws) < 2 or exact.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN:
-            return hypothesis
-        smallest = min(hypothesis.laws, key=lambda i: self.share(hypothesis, i))
-        if self.share(hypothesis, smallest) > MIN_SHARE:
-            return hypothesis
-        rest = tuple(i for i in hypothesis.laws if i != smallest)
-        return self.without_small(self.hypothesis(rest, hypothesis.scales))
+    def effects(self, laws: Iterable[int]) -> set[str]:
+        """Names of laws."""
+        return {self.laws[i].candidate.term.effect for i in laws}
 
     def rivals(self, hypothesis: Hypothesis, law: int) -> tuple[RivalFit, ...]:
         """Other laws in the place of one, the best of each first.
@@ -262,15 +248,10 @@ class LinearModel:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
-    def bulk(self, hypothesis: Hypothesis, law: int) -> float:
-        """Share that a law takes of what it and a free correction of its stage take together, beside all others."""
-        stage = self.laws[law].candidate.term.stage
-        of_stage = [i for i, term in enumerate(self.discrepancies) if term.candidate.term.stage == stage]
-        rest = tuple(i for i in hypothesis.laws if self.laws[i].candidate.term.stage != stage)
-        nothing = self.hypothesis(rest, hypothesis.scales, 0, of_stage).misfit
-        named = self.hypothesis(hypothesis.laws, hypothesis.scales, 0, of_stage).misfit
-        free = self.hypothesis(hypothesis.laws, None, SCALE_ITERATIONS).misfit
-        return (nothing - named) / max(nothing - min(free, named), 1e-300)
+    def gain_of_discrepancy(self, laws: Sequence[int], stage: str | None = None) -> float:
+        """Fall of the misfit by the discrepancy terms of one stage, or of all, beside laws and all other terms."""
+        dropped = [i for i, term in enumerate(self.discrepancies) if stage in (None, term.candidate.term.stage)]
+        return max(self.hypothesis(laws, without=dropped).misfit - self.hypothesis(laws).misfit, 0.0)
 
 
 def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> LinearModel:
@@ -354,30 +335,62 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
         return None  # every law would be compared with noise alone
     if not _follows(fit) or not all(_is_linear(candidate) for candidate in uncertain(fit.model)):
         return None
+    tried: list[set[str]] = []
     for _ in range(MAX_LINEARISATIONS):
         likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
         fit = fit_model(likelihood, fit.model, fit.x)
         linear = linear_model(likelihood, fit, candidates)
-        hypothesis = linear.without_small(linear.select())
-        laws = [linear.laws[i] for i in hypothesis.laws]
-        effects = {law.candidate.term.effect for law in laws}
-        progress(f"beside a discrepancy: {', '.join(sorted(effects)) or 'no named law'}")
-        if not effects:
+        present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
+        laws = linear.select().laws
+        progress(f"beside a discrepancy: {', '.join(sorted(linear.effects(laws))) or 'no named law'}")
+        if not laws:
             return None
-        if effects == {candidate.term.effect for candidate in uncertain(fit.model)}:
+        if linear.effects(laws) == linear.effects(present):
             break
-        with_laws = _fit_laws(likelihood, fit, linear, hypothesis.laws)
+        with_laws = _fit_laws(likelihood, fit, linear, laws)
         if with_laws.chi2 > MAX_CHI2_RATIO * fit.chi2:
             return None
+        effects = linear.effects(laws)
+        if effects in tried and with_laws.neg2_log_evidence > fit.neg2_log_evidence:
+            break
+        tried.append(effects)
         fit = with_laws
     else:
         return None
-    least_bulk = min(linear.bulk(hypothesis, i) for i in hypothesis.laws)
-    if np.max(hypothesis.scales) > MAX_SCALE_BESIDE**2 or least_bulk < MIN_BULK:
+    laws, fit = _without_imitations(likelihood, fit, linear, present)
+    if not laws:
         return None
-    keys = {candidate.term.effect: candidate.key for candidate in uncertain(fit.model)}
-    rivals = {keys[linear.laws[i].candidate.term.effect]: linear.rivals(hypothesis, i) for i in hypothesis.laws}
+    hypothesis = linear.hypothesis(laws, max_scale=MAX_SCALE_BESIDE)
+    rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in laws}
     return Choice(likelihood, fit, rivals)
+
+
+def _without_imitations(
+    likelihood: Likelihood, fit: Fit, linear: LinearModel, laws: tuple[int, ...]
+) -> tuple[tuple[int, ...], Fit]:
+    """The laws that take the bulk of a misfit, and the fit with them; the others imitate an unlisted imperfection.
+
+    A law has to gain more than a free correction of its stage still gains, and beside a law that gains more, also more
+    than the corrections of all stages.
+    """
+    while laws:
+        gains = {law: _gain(likelihood, fit, linear.laws[law].candidate) for law in laws}
+        largest = max(laws, key=lambda law: gains[law])
+        of_all = linear.gain_of_discrepancy(laws)
+        surplus = {law: gain - of_all for law, gain in gains.items()}
+        surplus[largest] = gains[largest] - linear.gain_of_discrepancy(laws, linear.laws[largest].candidate.term.stage)
+        least = min(laws, key=lambda law: surplus[law])
+        if surplus[least] > 0.0:
+            break
+        laws = tuple(law for law in laws if law != least)
+        fit = refit_without(likelihood, fit, linear.laws[least].candidate)
+    return laws, fit
+
+
+def _gain(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> float:
+    """Fall of the misfit by one term of a fit, with everything else refitted."""
+    without = refit_without(likelihood, fit, candidate)
+    return without.chi2 + without.penalty - fit.chi2 - fit.penalty
 
 
 def _is_linear(candidate: Candidate) -> bool:
