@@ -29,8 +29,14 @@ _CONDITIONS: dict[str, Callable[[Any], bool]] = {
 T = TypeVar("T")
 
 
-def checked_number(value: object, must: str, key: str) -> float | int:
+def checked_number(value: object, must: str, key: str, hint: str = "") -> float | int:
     """Return ``value`` as a number that satisfies ``must``. true and false are not numbers.
+
+    Args:
+        value: of the device file.
+        must: condition.
+        key: of the value.
+        hint: what to do where it is a number that does not satisfy the condition.
 
     Raises:
         DeviceInvalid: it does not; the error names ``key``.
@@ -39,6 +45,7 @@ def checked_number(value: object, must: str, key: str) -> float | int:
         with suppress(OverflowError):  # an integer of TOML may be too large for a float
             if isfinite(value) and _CONDITIONS[must](value):
                 return value if must == WHOLE["must"] else float(value)
+            raise DeviceInvalid(f"is {value!r} and must {must}", channel=key, hint=hint or None)
     raise DeviceInvalid(f"is {value!r} and must {must}", channel=key)
 
 
@@ -53,7 +60,7 @@ def check_values(record: object) -> None:
                 raise DeviceInvalid(f"is {value!r} and must be a list of numbers", channel=item.name)
             checked: object = tuple(checked_number(number, must, item.name) for number in value)
         else:
-            checked = checked_number(value, must, item.name)
+            checked = checked_number(value, must, item.name, item.metadata.get("hint", ""))
         object.__setattr__(record, item.name, checked)
 
 

@@ -13,6 +13,8 @@ from scanner import device_toml
 from scanner.device_toml import CAN_BE_OFF, FINITE, NONZERO, NOT_NEGATIVE, POSITIVE, WHOLE
 from scanner.errors import DeviceInvalid
 
+NO_SPRING_HINT = {"hint": "a device without a spring has no resonance: state its stiffness, or leave out its mechanics"}
+
 
 class Checked:
     """A table of the device file. Its values are checked and converted to float when it is made."""
@@ -33,7 +35,7 @@ class Mechanics(Checked):
 
     J: float = field(metadata=POSITIVE)
     b: float = field(metadata=POSITIVE)
-    k: float = field(metadata=POSITIVE)
+    k: float = field(metadata=POSITIVE | NO_SPRING_HINT)
 
     @property
     def resonance(self) -> float:

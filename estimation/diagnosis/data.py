@@ -151,6 +151,12 @@ def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Ru
     compared = tuple(
         _output(recording[name], sensed, device, step, n, grid_start, lines) for name, (_, sensed) in channels.items()
     )
+    for output in compared:
+        if sum(output.guard) >= output.data.size:
+            slowest = min(device.axis(name).resonance for name in output.axes)
+            what = f"covers {(end - start) * slowest:.2g} periods of a resonance at {slowest:.4g} Hz"
+            hint = "record at least 8 periods, or correct J and k of the device"
+            raise BadInput(what, file=recording.path, channel=output.name, hint=hint)
     scales = {
         name: _scales(device, name, inputs[name], compared, lines[name], len(axes) > 1, end - start) for name in axes
     }
@@ -182,16 +188,17 @@ def _output_channels(recording: Recording, device: Device) -> dict[str, tuple[st
 def _check_rate(
     recording: Recording, channel: Channel, axes: tuple[str, ...], device: Device, drives: Mapping[str, list[Channel]]
 ) -> None:
-    """Refuse a channel that is sampled too slowly for the motion of a free decay.
+    """Refuse a channel that is sampled too slowly for the motion.
 
-    A driven axis moves at the drive's frequency, which may lie far below its resonance.
+    A free decay moves at its resonance. A driven axis moves at the drive's frequency, which may lie below its
+    resonance. Where neither drive nor channel can contain the resonance, its values cannot be determined.
 
     Raises:
         BadInput: fewer than ``MIN_SAMPLES_PER_PERIOD`` samples in a period of the resonance.
     """
     fastest = max(device.axis(name).resonance for name in axes)
-    driven = any(float(np.ptp(drive.read())) > 0.0 for name in axes for drive in drives[name])
-    if driven or channel.sample_rate >= MIN_SAMPLES_PER_PERIOD * fastest:
+    driving = [drive for name in axes for drive in drives[name] if float(np.ptp(drive.read())) > 0.0]
+    if max([channel.sample_rate, *(drive.sample_rate for drive in driving)]) >= MIN_SAMPLES_PER_PERIOD * fastest:
         return
     what = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for a resonance at {fastest:.4g} Hz"
     hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * fastest:.4g} Hz or more, or correct J and k of the device"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimation.diagnosis.data import MIN_SAMPLES_PER_PERIOD
 from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S, IdentifiedValue
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -43,6 +44,14 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
 
     readout, resonance = axis.require_readout(), axis.resonance
     order = 1 if isinstance(readout, MotionSensor) else 2
+    if channel.sample_rate < MIN_SAMPLES_PER_PERIOD * order * resonance:
+        what = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for a resonance at {resonance:.4g} Hz"
+        hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * order * resonance:.4g} Hz or more, or correct J and k"
+        raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
+    cycles = channel.size / channel.sample_rate * resonance
+    if cycles < 0.5 * MIN_CYCLES:  # of the nominal resonance; that of the signal is known later
+        hint = f"record {MIN_CYCLES:g} cycles or more"
+        raise BadInput(f"holds {cycles:.3g} cycles of a free decay", file=channel.file, channel=channel.name, hint=hint)
     w0 = 2 * np.pi * _line(channel, order * resonance) / order
     stride = max(1, int(channel.sample_rate * 2 * np.pi / w0 / MAX_SAMPLES_PER_CYCLE))
     y = channel.read()[::stride]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimation.diagnosis.data import MIN_SAMPLES_PER_PERIOD
 from estimation.diagnosis.diagnose import Diagnosis, Finding, ParameterEstimate, Rival
 from estimation.diagnosis.open_loop import OpenLoop, is_worse
 from estimation.lock_in_channels import lock_in_amplitude
@@ -89,8 +90,11 @@ def slow_decays(recording: Recording, device: Device) -> list[SlowDecay]:
         if axis.mechanics is None or f"drive_{name}" in recording or f"bias_{name}" in recording:
             continue
         order, gain, key = _waveform(recording, axis)
-        if key is not None and recording[key].size / recording[key].sample_rate * axis.resonance > MIN_COMPRESSED_TURNS:
+        turns = 0.0 if key is None else recording[key].size / recording[key].sample_rate * axis.resonance
+        if key is not None and turns > MIN_COMPRESSED_TURNS:
             channel, frequency = recording[key], axis.resonance
+            if channel.sample_rate < MIN_SAMPLES_PER_PERIOD * frequency:
+                continue  # refused by the diagnosis of waveforms
             block = block_length(frequency, channel.sample_rate, BLOCK_TURNS)
             values = channel.read()
             time, phasors = block_phasors(values - values.mean(), channel.sample_rate, channel.start, frequency, block)

@@ -1,0 +1,54 @@
+"""Recordings that cannot serve: one clear message that says what to do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.identification.calibrate import identify
+from scanner.device import Axis, Device
+from scanner.errors import BadInput
+from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
+
+TIME = np.arange(5000) / 1e4
+DECAY = np.exp(-3.0 * TIME) * np.cos(2 * np.pi * 100.0 * TIME) + 0.01 * np.random.default_rng(1).normal(size=TIME.size)
+
+
+def device(resonance: float, driven: bool = False) -> Device:
+    w = 2 * np.pi * resonance
+    drive = Drive("linear", w**2) if driven else None
+    return Device("d", {"x": Axis(Mechanics(1.0, w / 50, w**2), drive=drive, readout=Position(10.0, 0.01), name="x")})
+
+
+def recording(resonance: float, driven: bool = False, samples: int = 5000) -> Recording:
+    channels = {"sense_x": (DECAY[:samples], "V", 1e4)}
+    if driven:
+        channels["drive_x"] = (np.sin(2 * np.pi * 100.0 * TIME[:samples]), "V", 1e4)
+    return Recording.from_arrays(channels, device(resonance, driven))
+
+
+@pytest.mark.parametrize("driven", [False, True])
+@pytest.mark.parametrize("resonance", [2e4, 1e9])
+def test_a_rate_that_cannot_show_the_resonance_is_refused(resonance: float, driven: bool) -> None:
+    with pytest.raises(BadInput, match=r"too slowly for a resonance at .*record at"):
+        diagnose_with_optics([recording(resonance, driven)])
+
+
+def test_identify_refuses_it_too() -> None:
+    with pytest.raises(BadInput, match=r"too slowly for a resonance at .*record at"):
+        identify([recording(2e4)], device(2e4))
+    with pytest.raises(BadInput, match=r"holds 0.08 cycles of a free decay; record 8 cycles or more"):
+        identify([recording(100.0, samples=8)], device(100.0))
+
+
+@pytest.mark.parametrize(("driven", "message"), [(False, "fewer than 8 periods"), (True, "covers 0.5 periods")])
+def test_too_few_turns_are_refused(driven: bool, message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        diagnose_with_optics([recording(1.0, driven)])
+
+
+def test_a_device_without_a_spring_is_refused_with_what_to_do() -> None:
+    with pytest.raises(BadInput, match=r"must be a number greater than 0; a device without a spring"):
+        Mechanics(1.0, 1.0, 0.0)
