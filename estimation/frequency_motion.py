@@ -35,6 +35,11 @@ class SlowCurve(NamedTuple):
     sd: Array
 
 
+def is_motion_computable(recording: Recording, device: Device) -> bool:
+    """Whether the drives were recorded and the mechanics are stated, so that the drives determine the motion."""
+    return all(axis.mechanics and f"drive_{name}" in recording for name, axis in device.axes.items())
+
+
 def frequency_motion(recording: Recording, device: Device) -> Motion:
     """The motion of a device without mechanics: amplitudes that fill the field, and phases that are not known.
 

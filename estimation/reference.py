@@ -21,6 +21,9 @@ CHUNK_SAMPLES = 1 << 19
 MAX_SPECTRUM_SAMPLES = 1 << 18
 """Samples in whose spectrum a line is searched."""
 
+MIN_SPECTRUM_SAMPLES = 8
+"""Samples from which a spectrum can show a line over its median."""
+
 SHORT_SPECTRUM_PERIODS = 3.0
 """Periods of the lowest frequency that are searched first: enough where the line is present from the beginning."""
 
@@ -135,6 +138,9 @@ def has_slow_oscillation(channel: Channel, high: float) -> bool:
     """Whether one line below ``high`` [Hz] has more than ``SLOW_LINE_SHARE`` of the variance of a signal."""
     values = channel.read(0, min(channel.size, MAX_SLOW_SEARCH_SAMPLES))
     length = max(1, int(channel.sample_rate / (SLOW_SAMPLES_PER_CYCLE * high)))
+    values = np.where(np.isfinite(values), values, np.nan)
+    if np.isnan(values).all():
+        return False
     means = np.nan_to_num(values - np.nanmean(values))[: values.size // length * length].reshape(-1, length).mean(1)
     found = _strongest(means, channel.sample_rate / length, 0.0, high)
     if found is None:
@@ -148,6 +154,9 @@ def has_slow_oscillation(channel: Channel, high: float) -> bool:
 def _strongest(values: Array, rate: float, low: float, high: float) -> float | None:
     """Frequency of the strongest line in (low, high) [Hz]; None if none exceeds the noise."""
     n = values.size
+    if n < MIN_SPECTRUM_SAMPLES:
+        return None
+    values = np.where(np.isfinite(values), values, np.nan)
     values = np.nan_to_num(values - np.nanmean(values)) if np.isfinite(values).any() else np.zeros(n)
     padded = 1 << (2 * n - 1).bit_length()  # a power of two: a prime would take six times as long
     spectrum = np.abs(np.fft.rfft(values * np.hanning(n), padded))

@@ -11,7 +11,7 @@ from estimation.optics.correction import correct_intensity
 from estimation.signals import require_device
 from recon.quality.clock_jumps import detect_clock_jumps, longest_segment
 from recon.quality.defects import Defect, find_defects
-from recon.quality.drive_check import check_drives
+from recon.quality.drive_check import check_drives, check_signals
 from scanner import devices
 from scanner.channel import CHANNEL_UNITS, Channel, check_signal
 from scanner.device import AXES, Device
@@ -19,6 +19,9 @@ from scanner.recording import Recording
 
 DeviceSource = str | Path | Device
 """A device, the path of a TOML file, or the name of a device of ``scanner.devices``."""
+
+MIN_INTENSITY_COVERAGE = 0.9
+"""Part of a recording that an intensity covers without a note: triggers and filters cost less than a tenth."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ def prepare(recording: Recording, device: DeviceSource | None = None) -> Prepare
     for axis in AXES:
         device.axis(axis)
     check_drives(recording, device)
+    check_signals(recording, device)
     return prepare_segment(recording, device, clock_jumps)
 
 
@@ -120,10 +124,18 @@ def select_device(recording: Recording, device: DeviceSource | None) -> Device:
 
 
 def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:
-    """A line for every channel and every device key that the program does not know: most of them are misspelt."""
+    """A line for every channel and device key that the program does not know, and for a short intensity."""
     for name in recording.channels:
         if name not in CHANNEL_UNITS and name != "intensity":
             yield f"{name}: a channel of this name is not used"
+    if "intensity" in recording and recording.duration > 0.0:
+        light = recording["intensity"]
+        covered = (light.end - light.start) / recording.duration
+        if covered < MIN_INTENSITY_COVERAGE:
+            yield (
+                f"intensity: covers {covered:.0%} of the recording, {light.end - light.start:.4g} s of "
+                f"{recording.duration:.4g} s; if it was recorded throughout, check its sample_rate"
+            )
     for key in _dotted_keys({**device.extra, **{name: axis.extra for name, axis in device.axes.items()}}):
         yield f"{key}: is no key of a device, and not used"
 

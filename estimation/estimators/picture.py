@@ -9,9 +9,9 @@ from scanner.recording import Recording
 
 
 def run(recording: Recording, device: Device) -> Motion:
-    if any(axis.mechanics is None for axis in device.axes.values()):
-        from estimation.frequency_motion import frequency_motion
+    from estimation.frequency_motion import frequency_motion, is_motion_computable
 
+    if not is_motion_computable(recording, device):
         return frequency_motion(recording, device)
     from estimation.tracker.drive_only import track_drive_only
 

@@ -105,7 +105,8 @@ def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[C
         f"is not in the recording and sense_{name} is no position readout",
         file=recording.path,
         channel=f"angle_{name}",
-        hint=f"choose another estimator, or record it; there are {', '.join(sorted(recording.channels))}",
+        hint=f"choose another estimator, record it, or state frequency in [{name}.drive]; "
+        f"there are {', '.join(sorted(recording.channels))}",
     )
 
 

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimation.filters.baselines import resolve_signs
+from estimation.frequency_motion import is_motion_computable
 from estimation.optics.correction import beam_motion
 from estimation.signals import drive_phase_change
 from estimation.term_compensation import estimate_with_terms
@@ -65,7 +66,7 @@ def refine_motion(
     Returns:
         The motion, and a line for each refined axis on what the picture showed.
     """
-    if motion.estimator == "picture" and any(device.axis(name).mechanics is None for name in AXES):
+    if motion.estimator == "picture" and not is_motion_computable(recording, device):
         return phases_from_picture(recording, device, motion, intensity, grid, flips)
     pixels = {"x": grid.width / 2, "y": grid.height / 2}
     refined = [name for name in AXES if _rms(motion.axes[name].phase_sd) * pixels[name] > MAX_PHASE_ERROR_PX]

@@ -1,13 +1,16 @@
-"""Whether the drives fit the device: swapped drives and wrong sample rates are named before anything is estimated."""
+"""Whether drives and signals fit the device: what is swapped, doubled or at a wrong rate is named before estimation."""
 
 from __future__ import annotations
 
 from math import isclose
 
+import numpy as np
+
 from estimation.reference import dominant_frequency
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.stages import MotionSensor
 
 SAME_FREQUENCY = 0.05
 """Relative difference up to which a frequency counts as a resonance of the device, or two ratios as equal."""
@@ -17,6 +20,41 @@ MIN_SEARCHED_RATIO = 1e-4
 
 MAX_DRIVE_RATIO = 1.33
 """Factor between drive and resonance from which both axes together show a wrong sample rate."""
+
+COMPARED_SAMPLES = 1 << 16
+"""Samples of two channels that are compared: noise makes any two signals differ within a few."""
+
+
+def check_signals(recording: Recording, device: Device) -> None:
+    """Check the signals of the motion of both axes against each other and against the resonances of the device.
+
+    Raises:
+        BadInput: both axes have the same samples, or each axis oscillates at the resonance of the other.
+    """
+    for kind in ("sense", "angle", "velocity", "acceleration"):
+        names = [f"{kind}_{axis}" for axis in AXES]
+        if not all(name in recording for name in names):
+            continue
+        x, y = (recording[name] for name in names)
+        first, second = (channel.read(0, COMPARED_SAMPLES) for channel in (x, y))
+        if np.array_equal(first, second, equal_nan=True) and np.nanstd(first) > 0.0:
+            hint = "check the mapping: a column may be used twice"
+            raise BadInput(f"and {y.name} hold the same samples", file=x.file, channel=x.name, hint=hint)
+        if any(device.axis(axis).mechanics is None for axis in AXES):
+            continue
+        if kind == "sense" and not all(isinstance(device.axis(axis).readout, MotionSensor) for axis in AXES):
+            continue
+        resonance = {axis: device.axis(axis).resonance for axis in AXES}
+        if isclose(resonance["x"], resonance["y"], rel_tol=SAME_FREQUENCY):
+            continue
+        try:
+            moves = {axis: dominant_frequency(recording[f"{kind}_{axis}"]) for axis in AXES}
+        except BadInput:  # no oscillation, or samples that cannot be used: the estimator says what it needs
+            continue
+        if all(isclose(moves[axis], resonance[other], rel_tol=SAME_FREQUENCY) for axis, other in ("xy", "yx")):
+            what, hint = f"and {y.name} are swapped: they show ", "exchange the channels, or the axes of the device"
+            raise BadInput(what + _frequencies(moves, resonance), file=x.file, channel=x.name, hint=hint)
+        _check_common_ratio(recording, names, moves, resonance)
 
 
 def check_drives(recording: Recording, device: Device) -> None:
@@ -40,17 +78,29 @@ def check_drives(recording: Recording, device: Device) -> None:
         moved[name], resonance[name] = frequency * axis.drive.motion_per_drive, axis.resonance
     if isclose(resonance["x"], resonance["y"], rel_tol=SAME_FREQUENCY):
         return
-    at = ", ".join(f"{name} at {moved[name]:.6g} Hz (resonance {resonance[name]:.6g} Hz)" for name in AXES)
-    file = recording["drive_x"].file
+    at, file = _frequencies(moved, resonance), recording["drive_x"].file
     crossed = ((moved["x"], resonance["y"]), (moved["y"], resonance["x"]))
     if all(isclose(f, other, rel_tol=SAME_FREQUENCY) for f, other in crossed):
         what = f"and drive_y are swapped: they move {at}"
         raise BadInput(what, file=file, channel="drive_x", hint="exchange the channels, or the axes of the device")
+    _check_common_ratio(recording, ["drive_x", "drive_y"], moved, resonance)
+
+
+def _check_common_ratio(
+    recording: Recording, names: list[str], moved: dict[str, float], resonance: dict[str, float]
+) -> None:
+    """Raise BadInput if both axes seem to move off their resonances by one factor, as at a wrong sample rate."""
+    file, at = recording[names[0]].file, _frequencies(moved, resonance)
     ratio = {name: moved[name] / resonance[name] for name in AXES}
     wrong = max(ratio["x"], 1 / ratio["x"]) > MAX_DRIVE_RATIO
     if wrong and isclose(ratio["x"], ratio["y"], rel_tol=SAME_FREQUENCY):
-        what = f"and drive_y move {at}, as if the sample rate were {ratio['x']:.3g} times the true one"
+        what = f"and {names[1]} move {at}, as if the sample rate were {ratio['x']:.3g} times the true one"
         hint = "check sample_rate, and J and k of the device"
         if isclose(ratio["x"], 2.0, rel_tol=SAME_FREQUENCY) or isclose(ratio["x"], 0.5, rel_tol=SAME_FREQUENCY):
             hint += "; combs (kind electrostatic) move the mirror at half the drive's frequency"
-        raise BadInput(what, file=file, channel="drive_x", hint=hint)
+        raise BadInput(what, file=file, channel=names[0], hint=hint)
+
+
+def _frequencies(moved: dict[str, float], resonance: dict[str, float]) -> str:
+    """Frequencies of the motion beside the resonances, in words."""
+    return ", ".join(f"{name} at {moved[name]:.6g} Hz (resonance {resonance[name]:.6g} Hz)" for name in AXES)
