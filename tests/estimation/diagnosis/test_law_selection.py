@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.law_selection import LinearModel, LinearTerm
+from estimation.diagnosis.linear_model import LinearModel, LinearTerm
 from estimation.diagnosis.parameters import Candidate
 from scanner.device import Axis, Device
 from scanner.recording import Recording
