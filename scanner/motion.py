@@ -165,9 +165,10 @@ class AxisMotion:
         return replace(self, phase=self.phase + np.pi, angle=self.angle.negated())
 
     def advanced(self, phase: Array) -> AxisMotion:
-        """Return the motion whose phase is ahead by ``phase`` at ``time``, shape (n,) [rad]."""
+        """Return the motion whose phase is ahead by ``phase`` at ``time``, shape (n,), n > 1 [rad]."""
         ahead = self.angle.advanced(self.time, phase, self.frequency)
-        return replace(self, phase=self.phase + phase, angle=ahead)
+        frequency = self.frequency + np.gradient(phase, self.time) / (2.0 * np.pi)
+        return replace(self, phase=self.phase + phase, frequency=frequency, angle=ahead)
 
 
 @dataclass(frozen=True)

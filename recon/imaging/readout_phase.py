@@ -4,11 +4,13 @@ The sense signal follows fast changes of the phase to 0.01°. A delay, an amplif
 curved characteristic that the device file does not state shifts its phase by an amount that varies slowly. The
 self-crossings of the scan (``bidirectional_phase``) measure the same phase without the readout. The model of an axis is
 
-    β(t) = c + g(t),   c ~ N(0, σ0²),   g a Gaussian process with the Matérn-3/2 covariance (σ1², τ),
+    β(t) = c + g(t) + s(t),   c ~ N(0, σ0²),
 
-with β the true phase minus the phase of the estimator, measured with independent errors in short parts of the scan. The
-hyperparameters σ0, σ1, τ and a factor on the standard errors are averaged over by their marginal likelihood (Rasmussen
-and Williams 2006, eq. 2.30).
+with β the true phase minus the phase of the estimator, measured with independent errors in short parts of the scan. g
+and s are Gaussian processes with Matérn-3/2 covariances (σ1², τ) and (σs(t)², τ). c and g are the error of the readout;
+s is the random error of the estimator, σs the standard deviation that it states. The picture measures s too, so the
+variance of the corrected phase is the posterior variance of β. The hyperparameters σ0, σ1, τ and a factor on the
+standard errors are averaged over by their marginal likelihood (Rasmussen and Williams 2006, eq. 2.30).
 σ0 = 0 and σ1 = 0, a readout as stated, have half of the prior probability each, so that a correct readout keeps the
 precision that the sense signal gives.
 """
@@ -32,9 +34,12 @@ OFFSET_SDS_RAD = np.radians([0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 0.286°, below which no picture changes, to the reach of the registration."""
 DRIFT_SDS_RAD = np.radians([0.01, 0.03, 0.1, 0.3, 1.0])
 """Standard deviations σ1 that the varying part may have: half decades; no readout varies by more."""
-DRIFT_TIMES_S = np.array([3e-3, 10e-3, 30e-3])
+DRIFT_TIMES_S = (3e-3, 10e-3, 30e-3)
 """Correlation times τ that it may have: half decades up to the length of a scan. The sense signal determines faster
 changes better than the picture."""
+SENSE_ERROR_TIMES_S = (1e-3, *DRIFT_TIMES_S)
+"""Correlation times τ of the estimator's error, equally probable: half decades down to 1 ms, which the error has in 1/f
+noise beside an amplifier's resonance. It is longer in white noise."""
 NOISE_FACTORS = np.array([1.0, 2.0, 4.0])
 """Factors on the standard errors of the measurements, equally probable. Detail that the registration does not resolve
 acts on short parts as additional noise."""
@@ -65,9 +70,9 @@ class ReadoutPhase:
     """Posterior of the phase error of one axis: true phase minus estimated phase, positive for a late sense signal.
 
     Attributes:
-        value, sd: of its mean over the scan [rad].
+        value, sd: of the mean of the readout's error over the scan, without the estimator's random error [rad].
         time: shape (n,), increasing [s].
-        mean, variance: at these times, shape (n,) [rad, rad²].
+        mean, variance: of both together at these times, shape (n,) [rad, rad²].
     """
 
     value: float
@@ -84,7 +89,7 @@ def correlate_matern32(lag: Array, time: float) -> Array:
 
 
 def estimate_readout_phase(
-    time: Array, value: Array, sd: Array, at: Array, may_drift: bool = True
+    time: Array, value: Array, sd: Array, at: Array, sense_sd: float | Array = 0.0, may_drift: bool = True
 ) -> ReadoutPhase | None:
     """Posterior of a phase error from measurements in the picture; None without a measurement.
 
@@ -92,14 +97,19 @@ def estimate_readout_phase(
         time: of the measurements, shape (n,) [s].
         value, sd: phase errors and standard deviations, shape (n,) [rad]; an infinite sd is no measurement.
         at: times of the posterior, shape (m,), m > 1, increasing [s].
+        sense_sd: standard deviation that the estimator states for its phase, a number or shape (m,) [rad]; 0 leaves
+            its error out of the posterior.
         may_drift: whether the error may vary with time.
     """
     used = np.isfinite(value) & np.isfinite(sd)
     if not used.any():
         return None
     time, value, noise = time[used], value[used], np.diag(sd[used] ** 2)
-    drifts = [(0.0, 1.0, PRIOR_PROBABILITY_AS_STATED)]  # standard deviation, correlation time, prior probability
-    share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / (DRIFT_SDS_RAD.size * DRIFT_TIMES_S.size)
+    sense_sd = np.broadcast_to(sense_sd, at.shape)
+    measured_sd = np.interp(time, at, sense_sd)
+    share = PRIOR_PROBABILITY_AS_STATED / len(SENSE_ERROR_TIMES_S)
+    drifts = [(0.0, tau, share) for tau in SENSE_ERROR_TIMES_S]  # standard deviation, correlation time, probability
+    share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / (DRIFT_SDS_RAD.size * len(DRIFT_TIMES_S))
     if may_drift:
         drifts += [(drift_sd, tau, share) for drift_sd in DRIFT_SDS_RAD for tau in DRIFT_TIMES_S]
     hypotheses = [(*drift, factor) for drift in drifts for factor in NOISE_FACTORS]
@@ -107,16 +117,18 @@ def estimate_readout_phase(
     share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / OFFSET_SDS_RAD.size
     offset_prior = np.concatenate([[PRIOR_PROBABILITY_AS_STATED], np.full(OFFSET_SDS_RAD.size, share)])
     average = np.gradient(at) / np.gradient(at).sum()
-    log_weight, means, variances, totals = [], [], [], []
+    log_weight, means, variances, totals, total_vars = [], [], [], [], []
     for drift_sd, tau, prior, factor in hypotheses:
-        within = drift_sd**2 * correlate_matern32(time[:, None] - time, tau)
-        across = drift_sd**2 * correlate_matern32(time[:, None] - at, tau)
+        within = (drift_sd**2 + np.outer(measured_sd, measured_sd)) * correlate_matern32(time[:, None] - time, tau)
+        correlation = correlate_matern32(time[:, None] - at, tau)
+        across = (drift_sd**2 + np.outer(measured_sd, sense_sd)) * correlation
         covariance = cho_factor(factor**2 * noise + within, lower=True)
         solved_value, solved_one = cho_solve(covariance, value), cho_solve(covariance, np.ones_like(value))
         log_det = 2.0 * np.log(np.diag(covariance[0])).sum()
         left = 1.0 - across.T @ solved_one  # of a constant, what the varying part does not follow, shape (m,)
         explained = (solve_triangular(covariance[0], across, lower=True) ** 2).sum(axis=0)
-        mean_across = across @ average
+        mean_across = drift_sd**2 * (correlation @ average)
+        mean_left = 1.0 - mean_across @ solved_one
         between = drift_sd**2 * (average @ correlate_matern32(at[:, None] - at, tau) @ average)
         mean_variance = max(between - mean_across @ cho_solve(covariance, mean_across), 0.0)
         # The constant adds σ0² 1 1ᵀ to the covariance: its posterior variance and mean follow from two inner products.
@@ -128,13 +140,14 @@ def estimate_readout_phase(
             - 0.5 * (value @ solved_value - constant * score + log_det + np.log1p(offset_var * information))
         )
         means.append(across.T @ solved_value + constant[:, None] * left)
-        variances.append(np.maximum(drift_sd**2 - explained, 0.0) + constant_var[:, None] * left**2)
-        totals.append(mean_variance + constant_var * (left @ average) ** 2)
+        variances.append(np.maximum(drift_sd**2 + sense_sd**2 - explained, 0.0) + constant_var[:, None] * left**2)
+        totals.append(mean_across @ solved_value + constant * mean_left)
+        total_vars.append(mean_variance + constant_var * mean_left**2)
     weight = np.exp(np.concatenate(log_weight) - np.max(log_weight))
     weight /= weight.sum()
-    mean = np.concatenate(means)
-    overall, posterior = weight @ (mean @ average), weight @ mean
-    total_var = weight @ (np.concatenate(totals) + (mean @ average) ** 2) - overall**2
+    mean, total = np.concatenate(means), np.concatenate(totals)
+    overall, posterior = weight @ total, weight @ mean
+    total_var = weight @ (np.concatenate(total_vars) + total**2) - overall**2
     variance = weight @ (np.concatenate(variances) + mean**2) - posterior**2
     return ReadoutPhase(float(overall), math.sqrt(max(total_var, 0.0)), at, posterior, np.maximum(variance, 0.0))
 
@@ -150,7 +163,7 @@ def remove_readout_phase(
         register: measures the phase errors of a corrected motion.
 
     Returns:
-        The corrected motion, whose ``phase_sd`` includes the uncertainty of the correction; its phase errors; and the
+        The corrected motion, whose ``phase_sd`` is that of sense signal and picture together; its phase errors; and the
         error that was removed by axis, without the axes of which the picture determines none. Their ``phase_sd`` allows
         for electronics that nobody described.
     """
@@ -161,7 +174,8 @@ def remove_readout_phase(
             axis = motion.axes[name]
             measured = measured_phase_error(errors, column, axis, corrected.axes[name])
             times = _posterior_times(axis, measured[0])
-            estimate = estimate_readout_phase(*measured, times, len(errors) >= MIN_DRIFT_SLICES)
+            sense_sd = np.interp(times, axis.time, axis.phase_sd)
+            estimate = estimate_readout_phase(*measured, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
             if estimate is None:
                 found.pop(name, None)  # an earlier round may have determined one
                 axes[name] = widen_undetermined(axis)
@@ -240,10 +254,10 @@ def measured_phase_error(
 
 
 def advance_axis(axis: AxisMotion, error: ReadoutPhase) -> AxisMotion:
-    """The motion ahead by a phase error, its standard deviation with that of the error."""
+    """The motion ahead by a phase error, with the standard deviation of that error, which includes the motion's."""
     variance = np.interp(axis.time, error.time, error.variance)
     ahead = axis.advanced(np.interp(axis.time, error.time, error.mean))
-    return replace(ahead, phase_sd=np.sqrt(axis.phase_sd**2 + variance))
+    return replace(ahead, phase_sd=np.sqrt(variance))
 
 
 def widen_undetermined(axis: AxisMotion) -> AxisMotion:

@@ -50,6 +50,24 @@ def test_intervals_have_their_nominal_coverage(kind: str) -> None:
         assert stated < np.radians(0.03) / np.sqrt(10.0)  # a constant alone would have 0.03°/sqrt(60)
 
 
+def test_the_picture_reduces_the_random_error_of_the_estimator() -> None:
+    rng = np.random.default_rng(8)
+    sense_sd = np.radians(0.05)
+    correlation = correlate_matern32(POSTERIOR_TIME_S[:, None] - POSTERIOR_TIME_S, 10e-3)
+    errors, stated, values = [], [], []
+    for _ in range(40):
+        truth = sense_sd * rng.multivariate_normal(np.zeros(POSTERIOR_TIME_S.size), correlation)
+        data = measured(truth, np.radians(0.03), rng)
+        posterior = estimate_readout_phase(TIME_S, *data, POSTERIOR_TIME_S, sense_sd)
+        assert posterior is not None
+        errors.append(posterior.mean - truth)
+        stated.append(np.sqrt(posterior.variance))
+        values.append(posterior.value / posterior.sd)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.5 * sense_sd
+    assert 0.9 < np.mean(np.abs(errors) < 1.96 * np.array(stated)) < 0.99
+    assert np.mean(np.abs(values) > 3.0) < 0.05  # a random error of the estimator is not one of the readout
+
+
 def test_a_large_constant_is_found_to_the_precision_of_the_mean() -> None:
     rng = np.random.default_rng(2)
     truth = np.full(POSTERIOR_TIME_S.size, np.radians(5.0))
