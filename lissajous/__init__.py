@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from estimation.estimators import register as register_estimators
     from lissajous.functions import (
-        Simulation,
         convert,
         diagnose,
         estimate,
@@ -20,9 +19,9 @@ if TYPE_CHECKING:
         load_device,
         predict,
         reconstruct,
-        simulate,
     )
     from lissajous.planning import ScanDesign, blur_study, design
+    from lissajous.simulation import Simulation, simulate
     from recon.frames import ScanFrames, frames
     from recon.imaging.blur import compare_with_scene, phase_bound
     from recon.imaging.gridding import map_samples
@@ -69,6 +68,8 @@ __all__ = [
 ]
 
 _DEFINED_ELSEWHERE = {
+    "Simulation": ("lissajous.simulation", "Simulation"),
+    "simulate": ("lissajous.simulation", "simulate"),
     "BadInput": ("scanner.errors", "BadInput"),
     "Device": ("scanner.device", "Device"),
     "Grid": ("recon.imaging.picture", "Grid"),
