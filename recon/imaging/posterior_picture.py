@@ -49,8 +49,9 @@ MEAN_POWER = 1.0
 """Power of the inverse gradient covariance in the prior of the mean."""
 
 SD_POWER = 0.5
-"""The same for the standard deviation. The covariance is itself uncertain; its root errs less in flat parts. With 1 the
-95 % intervals of twelve scenes held 65 % to 97 % of the pixels before scaling."""
+"""Power of the inverse gradient covariance in the prior of the standard deviation. The covariance is itself uncertain;
+its root errs less in flat parts. With 1 the 95 % intervals of twelve scenes held 65 % to 97 % of the pixels before
+scaling."""
 
 REFINEMENTS = 2
 """Repetitions of gradients and mean before the last mean. A third changes the error by less than 0.1 dB."""

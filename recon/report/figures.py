@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 UNVISITED = "#20405f"
 """Colour of pixels that the beam never visited; a picture has only greys."""
 
-MARK = "#e08a1e"
+MARK_COLOUR = "#e08a1e"
 """Colour of pixels that a defect of the recording affects."""
 
 FILL_RADIUS_PX = 2
@@ -73,9 +73,9 @@ def _rgb(colour: str) -> NDArray[np.uint8]:
 
 
 def highlight_pixels(rgb: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A picture, shape (height, width, 3), with the pixels of ``mask`` mixed half and half with ``MARK``."""
+    """A picture, shape (height, width, 3), with the pixels of ``mask`` mixed half and half with ``MARK_COLOUR``."""
     out = rgb.copy()
-    out[mask] = (out[mask].astype(np.uint16) + _rgb(MARK)) // 2
+    out[mask] = (out[mask].astype(np.uint16) + _rgb(MARK_COLOUR)) // 2
     return out
 
 
