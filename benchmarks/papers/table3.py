@@ -267,7 +267,7 @@ def lag_modelled(of: Trial, half: Sequence[int]) -> tuple[Axis, Callable[[Array,
     mechanics = fit_mechanics(of.axis, records)
     full = fit_readout(comb, records, senses, sections)
     line = fit_readout(comb, records, senses, sections, ("a_cir", "b_cir"))
-    axis = replace(of.axis, mechanics=Mechanics(**{key: estimated.value for key, estimated in mechanics.items()}))
+    axis = replace(of.axis, mechanics=Mechanics(*(mechanics[key].value for key in ("J", "b", "k"))))
 
     def linearised(sense: Array, angle: Array, drive: Array) -> Array:
         features = readout_features(comb, angle, drive, RATE, sections)

@@ -32,6 +32,10 @@ MAX_CHI2_RATIO = 100.0
 """Chi-square of the selected laws over that of the fit around which they were selected, above which they were not
 linear."""
 
+SMALL_LAW_MARGIN = 25.0
+"""Advantage in -2 log evidence over a discrepancy without laws that laws need if they gain less than the corrections
+beside them. A quintic spring that imitates a delay with memory has 12, a drift beside an imperfect readout 62."""
+
 
 class Choice(NamedTuple):
     """Named laws that explain a recording but for a small remainder.
@@ -82,8 +86,9 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
         fit = with_laws
     else:
         return None
-    laws, fit = _without_imitations(likelihood, fit, linear, present)
-    if not laws:
+    laws, fit, gain = _without_imitations(likelihood, fit, linear, present)
+    margin = 0.0 if gain > linear.gain_of_discrepancy(laws) else SMALL_LAW_MARGIN
+    if not laws or not linear.are_needed(laws, margin):
         return None
     hypothesis = linear.hypothesis(laws, max_scale=MAX_SCALE_BESIDE)
     rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in laws}
@@ -92,24 +97,28 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
 
 def _without_imitations(
     likelihood: Likelihood, fit: Fit, linear: LinearModel, laws: tuple[int, ...]
-) -> tuple[tuple[int, ...], Fit]:
-    """The laws that take the bulk of a misfit, and the fit with them; the others imitate an unlisted imperfection.
+) -> tuple[tuple[int, ...], Fit, float]:
+    """The laws that take the bulk of a misfit, the fit with them, and the largest gain of a law.
+
+    The others imitate an unlisted imperfection.
 
     A law has to gain more than a free correction of its stage still gains, and beside a law that gains more, also more
     than the corrections of all stages.
     """
+    largest_gain = 0.0
     while laws:
         gains = {law: _gain(likelihood, fit, linear.laws[law].candidate) for law in laws}
         largest = max(laws, key=lambda law: gains[law])
         of_all = linear.gain_of_discrepancy(laws)
         surplus = {law: gain - of_all for law, gain in gains.items()}
         surplus[largest] = gains[largest] - linear.gain_of_discrepancy(laws, linear.laws[largest].candidate.term.stage)
+        largest_gain = gains[largest]
         least = min(laws, key=lambda law: surplus[law])
         if surplus[least] > 0.0:
             break
         laws = tuple(law for law in laws if law != least)
         fit = refit_without(likelihood, fit, linear.laws[least].candidate)
-    return laws, fit
+    return laws, fit, largest_gain
 
 
 def _gain(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> float:

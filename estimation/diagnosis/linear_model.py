@@ -234,6 +234,15 @@ class LinearModel:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
+    def are_needed(self, laws: Sequence[int], margin: float) -> bool:
+        """Whether a discrepancy without bound on its scales needs laws beside it.
+
+        Their evidence has to be better by ``margin`` than that of the discrepancy alone, and its misfit no smaller.
+        """
+        alone, beside = self.hypothesis(()), self.hypothesis(laws)
+        better = alone.neg2_log_evidence - beside.neg2_log_evidence > margin
+        return better and alone.misfit > beside.misfit - MIN_SCORE_GAIN
+
     def gain_of_discrepancy(self, laws: Sequence[int], stage: str | None = None) -> float:
         """Fall of the misfit by the discrepancy terms of one stage, or of all, beside laws and all other terms."""
         dropped = [i for i, term in enumerate(self.discrepancies) if stage in (None, term.candidate.term.stage)]

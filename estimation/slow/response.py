@@ -58,8 +58,8 @@ AMPLITUDE_LAWS: Mapping[str, Callable[[Array, Array], Complex]] = {
     "quadratic-drag": lambda w, a: 8.0j / (3.0 * np.pi) * w**2 * a,
     "coulomb-friction": lambda w, a: 4.0j / np.pi / a + 0.0 * w,
 }
-"""Describing function phi(w, A) of a law whose torque over J is c theta^3, c theta^2 theta', c |theta'| theta' or
-c sign(theta')."""
+"""Describing function phi(w, A) of a law whose torque over J is ``c theta^3``, ``c theta^2 theta'``,
+``c abs(theta') theta'`` or ``c sign(theta')``."""
 
 EFFECTS = (SECOND_MODE, FEEDTHROUGH, *AMPLITUDE_LAWS)
 """Effects that a frequency response may show. A law of amplitude is not combined with a second mode: the amplitudes of
