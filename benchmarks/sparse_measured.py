@@ -16,13 +16,16 @@ from scipy.ndimage import distance_transform_edt
 from estimation.estimate import estimate
 from recon.imaging.held_out import SplitSums
 from recon.imaging.intensity_gridding import grid_intensity
+from recon.imaging.kernel_picture import kernel_picture
 from recon.imaging.picture import Grid
-from recon.imaging.picture_estimate import ESTIMATORS, estimate_picture
+from recon.imaging.picture_estimate import estimate_picture
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
+from recon.imaging.posterior_picture import posterior_picture
 from recon.io.convert import convert
 from scanner.arrays import Array
 
 MAPPING = Path(__file__).parent.parent / "examples" / "afm_spiral.toml"
+ESTIMATORS = {"kernel": kernel_picture, "posterior": posterior_picture}
 TURN_SAMPLES = 1000
 PIXELS = 128
 

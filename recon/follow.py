@@ -87,11 +87,13 @@ class PreviousFrame(NamedTuple):
         motion: of the mirror in the frame.
         grid: shared by all frames.
         readout_phase: phase error of the readout by axis, from all frames so far.
+        estimate: picture of the frame.
     """
 
     motion: Motion
     grid: Grid
     readout_phase: Mapping[str, ReadoutPhase]
+    estimate: EstimatedPicture
 
 
 @dataclass
@@ -245,12 +247,13 @@ def reconstruct_frame(
     unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), intensity)
     means = grid_intensity(estimated.beam, intensity, estimated.grid, unlocated, first)
     noise = measure_noise(estimated.beam, intensity, estimated.grid, NOISE_SAMPLES)
-    _replace_pictures(
-        output, estimate_picture(options.picture, means, noise, estimated.beam, intensity, unlocated, first)
-    )
+    before = previous.estimate if previous and not options.independent_frames else None
+    data = estimated.beam, intensity, unlocated, first
+    picture = estimate_picture(options.picture, means, noise, *data, before=before)
+    _replace_pictures(output, picture)
     if wants_readout_phase(sensed, options):  # after the picture, which therefore comes no later
         known = update_readout_phase(sensed, estimated.motion, measure_phase_errors(estimated), known)
-    return PreviousFrame(sensed, estimated.grid, known)
+    return PreviousFrame(sensed, estimated.grid, known, picture)
 
 
 def match_signs(motion: Motion, before: Motion) -> Motion:

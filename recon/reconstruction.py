@@ -44,6 +44,7 @@ class Options:
         sample_motion: estimate the motion of the sample and remove it.
         frames: number of frames to write; None for none.
         frame_time: duration of a frame to write [s], instead of ``frames``.
+        independent_frames: frames of posterior pictures use no samples of earlier frames.
         zarr: write the frames as OME-Zarr too.
         movie: write the frames as a movie too, ``"mp4"`` or ``"gif"``.
     """
@@ -62,6 +63,7 @@ class Options:
     sample_motion: bool = False
     frames: int | None = None
     frame_time: float | None = None
+    independent_frames: bool = False
     zarr: bool = False
     movie: str | None = None
 

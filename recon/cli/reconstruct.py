@@ -41,6 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="or frames of S seconds; follow: so long (the scan's repeat)",
     )
+    parser.add_argument(
+        "--independent-frames",
+        action="store_true",
+        help="posterior: each frame by itself; else a frame also uses earlier ones where they agree with its samples",
+    )
     parser.add_argument("--zarr", action="store_true", help="write the frames to frames.ome.zarr too")
     parser.add_argument("--movie", choices=("mp4", "gif"), help="write the frames to frames.mp4 or frames.gif too")
     parser.add_argument(
@@ -116,6 +121,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         sample_motion=args.sample_motion,
         frames=args.frames,
         frame_time=args.frame_time,
+        independent_frames=args.independent_frames,
         zarr=args.zarr,
         movie=args.movie,
     )

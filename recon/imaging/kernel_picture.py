@@ -47,12 +47,14 @@ class PictureEstimate(NamedTuple):
         sd: standard deviation of ``image`` as an estimate of the scene.
         data_share: weight of the pixel's own samples in its value, 0 where it was not visited.
         width: standard deviation of the kernel [px].
+        strength: of the smoothness prior; None without one.
     """
 
     image: Array
     sd: Array
     data_share: Array
     width: float
+    strength: float | None = None
 
     @property
     def resolution(self) -> float:

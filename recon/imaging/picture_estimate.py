@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
@@ -14,7 +14,7 @@ from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.kernel_picture import PictureEstimate, kernel_picture
 from recon.imaging.picture import Picture
 from recon.imaging.pixel_noise import SampleNoise, pixel_sd
-from recon.imaging.posterior_picture import posterior_picture
+from recon.imaging.recursive_frames import CarriedFrames, recursive_picture
 from recon.sample_ranges import SampleRanges, subtract_ranges
 from scanner.channel import Channel
 from scanner.errors import BadInput
@@ -25,12 +25,6 @@ PictureKind = Literal["mean", "kernel", "posterior"]
 
 PICTURE_KINDS: tuple[str, ...] = get_args(PictureKind)
 """The names of the kinds."""
-
-ESTIMATORS: Mapping[str, Callable[[SplitSums, SampleNoise], PictureEstimate]] = {
-    "kernel": kernel_picture,
-    "posterior": posterior_picture,
-}
-"""Estimators that use the neighbours of a pixel."""
 
 MIN_SPREAD_PX = 1.0
 """Smallest standard deviation of the visited pixels across any direction. Below it the samples lie on one line."""
@@ -50,6 +44,7 @@ class EstimatedPicture:
             image; None for a picture of means.
         resolution_px: distance between independent values [px]; None for a picture of means.
         notes: limits of the picture, a line each.
+        carried: what the next frame can use of this one, by detector; empty for a kind whose frames are independent.
     """
 
     picture: Picture
@@ -57,6 +52,7 @@ class EstimatedPicture:
     data_share: NDArray[np.float32] | None = None
     resolution_px: float | None = None
     notes: list[str] = field(default_factory=list)
+    carried: Sequence[CarriedFrames] = ()
 
     @property
     def sd_picture(self) -> Picture:
@@ -73,6 +69,7 @@ def estimate_picture(
     unlocated: SampleRanges,
     first: int = 0,
     stop: int | None = None,
+    before: EstimatedPicture | None = None,
 ) -> EstimatedPicture:
     """Return the picture of the samples ``first`` up to ``stop`` in the wanted kind.
 
@@ -81,6 +78,8 @@ def estimate_picture(
         means: picture of the means of these samples.
         noise: of a sample, by detector.
         beam, intensity, unlocated, first, stop: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
+        before: frame before, whose samples a posterior picture uses where they agree with those of this one; None for
+            an independent picture.
 
     Raises:
         BadInput: no such kind, or the samples determine no picture of this kind.
@@ -93,10 +92,11 @@ def estimate_picture(
     stop = intensity.size if stop is None else stop
     kept = subtract_ranges([(first, stop)], subtract_ranges(held_out_ranges(first, stop), unlocated))
     held = grid_intensity(beam, intensity, means.grid, kept, first, stop)
-    estimates = [
-        _estimate_detector(kind, samples, detector_noise)
-        for samples, detector_noise in zip(_split_sums(means, held), noise, strict=True)
-    ]
+    detectors = _split_sums(means, held)
+    carried: Sequence[CarriedFrames | None] = (before.carried if before else ()) or [None] * len(detectors)
+    estimates, carry = zip(
+        *(_estimate_detector(kind, *each) for each in zip(detectors, noise, carried, strict=True)), strict=True
+    )
     image, sd, share = (
         np.stack([getattr(each, name) for each in estimates], -1).astype(np.float32).reshape(means.image.shape)
         for name in ("image", "sd", "data_share")
@@ -108,12 +108,16 @@ def estimate_picture(
     ]
     if not np.isfinite(image).all():
         notes.append(f"{np.mean(np.isnan(image)):.1%} of the pixels are too far from any sample and have no value")
-    if any(_is_flat(samples, each) for samples, each in zip(_split_sums(means, held), noise, strict=True)):
+    if any(_is_flat(samples, each) for samples, each in zip(detectors, noise, strict=True)):
         notes.append("intensity: no structure beyond the noise was found; the picture is flat within its uncertainty")
-    return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes)
+    following = [each for each in carry if each is not None]
+    return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes, following)
 
 
-def _estimate_detector(kind: str, samples: SplitSums, noise: SampleNoise | None) -> PictureEstimate:
+def _estimate_detector(
+    kind: str, samples: SplitSums, noise: SampleNoise | None, before: CarriedFrames | None
+) -> tuple[PictureEstimate, CarriedFrames | None]:
+    """Estimate of one detector, and what the next frame takes over."""
     means = samples.sums[samples.counts > 0] / samples.counts[samples.counts > 0]
     hint = "use --picture mean"
     if np.ptp(means) == 0.0:
@@ -121,7 +125,9 @@ def _estimate_detector(kind: str, samples: SplitSums, noise: SampleNoise | None)
     if noise is None or not samples.held_counts.any():
         what = f"the scan is too short for --picture {kind}: too few pixels were visited twice to measure the noise"
         raise BadInput(what, channel="intensity", hint=f"record longer, ask for fewer pixels or {hint}")
-    return ESTIMATORS[kind](samples, noise)
+    if kind == "kernel":
+        return kernel_picture(samples, noise), None
+    return recursive_picture(samples, noise, before)
 
 
 def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:

@@ -89,12 +89,13 @@ COARSE_TOLERANCE, FINE_TOLERANCE = 0.1, 0.02
 """Relative residuals of the solutions: for the comparison of strengths, and for the picture."""
 
 
-def posterior_picture(samples: SplitSums, noise: SampleNoise) -> PictureEstimate:
+def posterior_picture(samples: SplitSums, noise: SampleNoise, initial_strength: float | None = None) -> PictureEstimate:
     """Return the posterior mean of the scene and its standard deviation.
 
     Args:
         samples: of one detector by pixel.
         noise: of a sample.
+        initial_strength: of the prior, at which its search begins; None for one by the width of the kernel.
     """
     width = choose_width(samples, noise)
     kept_counts, held_counts = samples.kept_counts, samples.held_counts
@@ -104,7 +105,7 @@ def posterior_picture(samples: SplitSums, noise: SampleNoise) -> PictureEstimate
     mean = kernel_mean(samples.kept_sums, kept_counts, width)
     gradients = _gradient_covariance(mean, 0.0, WINDOW * width)
     precision = _sample_precision(mean, noise, scene_variance)
-    strength = width**2 * float((kept_counts * precision).mean())
+    strength = initial_strength or width**2 * float((kept_counts * precision).mean())
     start: Fields = np.repeat(_bordered(mean)[..., None], LANES, axis=2).astype(np.float32)
     for _ in range(REFINEMENTS):
         strengths = strength * np.exp(STRENGTH_STEP * (np.arange(LANES) - 0.5 * (LANES - 1)))
@@ -129,8 +130,9 @@ def posterior_picture(samples: SplitSums, noise: SampleNoise) -> PictureEstimate
         from_neighbours *= TAIL_FACTOR * _sd_scale(*found)
     variance = 1.0 / (samples.counts * precision + 1.0 / from_neighbours)
     reached = find_reached(samples.counts, max(width, MIN_REACH_WIDTH_PX))
-    image, sd = np.where(reached, image, np.nan), np.where(reached, np.sqrt(variance), np.nan)
-    return PictureEstimate(image, sd, samples.counts * precision * variance, width)
+    sd = np.sqrt(variance + (_mean_over_pixel(image) - image) ** 2)
+    image, sd = np.where(reached, image, np.nan), np.where(reached, sd, np.nan)
+    return PictureEstimate(image, sd, samples.counts * precision * variance, width, strength)
 
 
 def _sample_precision(mean: Array, noise: SampleNoise, scene_variance: float) -> Array:
@@ -196,6 +198,17 @@ def _sd_scale(ratio: float, sd: float) -> float:
     found = max(ratio, sd)
     weight = prior_log_sd**2 / (prior_log_sd**2 + (sd / found) ** 2)
     return float(found**weight * prior ** (1.0 - weight))
+
+
+def _mean_over_pixel(image: Array) -> Array:
+    """Mean over each pixel of the scene that has these values at the pixels' centres and is bilinear between them.
+
+    Samples are averaged over a pixel, so their mean differs from the value at its centre where the scene is curved.
+    """
+    import cv2
+
+    weights = np.array([0.125, 0.75, 0.125])
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, weights, weights, borderType=cv2.BORDER_REPLICATE))
 
 
 def _bordered(image: NDArray[Any]) -> NDArray[Any]:

@@ -146,3 +146,11 @@ def test_napari_reads_a_recording(tmp_path: Path) -> None:
     assert arguments["scale"][1] * picture.shape[1] == pytest.approx(2e3 * scan.half_angle_x)
     (tmp_path / "text.h5").write_text(json.dumps({}), encoding="utf-8")
     assert get_reader(str(tmp_path / "text.h5")) is None
+
+
+def test_a_posterior_frame_uses_earlier_frames_unless_they_are_independent(result: Reconstruction) -> None:
+    posterior = replace(result, picture_kind="posterior")
+    with_earlier, independent = (list(frames(posterior, 3, independent=alone).estimates()) for alone in (False, True))
+    assert np.array_equal(with_earlier[0].picture.image, independent[0].picture.image)
+    assert np.median(with_earlier[2].sd) < 0.9 * np.median(independent[2].sd)
+    assert np.array_equal(with_earlier[2].picture.coverage, independent[2].picture.coverage)
