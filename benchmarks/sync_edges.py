@@ -21,7 +21,7 @@ AMPLITUDE_RAD, FREQUENCY_HZ, RATE_HZ, DURATION_S, JITTER_S = 0.1, 5000.0, 1e6, 0
 WALK_RAD_S = 30.0
 """Standard deviation of the walk of the angular frequency [rad/s] after one second."""
 ANGLE_RAD = 0.02
-SEEDS = range(91_200, 91_260)
+SEEDS = range(91_400, 91_460)
 
 
 def walking_phase(rng: np.random.Generator) -> Array:

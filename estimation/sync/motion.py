@@ -43,8 +43,8 @@ class EdgePhase:
         time: shape (n,) [s].
         phase: of theta = A sin(phase), unwrapped, shape (n,) [rad]. frequency: shape (n,) [Hz].
         phase_sd: shape (n,) [rad].
-        asymmetry: phase by which the beam passes the detector after the centre on its way up [rad], and its sd.
-        asymmetry_sd: [rad].
+        asymmetry: phase by which the beam passes the detector after the centre on its way up, shape (n,) [rad].
+        asymmetry_sd: its standard deviation, shape (n,) [rad].
         jitter_sd: of an edge [s].
         sign: ``"known: <how>"`` or ``"ambiguous"``.
         numbered: the edges before outliers were left out.
@@ -55,8 +55,8 @@ class EdgePhase:
     phase: Array
     frequency: Array
     phase_sd: Array
-    asymmetry: float
-    asymmetry_sd: float
+    asymmetry: Array
+    asymmetry_sd: Array
     jitter_sd: float
     sign: str
     numbered: NumberedEdges
@@ -81,7 +81,7 @@ def phase_from_edges(edges: Edges) -> EdgePhase:
     periods = (numbered.times - t0) * f0
     side = np.array([-1.0, 1.0] if nominal.size == 2 else [0.0, 0.0])[numbered.kind]
     measured = 2 * np.pi * (numbered.period - periods) + nominal[numbered.kind]
-    smoothed = smooth_phase(periods, measured, side)
+    smoothed = smooth_phase(periods, measured, side, walking_asymmetry=bool(edges.angle))
     flipped, sign = _sign(edges, smoothed)
     used = smoothed.used
     return EdgePhase(
@@ -89,8 +89,8 @@ def phase_from_edges(edges: Edges) -> EdgePhase:
         phase=(2 * np.pi * periods + smoothed.phase + np.pi * flipped)[used],
         frequency=f0 * (1.0 + smoothed.rate[used] / (2 * np.pi)),
         phase_sd=smoothed.phase_sd[used],
-        asymmetry=-smoothed.asymmetry if flipped else smoothed.asymmetry,
-        asymmetry_sd=smoothed.asymmetry_sd,
+        asymmetry=(-smoothed.asymmetry if flipped else smoothed.asymmetry)[used],
+        asymmetry_sd=smoothed.asymmetry_sd[used],
         jitter_sd=smoothed.jitter_sd / (2 * np.pi * f0),
         sign=sign,
         numbered=numbered,
@@ -102,18 +102,22 @@ def _sign(edges: Edges, smoothed: SmoothedPhase) -> tuple[bool, str]:
     """Whether the phase has to be turned by half a period, and what the edges say of the sign."""
     if edges.event.startswith("zero-crossing"):
         return False, f"known: {edges.name}"
-    significant = abs(smoothed.asymmetry) > SIGNIFICANT_SD * smoothed.asymmetry_sd
-    if edges.event == "turn" or not edges.angle or not significant:
+    if edges.event == "turn" or not edges.angle or not _is_significant(smoothed.asymmetry, smoothed.asymmetry_sd):
         return False, "ambiguous"
-    return smoothed.asymmetry * edges.angle < 0.0, f"known: {edges.name}"
+    return bool(np.median(smoothed.asymmetry) * edges.angle < 0.0), f"known: {edges.name}"
 
 
-def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[float, float] | None:
-    """Amplitude and its standard deviation [rad], from the asymmetry of a detector at a known angle; else None."""
-    if not edges.angle or abs(found.asymmetry) < SIGNIFICANT_SD * found.asymmetry_sd or found.sign == "ambiguous":
+def _is_significant(asymmetry: Array, sd: Array) -> bool:
+    """Whether the asymmetry differs from 0 by ``SIGNIFICANT_SD`` at every edge, and has one sign."""
+    return bool(np.all(np.abs(asymmetry) > SIGNIFICANT_SD * sd) and np.ptp(np.sign(asymmetry)) == 0.0)
+
+
+def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[Array, Array] | None:
+    """Amplitude and its standard deviation at each edge, shape (n,) [rad], by a detector at a known angle; else None."""
+    if not edges.angle or found.sign == "ambiguous" or not _is_significant(found.asymmetry, found.asymmetry_sd):
         return None
     amplitude = edges.angle / np.sin(found.asymmetry)
-    return float(amplitude), float(abs(amplitude / np.tan(found.asymmetry)) * found.asymmetry_sd)
+    return amplitude, np.abs(amplitude / np.tan(found.asymmetry)) * found.asymmetry_sd
 
 
 def axis_motion_from_edges(
@@ -140,19 +144,19 @@ def axis_motion_from_edges(
             what = "edges alone do not determine the amplitude"
             hint = "state the field of view, [scan], in the device, or the angle of a detector beside the centre"
             raise BadInput(what, file=edges.file, channel=edges.name, hint=hint)
-        amplitude = float(getattr(device.scan, f"half_angle_{name}"))
+        amplitude = np.full(found.time.size, float(getattr(device.scan, f"half_angle_{name}")))
         notes.append(f"{edges.name}: the edges do not determine the amplitude; the motion is taken to fill the field")
     else:
         amplitude = measured[0]
     if edges.hysteresis:
         lag = np.arcsin(np.clip(edges.hysteresis / (amplitude * np.cos(found.asymmetry)), -1.0, 1.0))
     else:
-        lag = 0.0
+        lag = np.zeros(found.time.size)
     phase = found.phase + lag
     spline = CubicHermiteSpline(found.time, phase, 2 * np.pi * found.frequency)
     rate, start, n = clock
     time = start + np.arange(n) / rate
-    angle = amplitude * np.sin(spline(time))
+    angle = np.interp(time, found.time, amplitude) * np.sin(spline(time))
     beyond = MAX_BEYOND_PERIODS / float(np.median(found.frequency))
     angle[(time < found.time[0] - beyond) | (time > found.time[-1] + beyond)] = np.nan
     step = max(1, round(KNOT_PERIODS * found.time.size * found.numbered.length / np.ptp(found.time)))
@@ -164,12 +168,13 @@ def axis_motion_from_edges(
     motion = AxisMotion(
         time=knots,
         phase=phase[::step] - reference.phase(knots),
-        amplitude=np.full(knots.size, amplitude),
+        amplitude=amplitude[::step],
         frequency=found.frequency[::step],
         phase_sd=found.phase_sd[::step],
         angle=SampledAngle(angle, rate, start),
         reference=reference.kind,
         sign=found.sign,
+        amplitude_sd=None if measured is None else measured[1][::step],
     )
     facts: dict[str, object] = {
         "edges": int(found.time.size),
@@ -177,8 +182,8 @@ def axis_motion_from_edges(
         "repeated": found.numbered.doubled,
         "out_of_place": found.numbered.stray + found.outliers,
         "jitter_s": found.jitter_sd,
-        "asymmetry_rad": found.asymmetry,
-        "asymmetry_sd_rad": found.asymmetry_sd,
-        "amplitude_sd_rad": None if measured is None else measured[1],
+        "asymmetry_rad": float(np.median(found.asymmetry)),
+        "asymmetry_sd_rad": float(np.median(found.asymmetry_sd)),
+        "amplitude_sd_rad": None if measured is None else float(np.median(measured[1])),
     }
     return motion, notes, facts

@@ -6,7 +6,9 @@ The phase is phi(t) = 2 pi f0 t + psi(t). Its slow part psi is integrated from a
     psi(t_k) + noise = nominal phase of the edge - 2 pi f0 t_k + s_c alpha,      s_0 = 1, s_1 = -1,
 
 where alpha is the asymmetry of the detector: the phase by which the beam passes it late on the way up and early on the
-way down. The ratio of the walk to the jitter maximises the likelihood, with the jitter's variance eliminated.
+way down. It is constant, or walks at random with the amplitude of the motion, where the likelihood gains by that more
+than ``MIN_DEVIANCE_GAIN``. The ratios of the walks to the jitter maximise the likelihood, with the jitter's variance
+eliminated.
 
 Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445 (smoother); Harvey, Forecasting, Structural Time Series Models
 and the Kalman Filter (1989), section 4.2 (concentrated likelihood).
@@ -14,6 +16,7 @@ and the Kalman Filter (1989), section 4.2 (concentrated likelihood).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -39,13 +42,20 @@ MAX_OUTLIER_SD = 6.0
 """Residual in standard deviations above which an edge is left out: by chance once in 5e8."""
 
 
+MIN_DEVIANCE_GAIN = 10.0
+"""Decrease of -2 log likelihood from which the asymmetry is taken to walk: by chance once in 1000."""
+
+SEARCH_ROUNDS = 2
+"""Alternations between the two walks; their estimates are nearly independent."""
+
+
 class SmoothedPhase(NamedTuple):
     """Phase at the edges.
 
     Attributes:
         phase: psi, shape (n,) [rad]. rate: its derivative [rad a period].
         phase_sd: shape (n,) [rad].
-        asymmetry, asymmetry_sd: alpha [rad]; 0 where the edges are of one kind.
+        asymmetry, asymmetry_sd: alpha at each edge, shape (n,) [rad]; 0 where the edges are of one kind.
         jitter_sd: of an edge [rad].
         used: whether an edge is no outlier, shape (n,).
     """
@@ -53,25 +63,26 @@ class SmoothedPhase(NamedTuple):
     phase: Array
     rate: Array
     phase_sd: Array
-    asymmetry: float
-    asymmetry_sd: float
+    asymmetry: Array
+    asymmetry_sd: Array
     jitter_sd: float
     used: NDArray[np.bool_]
 
 
-def smooth_phase(periods: Array, measured: Array, side: Array) -> SmoothedPhase:
+def smooth_phase(periods: Array, measured: Array, side: Array, walking_asymmetry: bool = False) -> SmoothedPhase:
     """Smooth the phases of edges, once more without the outliers of the first pass.
 
     Args:
         periods: time of each edge in periods, increasing, shape (n,).
         measured: psi(t_k) - s alpha as measured [rad], shape (n,).
         side: -s of each edge, shape (n,); zeros where all edges are of one kind.
+        walking_asymmetry: whether the asymmetry may change: that of a detector beside the centre does with the amplitude.
     """
     used = np.ones(periods.size)
     part = slice(0, LIKELIHOOD_EDGES)
     for _ in range(2):
-        ratio, variance = _most_likely(periods[part], measured[part], side[part], used[part])
-        states, covariances = _smooth(periods, measured, side, used, ratio, DIFFUSE)
+        walks, variance = _most_likely(periods[part], measured[part], side[part], used[part], walking_asymmetry)
+        states, covariances = _smooth(periods, measured, side, used, *walks, DIFFUSE)
         residual = measured - states[:, 0] - side * states[:, 2]
         used = (np.abs(residual) < MAX_OUTLIER_SD * np.sqrt(variance)).astype(float)
         if used.all():
@@ -81,31 +92,49 @@ def smooth_phase(periods: Array, measured: Array, side: Array) -> SmoothedPhase:
         states[:, 0],
         states[:, 1],
         sd * np.sqrt(covariances[:, 0]),
-        float(states[0, 2]),
-        float(sd * np.sqrt(covariances[0, 1])),
+        states[:, 2],
+        sd * np.sqrt(covariances[:, 1]),
         float(sd),
         used > 0.0,
     )
 
 
-def _most_likely(periods: Array, measured: Array, side: Array, used: Array) -> tuple[float, float]:
-    """Ratio of the walk's variance to the jitter's, and the jitter's variance [rad2]."""
+def _most_likely(
+    periods: Array, measured: Array, side: Array, used: Array, walking_asymmetry: bool
+) -> tuple[tuple[float, float], float]:
+    """Ratios of the walks' variances, of frequency and asymmetry, to the jitter's, and the jitter's variance [rad2]."""
+
+    def deviance(ratio: float, asymmetry_ratio: float) -> float:
+        count, chi2, log_det = _likelihood(periods, measured, side, used, ratio, asymmetry_ratio, DIFFUSE)
+        return float(count * np.log(chi2 / count) + log_det)
+
+    ratio, least = _search(lambda each: deviance(each, 0.0))
+    walks = (ratio, 0.0)
+    if walking_asymmetry and np.abs(side).max() > 0.0:
+        both, free = walks, least
+        for _ in range(SEARCH_ROUNDS):
+            asymmetry_ratio, _ = _search(lambda each, at=both[0]: deviance(at, each))
+            ratio, free = _search(lambda each, at=asymmetry_ratio: deviance(each, at))
+            both = (ratio, asymmetry_ratio)
+        if free < least - MIN_DEVIANCE_GAIN:
+            walks = both
+    count, chi2, _ = _likelihood(periods, measured, side, used, *walks, DIFFUSE)
+    return walks, chi2 / count
+
+
+def _search(deviance: Callable[[float], float]) -> tuple[float, float]:
+    """The ratio in ``LOG10_WALK_RANGE`` of the least deviance, and that deviance."""
     from scipy.optimize import minimize_scalar
 
-    def deviance(log_ratio: float) -> float:
-        count, chi2, log_det = _likelihood(periods, measured, side, used, 10.0**log_ratio, DIFFUSE)
-        return count * np.log(chi2 / count) + log_det
-
     grid = np.linspace(*LOG10_WALK_RANGE, 19)
-    at = int(np.argmin([deviance(float(log_ratio)) for log_ratio in grid]))
+    at = int(np.argmin([deviance(10.0 ** float(log_ratio)) for log_ratio in grid]))
     bounds = (float(grid[max(at - 1, 0)]), float(grid[min(at + 1, grid.size - 1)]))
-    ratio = 10.0 ** float(minimize_scalar(deviance, bounds=bounds, method="bounded", options={"xatol": 0.02}).x)
-    count, chi2, _ = _likelihood(periods, measured, side, used, ratio, DIFFUSE)
-    return ratio, chi2 / count
+    found = minimize_scalar(lambda each: deviance(10.0**each), bounds=bounds, method="bounded", options={"xatol": 0.02})
+    return 10.0 ** float(found.x), float(found.fun)
 
 
 @njit(cache=True)
-def _predict(x, P, step, ratio):  # type: ignore[no-untyped-def]
+def _predict(x, P, step, ratio, asymmetry_ratio):  # type: ignore[no-untyped-def]
     """The state after ``step`` periods: x (3,) and P (3, 3) in place."""
     x[0] += step * x[1]
     for j in range(3):
@@ -116,6 +145,7 @@ def _predict(x, P, step, ratio):  # type: ignore[no-untyped-def]
     P[0, 1] += ratio * step**2 / 2.0
     P[1, 0] += ratio * step**2 / 2.0
     P[1, 1] += ratio * step
+    P[2, 2] += asymmetry_ratio * step
 
 
 @njit(cache=True)
@@ -142,13 +172,13 @@ def _start(measured, side, diffuse):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _likelihood(periods, measured, side, used, ratio, diffuse):  # type: ignore[no-untyped-def]
+def _likelihood(periods, measured, side, used, ratio, asymmetry_ratio, diffuse):  # type: ignore[no-untyped-def]
     """Number of innovations, their sum of squares over their variances, and the sum of log variances."""
     x, P = _start(measured, side, diffuse)
     count, chi2, log_det = 0, 0.0, 0.0
     for k in range(periods.size):
         if k:
-            _predict(x, P, periods[k] - periods[k - 1], ratio)
+            _predict(x, P, periods[k] - periods[k - 1], ratio, asymmetry_ratio)
         if used[k] > 0.0:
             r, S = _update(x, P, measured[k], side[k])
             if k >= INITIAL_EDGES:
@@ -157,7 +187,7 @@ def _likelihood(periods, measured, side, used, ratio, diffuse):  # type: ignore[
 
 
 @njit(cache=True)
-def _smooth(periods, measured, side, used, ratio, diffuse):  # type: ignore[no-untyped-def]
+def _smooth(periods, measured, side, used, ratio, asymmetry_ratio, diffuse):  # type: ignore[no-untyped-def]
     """States (n, 3), and the variances of phase and asymmetry (n, 2), for edges of variance 1, all edges used."""
     n = periods.size
     means, before = np.empty((n, 3)), np.empty((n, 3))
@@ -165,7 +195,7 @@ def _smooth(periods, measured, side, used, ratio, diffuse):  # type: ignore[no-u
     x, P = _start(measured, side, diffuse)
     for k in range(n):
         if k:
-            _predict(x, P, periods[k] - periods[k - 1], ratio)
+            _predict(x, P, periods[k] - periods[k - 1], ratio, asymmetry_ratio)
         before[k], covariances_before[k] = x, P
         if used[k] > 0.0:
             _update(x, P, measured[k], side[k])

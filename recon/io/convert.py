@@ -226,7 +226,16 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
     file = f"{source} by {plan_source}"
     lock_in = {key: spec.get(key) for key in ("reference", "level")}
     return make_channel(
-        name, raw, unit=unit, sample_rate=rate, start=start, gain=scale, offset=offset, file=file, **lock_in
+        name,
+        raw,
+        unit=unit,
+        sample_rate=rate,
+        start=start,
+        gain=scale,
+        offset=offset,
+        detectors=names if name == "intensity" and len(names) > 1 else (),
+        file=file,
+        **lock_in,
     )
 
 

@@ -9,13 +9,16 @@ from recon.io.convert import open_any
 from recon.io.readers import read
 from recon.io.readers.column_names import TIME_NAMES
 from recon.io.readers.contents import Variable
-from scanner.channel import CHANNEL_UNITS
+from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS
 from scanner.hdf5 import attributes, check_ends, is_hdf5, open_hdf5
 from scanner.recording import FORMAT
 
 HEADING = f"""\
 # A suggestion to edit: name each channel by what it is, remove the others, state what is commented out.
-# Channels: {", ".join(CHANNEL_UNITS)}, intensity (several detectors: variable = ["CH3", "CH4"])."""
+# Channels: {", ".join((*CHANNEL_UNITS, *AMPLITUDE_CHANNELS))}, intensity
+# (several detectors: variable = ["CH3", "CH4"]). amplitude_x and phase_x of a lock-in also need reference = HZ.
+# Times of edges, instead of unit, rate and start: [channels.sync_x], variable = "edges", unit = "us", angle = 0.02
+# (rad, of the detector) or event = "both-edges"."""
 
 DEVICE_PART = """\
 # The device: remove the first # of each line and edit, or give a file of `lissajous new-device` with --device.
