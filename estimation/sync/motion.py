@@ -113,7 +113,7 @@ def _is_significant(asymmetry: Array, sd: Array) -> bool:
 
 
 def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[Array, Array] | None:
-    """Amplitude and its standard deviation at each edge, shape (n,) [rad], by a detector at a known angle; else None."""
+    """Amplitude and its sd at each edge, shape (n,) [rad], by a detector at a known angle; else None."""
     if not edges.angle or found.sign == "ambiguous" or not _is_significant(found.asymmetry, found.asymmetry_sd):
         return None
     amplitude = edges.angle / np.sin(found.asymmetry)

@@ -17,6 +17,7 @@ and the Kalman Filter (1989), section 4.2 (concentrated likelihood).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -76,7 +77,7 @@ def smooth_phase(periods: Array, measured: Array, side: Array, walking_asymmetry
         periods: time of each edge in periods, increasing, shape (n,).
         measured: psi(t_k) - s alpha as measured [rad], shape (n,).
         side: -s of each edge, shape (n,); zeros where all edges are of one kind.
-        walking_asymmetry: whether the asymmetry may change: that of a detector beside the centre does with the amplitude.
+        walking_asymmetry: whether the asymmetry may change, as it does with the amplitude.
     """
     used = np.ones(periods.size)
     part = slice(0, LIKELIHOOD_EDGES)
@@ -108,13 +109,13 @@ def _most_likely(
         count, chi2, log_det = _likelihood(periods, measured, side, used, ratio, asymmetry_ratio, DIFFUSE)
         return float(count * np.log(chi2 / count) + log_det)
 
-    ratio, least = _search(lambda each: deviance(each, 0.0))
+    ratio, least = _search(partial(deviance, asymmetry_ratio=0.0))
     walks = (ratio, 0.0)
     if walking_asymmetry and np.abs(side).max() > 0.0:
         both, free = walks, least
         for _ in range(SEARCH_ROUNDS):
-            asymmetry_ratio, _ = _search(lambda each, at=both[0]: deviance(at, each))
-            ratio, free = _search(lambda each, at=asymmetry_ratio: deviance(each, at))
+            asymmetry_ratio, _ = _search(partial(deviance, both[0]))
+            ratio, free = _search(partial(deviance, asymmetry_ratio=asymmetry_ratio))
             both = (ratio, asymmetry_ratio)
         if free < least - MIN_DEVIANCE_GAIN:
             walks = both
