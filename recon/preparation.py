@@ -11,9 +11,9 @@ from estimation.optics.correction import correct_intensity
 from estimation.signals import require_device
 from recon.quality.clock_jumps import detect_clock_jumps, longest_segment
 from recon.quality.defects import Defect, find_defects
-from recon.quality.drive_check import check_drives, check_signals
+from recon.quality.drive_check import check_drives, check_rates, check_signals, describe_inverted_sensors
 from scanner import devices
-from scanner.channel import CHANNEL_UNITS, Channel, check_signal
+from scanner.channel import CHANNEL_UNITS, Channel, check_signal, suggest_name
 from scanner.device import AXES, Device
 from scanner.recording import Recording
 
@@ -72,6 +72,7 @@ def prepare(recording: Recording, device: DeviceSource | None = None) -> Prepare
         device.axis(axis)
     check_drives(recording, device)
     check_signals(recording, device)
+    check_rates(recording, device)
     return prepare_segment(recording, device, clock_jumps)
 
 
@@ -124,10 +125,11 @@ def select_device(recording: Recording, device: DeviceSource | None) -> Device:
 
 
 def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:
-    """A line for every channel and device key that the program does not know, and for a short intensity."""
+    """A line for every unknown channel and device key, every inverted sensor, and a short intensity."""
     for name in recording.channels:
         if name not in CHANNEL_UNITS and name != "intensity":
-            yield f"{name}: a channel of this name is not used"
+            yield f"{name}: a channel of this name is not used{suggest_name(name)}"
+    yield from describe_inverted_sensors(recording, device)
     if "intensity" in recording and recording.duration > 0.0:
         light = recording["intensity"]
         covered = (light.end - light.start) / recording.duration

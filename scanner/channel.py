@@ -61,6 +61,19 @@ DBM_LEVEL_V = float(np.sqrt(2.0 * 50.0 * 1e-3))
 """Amplitude of a sine of 1 mW in 50 ohm [V]: 0 dBm as spectrum analysers and lock-in amplifiers state it."""
 
 
+MIN_NAME_SIMILARITY = 0.8
+"""Similarity (``difflib``) from which an unknown channel name counts as misspelt: one or two letters of six."""
+
+
+def suggest_name(name: str) -> str:
+    """The known channel name nearest to an unknown one, as the end of a message; empty if none is near."""
+    from difflib import get_close_matches
+
+    known = (*CHANNEL_UNITS, *AMPLITUDE_CHANNELS, "intensity", "sync_x", "sync_y")
+    near = [] if name in known else get_close_matches(name.lower(), known, 1, MIN_NAME_SIMILARITY)
+    return f"; is it {near[0]}?" if near else ""
+
+
 class SampleSource(Protocol):
     """Storage of samples: a numpy array, an HDF5 dataset, or another object that reads when it is sliced."""
 

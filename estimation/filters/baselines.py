@@ -20,7 +20,7 @@ from estimation.signals import (
     white_noise_sd,
 )
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal, make_channel
+from scanner.channel import Channel, check_signal, make_channel, suggest_name
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.lock_in import block_length, block_phasors, unwrap_phase
@@ -33,6 +33,9 @@ SIGN_SAMPLES = 100_000
 
 MIN_BLOCKS = 2
 """Blocks that a motion's slow clock has at least."""
+
+UNIFORM_PHASE_SD = float(np.pi / np.sqrt(3.0))
+"""Standard deviation of a phase of which nothing is known [rad]: the largest that is stated."""
 
 CONSTANT_POINTS = 200
 """Points of the slow clock of a constant motion: only a chirped drive's frequency changes along it."""
@@ -106,7 +109,7 @@ def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[C
         file=recording.path,
         channel=f"angle_{name}",
         hint=f"choose another estimator, record it, or state frequency in [{name}.drive]; "
-        f"there are {', '.join(sorted(recording.channels))}",
+        f"there are {', '.join(each + suggest_name(each) for each in sorted(recording.channels))}",
     )
 
 
@@ -165,7 +168,9 @@ def axis_motion_from_angle(
         phase=phase,
         amplitude=amplitude,
         frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
-        phase_sd=noise_sd / np.maximum(amplitude, 1e-300) * np.sqrt(3.0 / block),  # 3/N: Hann weights, 2/N unweighted
+        phase_sd=np.minimum(  # 3/N: Hann weights, 2/N unweighted
+            noise_sd / np.maximum(amplitude, 1e-300) * np.sqrt(3.0 / block), UNIFORM_PHASE_SD
+        ),
         angle=SampledAngle(resample_to_clock(angle, channel, clock), clock[0], clock[1]),
         reference=reference.kind,
         sign=f"known: {channel.name}",

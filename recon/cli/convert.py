@@ -81,12 +81,15 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def format_summary(summary: dict[str, Any]) -> str:
+    from scanner.channel import suggest_name
+
     lines = [f"{summary['recording']}: {summary['duration']:.6g} s, from {summary['source']} ({summary['format']})"]
     for name, own in summary["channels"].items():
         by = own["stated_by"]
         line = f"  {name}: {own['variable']}, {own['unit']} ({by['unit']})"
         line += f", {own['sample_rate']:.9g} Hz ({by['sample_rate']})"
         line += f", from {own['start']:.9g} s ({by['start']}), {own['shape'][0]} samples"
-        lines.append(line + "".join(f"; the file states {key} {value}" for key, value in own["overruled"].items()))
+        line += "".join(f"; the file states {key} {value}" for key, value in own["overruled"].items())
+        lines.append(line + suggest_name(name))
     lines += [f"  {name}: {edges['number']} edges, {edges['event']}" for name, edges in summary["edges"].items()]
     return "\n".join(lines)

@@ -134,7 +134,8 @@ def _contents(source: Path, plan: Plan, plan_source: object) -> Contents:
     if not isinstance(plan.get("channels"), dict) or not plan["channels"]:
         raise BadInput("names no channels", file=plan_source, hint="add a table [channels.<name>] for each")
     if not isinstance(plan.get("device", {}), dict):
-        raise BadInput("must be a table", file=plan_source, channel="device", hint="write [device.x.readout] and so on")
+        hint = "write [device.x.readout] and so on, or leave it out and give a device file with --device"
+        raise BadInput("must be a table", file=plan_source, channel="device", hint=hint)
     return read(source, plan.get("format"))
 
 

@@ -193,7 +193,11 @@ def test_an_incomplete_or_invalid_mapping_is_refused(bench: Path, swap: tuple[st
             'format = "matlab"\nchannels.sense_x = "x"',
             "channels.sense_x: is 'x' and must be a table; write [channels.sense_x]",
         ),
-        ("channels.sense.unit = 'V'\ndevice = 3", "device: must be a table; write [device.x.readout] and so on"),
+        (
+            "channels.sense.unit = 'V'\ndevice = 3",
+            "device: must be a table; write [device.x.readout] and so on, or leave it out and give a device file "
+            "with --device",
+        ),
     ],
 )
 def test_a_mapping_without_channels_is_refused(bench: Path, text: str, line: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimation.estimate import estimate
 from recon.preparation import prepare
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
@@ -47,3 +48,47 @@ def test_an_intensity_that_covers_half_the_recording_is_noted() -> None:
     assert not prepare(scan(2000.0, 835.0)).unknown_entries
     (note,) = prepare(scan(2000.0, 835.0, light=TIME.size // 2)).unknown_entries
     assert "intensity: covers 50% of the recording" in note
+
+
+def driven_scan(gain: float = 1.0, rate: float = RATE, dead_from: int = TIME.size) -> Recording:
+    """A scan whose x axis lags its drive by 90 degrees, with a sensor of ``gain`` recorded at ``rate``."""
+    recording = scan(2000.0, 835.0)
+    x = -gain * np.cos(2 * np.pi * 2000.0 * TIME) * (np.arange(TIME.size) < dead_from)
+    channels = {name: (recording[name].read(), recording[name].unit, RATE) for name in ("sense_y", "intensity")}
+    channels |= {"drive_x": (np.sin(2 * np.pi * 2000.0 * TIME), "V", RATE), "sense_x": (x, "V", rate)}
+    return Recording.from_arrays(channels, DEVICE)
+
+
+def test_an_inverted_sensor_is_noted_where_the_drive_shows_it() -> None:
+    assert not prepare(driven_scan()).unknown_entries
+    (note,) = prepare(driven_scan(-1.0)).unknown_entries
+    assert "sense_x: the motion leads drive_x by 90°" in note
+    assert "--flip-x" in note
+
+
+def test_a_sensor_at_twice_the_rate_of_its_drive_is_named() -> None:
+    with pytest.raises(BadInput, match=r"sense_x: moves at 4000.*, 2 times the 2000.* Hz of drive_x; check the sample"):
+        prepare(driven_scan(rate=2 * RATE))
+
+
+def test_a_sensor_in_place_of_the_intensity_is_named() -> None:
+    recording = scan(2000.0, 835.0)
+    channels = {name: (recording[name].read(), "V", RATE) for name in ("sense_x", "sense_y")}
+    with pytest.raises(BadInput, match="sense_x: and intensity hold the same samples"):
+        prepare(Recording.from_arrays(channels | {"intensity": channels["sense_x"]}, DEVICE))
+
+
+def test_misspelt_channels_are_noted_with_the_nearest_name() -> None:
+    recording = scan(2000.0, 835.0)
+    channels = {name: (each.read(), each.unit, RATE) for name, each in recording.channels.items()}
+    (note,) = prepare(Recording.from_arrays(channels | {"drve_x": (TIME, "V", RATE)}, DEVICE)).unknown_entries
+    assert note.endswith("drve_x: a channel of this name is not used; is it drive_x?")
+    channels["intesity"] = channels.pop("intensity")
+    with pytest.raises(BadInput, match="intesity; is it intensity"):
+        prepare(Recording.from_arrays(channels, DEVICE))
+
+
+def test_a_sensor_that_dies_states_an_unknown_phase() -> None:
+    motion = estimate(driven_scan(dead_from=TIME.size // 2), DEVICE, "sensor").axes["x"]
+    assert motion.phase_sd.max() == pytest.approx(np.pi / np.sqrt(3.0))
+    assert motion.phase_sd[: motion.time.size // 3].max() < 0.01
