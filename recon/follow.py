@@ -234,7 +234,7 @@ def reconstruct_frame(
     """
     device = select_device(recording, options.device)
     lead_in = LEAD_IN_PERIODS * slow_period(previous.motion) if previous else 0.0
-    prepared = prepare_frame(recording, device, start - lead_in, stop)
+    prepared = prepare_frame(recording, device, start - lead_in, stop, options.undo_lag)
     estimated = estimate_motion(prepared, options, previous.motion if previous else None)
     if previous:
         motion = match_signs(estimated.motion, previous.motion)

@@ -116,7 +116,7 @@ def reconstruct(
         BadInput: the recording or the device lacks what is needed.
     """
     began = time.perf_counter()
-    prepared = prepare(recording, options.device)
+    prepared = prepare(recording, options.device, options.undo_lag)
     result = _reconstruct_prepared(prepared, options, truth, quiet)
     result = _repair_dropped_samples(prepared, result, options, truth, quiet)
     if prepared.clock_jumps:
@@ -298,7 +298,8 @@ def _repair_dropped_samples(
         return result
     dropped, recorded = timing_break.dropped, prepared.uncorrected["intensity"]
     if dropped is not None:
-        restored = prepare_segment(restore_timing(prepared.uncorrected, dropped), prepared.device, prepared.clock_jumps)
+        timed = restore_timing(prepared.uncorrected, dropped)
+        restored = prepare_segment(timed, prepared.device, prepared.clock_jumps, options.undo_lag)
         repaired = _reconstruct_prepared(restored, options, truth, quiet)
         if slices_aligned(repaired.phase_errors, repaired.motion).all():
             start, stop = (recorded.start + at / recorded.sample_rate for at in (dropped.first, dropped.stop))

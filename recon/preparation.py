@@ -52,12 +52,15 @@ class PreparedRecording:
         return self.recording["intensity"]
 
 
-def prepare(recording: Recording, device: DeviceSource | None = None) -> PreparedRecording:
+def prepare(
+    recording: Recording, device: DeviceSource | None = None, undo_lag: bool = False
+) -> PreparedRecording:
     """Check a recording and cut it to its longest segment without a clock jump.
 
     Args:
         recording: with an intensity, and whatever channels the estimator needs.
         device: in place of the recording's own.
+        undo_lag: as for :func:`estimation.optics.correction.correct_intensity`.
 
     Raises:
         BadInput: no intensity, or one that is not a signal; no device, a device without an
@@ -73,43 +76,52 @@ def prepare(recording: Recording, device: DeviceSource | None = None) -> Prepare
     check_drives(recording, device)
     check_signals(recording, device)
     check_rates(recording, device)
-    return prepare_segment(recording, device, clock_jumps)
+    return prepare_segment(recording, device, clock_jumps, undo_lag)
 
 
-def prepare_segment(segment: Recording, device: Device, clock_jumps: Sequence[Defect]) -> PreparedRecording:
+def prepare_segment(
+    segment: Recording, device: Device, clock_jumps: Sequence[Defect], undo_lag: bool = False
+) -> PreparedRecording:
     """Correct and inspect a segment between clock jumps.
 
     Args:
         segment: with an intensity.
         device: of the recording.
         clock_jumps: of the whole recording.
+        undo_lag: as for :func:`estimation.optics.correction.correct_intensity`.
     """
-    recording = correct_intensity(segment, device)
+    recording = correct_intensity(segment, device, undo_lag)
+    inspected = correct_intensity(segment, device)  # clipping is found before the low-pass is undone
     return PreparedRecording(
         recording=recording,
         uncorrected=segment,
         device=device,
         clock_jumps=tuple(clock_jumps),
-        defects=(*clock_jumps, *find_defects(recording)),
+        defects=(*clock_jumps, *find_defects(inspected)),
         unknown_entries=tuple(_unknown_entries(recording, device)),
         origin=recording.start,
     )
 
 
-def prepare_frame(recording: Recording, device: Device, start: float, stop: float) -> PreparedRecording:
+def prepare_frame(
+    recording: Recording, device: Device, start: float, stop: float, undo_lag: bool = False
+) -> PreparedRecording:
     """Prepare the part of a growing recording from ``start`` to ``stop`` [s], without a search for clock jumps.
+
+    ``undo_lag`` is as for :func:`estimation.optics.correction.correct_intensity`.
 
     Raises:
         BadInput: the part holds no intensity.
     """
-    frame = correct_intensity(recording, device).slice(start, stop)
+    frame = correct_intensity(recording, device, undo_lag).slice(start, stop)
+    inspected = correct_intensity(recording, device).slice(start, stop)
     frame.require("intensity", "a picture needs it")
     return PreparedRecording(
         recording=frame,
         uncorrected=recording.slice(start, stop),
         device=device,
         clock_jumps=(),
-        defects=tuple(find_defects(frame)),
+        defects=tuple(find_defects(inspected)),
         unknown_entries=(),
         origin=recording.start,
     )

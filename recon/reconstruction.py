@@ -67,6 +67,11 @@ class Options:
     zarr: bool = False
     movie: str | None = None
 
+    @property
+    def undo_lag(self) -> bool:
+        """Whether the low-pass of a slow detector is undone: not in means, in which electronic noise would grow."""
+        return self.picture != "mean"
+
 
 @dataclass(frozen=True)
 class Reconstruction:

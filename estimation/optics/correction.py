@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation.optics.detector_inverse import REACH, detector_corners, inverse_filter, undo_low_pass
 from scanner.arrays import Array
 from scanner.channel import LazySamples
 from scanner.device import Device
@@ -14,22 +15,40 @@ from scanner.optics import beam_position, intensity_delay, intensity_gain, terms
 from scanner.recording import Recording
 
 
-def correct_intensity(recording: Recording, device: Device) -> Recording:
+def correct_intensity(recording: Recording, device: Device, undo_lag: bool = False) -> Recording:
     """The recording with its intensity corrected for the delay and the gain of the device's optics terms.
 
-    A detector's lag is corrected by its delay only: sharpening what it smoothed would raise the noise. Samples are
-    corrected as they are read.
+    Samples are corrected as they are read.
+
+    Args:
+        recording: with or without an intensity.
+        device: states the terms.
+        undo_lag: undo the low-pass of a slow detector, which raises electronic noise; otherwise only its delay is
+            corrected.
     """
     if "intensity" not in recording or not terms_on_channel(device, "intensity"):
         return recording
     channel = recording["intensity"]
+    step = 1 / channel.sample_rate
+    corners = detector_corners(device) if undo_lag else []
+    filters = [inverse_filter(corner, step) for corner in corners]
+    before, after = len(filters) * (REACH + 1), len(filters) * REACH
 
     def corrected(first: int, stop: int) -> Array:
-        values = channel.read(first, stop)
+        if stop <= first:
+            return channel.read(first, first)
+        # Before the first sample and after the last one the intensity is taken as constant.
+        index = np.arange(first - before, stop + after)
+        start = max(first - before, 0)
+        values = channel.read(start, min(stop + after, channel.size))
+        values = values[np.clip(index - start, 0, len(values) - 1)]
+        for weights in filters:
+            values = undo_low_pass(values, weights)
         gain = intensity_gain(device, channel.time(first, stop) - recording.start)
         return np.asarray(values / (gain if values.ndim == 1 else gain[:, None]))
 
-    start = channel.start - intensity_delay(device, 1 / channel.sample_rate)
+    removed = sum(1 / (2 * np.pi * corner) for corner in corners)
+    start = channel.start - intensity_delay(device, step) + removed
     intensity = replace(
         channel,
         raw=LazySamples(channel.shape, np.dtype(np.float64), corrected),
