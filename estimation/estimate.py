@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from estimation.estimators import find_estimator
 from estimation.signals import require_device
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
 from scanner.stages import Position
@@ -70,6 +73,21 @@ def estimate(
             motion = estimator.resume(recording, device, before)
         else:
             motion = estimator.run(recording, device)
+        check_finite(motion, recording)
         return resolve_signs(motion, recording, flips or {})
 
     return estimate_with_terms(recording, device, run, estimator.is_model_based)
+
+
+def check_finite(motion: Motion, recording: Recording) -> None:
+    """Check that an estimator could follow the signals.
+
+    Raises:
+        BadInput: the phase or the amplitude of an axis is not finite.
+    """
+    for name, axis in motion.axes.items():
+        if np.isfinite(axis.phase).all() and np.isfinite(axis.amplitude).all():
+            continue
+        what = f"the estimator {motion.estimator} diverges: the signal of {name} does not fit the device"
+        hint = f"check units, the gain of [{name}.readout], and [{name}.mechanics]"
+        raise BadInput(what, file=recording.path, channel=name, hint=hint)

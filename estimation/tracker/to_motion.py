@@ -66,7 +66,8 @@ def axis_knots(observations: BlockObservations, states: Array, sds: Array, a: in
         pair = _knots_at_switch(observations, states, a, k)
         knots = [np.insert(values, k + 1, added, axis=0) for values, added in zip(knots, pair, strict=True)]
     time, phase, rates, log, motion_harmonics, at_switch = knots
-    relative = (motion_harmonics / np.exp(log)[:, None]).astype(np.complex64)
+    with np.errstate(all="ignore"):  # a diverged motion is refused by estimate()
+        relative = (motion_harmonics / np.exp(log)[:, None]).astype(np.complex64)
     relative[:, 1] = -1j
     if law.theta_th == 0.0 and law.electrostatic_factor:
         relative = np.ascontiguousarray(relative[:, 1::2])

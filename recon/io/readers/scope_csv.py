@@ -156,10 +156,19 @@ def _layout(path: Path, head: list[list[str]], row: str, separator: str) -> Layo
         return Layout("Keysight InfiniiVision CSV", _padded(head[0], width), units, range(width), len(head), times)
     if "sample interval" in keys and "horizontal units" in keys:
         return _tektronix_above(head, keys, width)
+    _check_decimal_commas(path, head[-1], row, separator, width)
     names, units = name_columns(head, width)
     clock = find_time_column(names, units)
     scale = 1.0 if clock is None else TIME_UNITS[units[clock].lower()]
     return Layout("CSV", names, units, range(width), len(head), clock=clock, clock_scale=scale)
+
+
+def _check_decimal_commas(path: Path, names: list[str], row: str, separator: str, width: int) -> None:
+    """Raise BadInput if numbers with decimal commas seem to be separated by commas too."""
+    if separator == "," and "." not in row and len(names) < width <= 2 * len(names):
+        what = f"its lines have {width} numbers without a point, and its heading {len(names)} names"
+        hint = "if commas are decimal marks, export it with points, or with semicolons or tabs between the columns"
+        raise BadInput(what, file=path, hint=hint)
 
 
 def _padded(fields: Sequence[str], width: int) -> list[str]:

@@ -127,3 +127,10 @@ def test_damaged_lvm_files_are_refused(tmp_path: Path, change: tuple[str, str], 
     assert change[0] in LVM
     with pytest.raises(BadInput, match=words):
         read(write_text(tmp_path / "a.lvm", LVM.replace(*change)), "lvm")
+
+
+def test_decimal_commas_between_columns_with_commas_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "export.csv"
+    path.write_text("Time (s),CH1 (V)\n0,00,1,25\n0,01,1,50\n0,02,1,75\n")
+    with pytest.raises(BadInput, match="4 numbers without a point, and its heading 2 names; if commas are decimal"):
+        read(path)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.estimate import estimate
+from estimation.estimate import check_finite, estimate
 from recon.preparation import prepare
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.errors import BadInput
+from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 
 RATE = 1e5
@@ -92,3 +93,10 @@ def test_a_sensor_that_dies_states_an_unknown_phase() -> None:
     motion = estimate(driven_scan(dead_from=TIME.size // 2), DEVICE, "sensor").axes["x"]
     assert motion.phase_sd.max() == pytest.approx(np.pi / np.sqrt(3.0))
     assert motion.phase_sd[: motion.time.size // 3].max() < 0.01
+
+
+def test_an_estimator_that_diverges_is_refused_in_one_line() -> None:
+    unknown = np.full(3, np.nan)
+    motion = AxisMotion(TIME[:3], unknown, unknown, unknown, unknown, SampledAngle(unknown, RATE))
+    with pytest.raises(BadInput, match="tracker diverges: the signal of x does not fit the device; check units"):
+        check_finite(Motion({"x": motion}, "tracker"), scan(2000.0, 835.0))
