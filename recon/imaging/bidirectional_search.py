@@ -48,7 +48,7 @@ class RegistrationSamples(NamedTuple):
 def search_phase_errors(samples: RegistrationSamples) -> Array:
     """Return the phase errors (x, y) [rad] for which the pictures of opposite directions correlate best, shape (2,).
 
-    NaN where they correlate no better than noise.
+    NaN where they correlate no better than noise, or an axis does not move.
 
     Over arcsin(θ/A) instead of θ, forward and backward pictures are shifted against each other by 2 d everywhere. All
     errors within ``SEARCH_REACH_RAD`` are therefore evaluated at once, by the normalised correlation of the pairs of
@@ -60,9 +60,12 @@ def search_phase_errors(samples: RegistrationSamples) -> Array:
     from scipy.ndimage import gaussian_filter
 
     n = SEARCH_CELLS
+    reach = [float(np.hypot(*axis).max()) for axis in ((samples.x, samples.dx), (samples.y, samples.dy))]
+    if min(reach) == 0.0:
+        return np.full(2, np.nan)
     column, row = (
-        np.minimum((np.arcsin(place / np.hypot(place, motion).max()) / math.pi + 0.5) * n, n - 1).astype(int)
-        for place, motion in ((samples.x, samples.dx), (samples.y, samples.dy))
+        np.minimum((np.arcsin(place / amplitude) / math.pi + 0.5) * n, n - 1).astype(int)
+        for place, amplitude in zip((samples.x, samples.y), reach, strict=True)
     )
     index = ((2 * (samples.dy > 0) + (samples.dx > 0)) * n + row) * n + column
     value = samples.intensity - samples.intensity.mean()

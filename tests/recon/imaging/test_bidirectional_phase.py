@@ -11,6 +11,7 @@ from scipy.ndimage import map_coordinates
 from skimage.data import immunohistochemistry
 
 from recon.imaging.bidirectional_phase import measure_phase_errors, quadrature
+from recon.imaging.bidirectional_search import RegistrationSamples, search_phase_errors
 from recon.imaging.picture import Grid
 from scanner.errors import BadInput
 
@@ -172,3 +173,10 @@ def test_input_arrays_are_not_modified():
     measure_phase_errors(x, y, intensity, SAMPLE_RATE_HZ, GRID, A_X, A_Y)
     for array, copy in zip((x, y, intensity), before, strict=True):
         assert_array_equal(array, copy)
+
+
+def test_an_axis_that_does_not_move_has_no_phase_error() -> None:
+    y = np.linspace(-1.0, 1.0, 64)
+    still = np.zeros_like(y)
+    samples = RegistrationSamples(still, y, still, np.ones_like(y), np.cos(y), np.zeros(y.size, np.int64))
+    assert np.isnan(search_phase_errors(samples)).all()
