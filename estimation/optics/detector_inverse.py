@@ -7,7 +7,7 @@ v[i] = (s[i] - a s[i-1]) / (1 - a) is therefore exact, and its photon noise is t
 
 The beam moves during the interval. For light that is linear in between, v[i] = (1 - w) L[i] + w L[i-1] with the light L
 at the samples and w near 1/2. This mean has nearly no signal at half the sampling rate, so its inverse is regularised:
-the response B becomes conj(B) (1 + r) / (|B|^2 + r) with r = ``REGULARISATION``.
+the response B becomes ``conj(B) (1 + r) / (|B|^2 + r)`` with r = ``REGULARISATION``.
 
 Electronic noise arises after the low-pass. The first step multiplies its variance by (1 + a^2) / (1 - a)^2, which is 32
 at 200 kHz and 5 MS/s. Whoever uses the inverse has to measure the noise in it.
