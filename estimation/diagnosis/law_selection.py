@@ -20,7 +20,7 @@ from estimation.diagnosis.linear_model import MAX_SCALE_BESIDE, LinearModel, com
 from estimation.diagnosis.model import Model, uncertain
 from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.pruning import refit_without
-from estimation.diagnosis.screening import is_amplitude, set_amplitudes
+from estimation.diagnosis.screening import is_linear, set_amplitudes
 
 MAX_LINEARISATIONS = 4
 """Fits around which laws are selected, each with the laws selected before."""
@@ -62,7 +62,7 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
     fit = anchor
     if not any(candidate.term.effect in DISCREPANCY_TERMS for candidate in candidates):
         return None  # every law would be compared with noise alone
-    if not _follows(fit) or not all(_is_linear(candidate) for candidate in uncertain(fit.model)):
+    if not _follows(fit) or not all(is_linear(candidate) for candidate in uncertain(fit.model)):
         return None
     tried: list[set[str]] = []
     for _ in range(MAX_LINEARISATIONS):
@@ -88,7 +88,7 @@ def choose_laws(anchor: Fit, candidates: Sequence[Candidate], progress: Callable
         return None
     laws, fit, gain = _without_imitations(likelihood, fit, linear, present)
     margin = 0.0 if gain > linear.gain_of_discrepancy(laws) else SMALL_LAW_MARGIN
-    if not laws or not linear.are_needed(laws, margin):
+    if not laws or not linear.are_needed(laws, SMALL_LAW_MARGIN, margin):
         return None
     hypothesis = linear.hypothesis(laws, max_scale=MAX_SCALE_BESIDE)
     rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in laws}
@@ -100,36 +100,35 @@ def _without_imitations(
 ) -> tuple[tuple[int, ...], Fit, float]:
     """The laws that take the bulk of a misfit, the fit with them, and the largest gain of a law.
 
-    The others imitate an unlisted imperfection.
-
-    A law has to gain more than a free correction of its stage still gains, and beside a law that gains more, also more
-    than the corrections of all stages.
+    The others imitate an unlisted imperfection. A law has to gain more than a free correction of its stage still gains,
+    and beside a law that gains more, also more than the corrections of all stages. The gain of a law beside others that
+    have been dropped since is computed again only where it would not suffice.
     """
-    largest_gain = 0.0
+
+    def without(law: int) -> Fit:
+        return refit_without(likelihood, fit, linear.laws[law].candidate)
+
+    reduced = {law: without(law) for law in laws}
+    gains, current = {law: _misfit(one) - _misfit(fit) for law, one in reduced.items()}, set(laws)
     while laws:
-        gains = {law: _gain(likelihood, fit, linear.laws[law].candidate) for law in laws}
         largest = max(laws, key=lambda law: gains[law])
         of_all = linear.gain_of_discrepancy(laws)
-        surplus = {law: gain - of_all for law, gain in gains.items()}
+        surplus = {law: gains[law] - of_all for law in laws}
         surplus[largest] = gains[largest] - linear.gain_of_discrepancy(laws, linear.laws[largest].candidate.term.stage)
-        largest_gain = gains[largest]
         least = min(laws, key=lambda law: surplus[law])
         if surplus[least] > 0.0:
             break
-        laws = tuple(law for law in laws if law != least)
-        fit = refit_without(likelihood, fit, linear.laws[least].candidate)
-    return laws, fit, largest_gain
+        if least in current:
+            laws, fit, current = tuple(law for law in laws if law != least), reduced[least], set()
+        else:
+            reduced[least] = without(least)
+            gains[least] = _misfit(reduced[least]) - _misfit(fit)
+            current.add(least)
+    return laws, fit, max((gains[law] for law in laws), default=0.0)
 
 
-def _gain(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> float:
-    """Fall of the misfit by one term of a fit, with everything else refitted."""
-    without = refit_without(likelihood, fit, candidate)
-    return without.chi2 + without.penalty - fit.chi2 - fit.penalty
-
-
-def _is_linear(candidate: Candidate) -> bool:
-    """Whether a term is linear in an amplitude."""
-    return any(is_amplitude(candidate, parameter) for parameter in candidate.term.free_parameters)
+def _misfit(fit: Fit) -> float:
+    return fit.chi2 + fit.penalty
 
 
 def _follows(fit: Fit) -> bool:

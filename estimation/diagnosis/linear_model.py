@@ -26,8 +26,8 @@ from estimation.diagnosis.model import uncertain
 from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import (
     ScoreTest,
-    amplitude_indices,
     is_amplitude,
+    is_linear,
     score_candidate_starts,
 )
 from estimation.least_squares import regress, triangular_factor
@@ -234,14 +234,17 @@ class LinearModel:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
-    def are_needed(self, laws: Sequence[int], margin: float) -> bool:
+    def are_needed(self, laws: Sequence[int], imitation_margin: float, margin: float = 0.0) -> bool:
         """Whether a discrepancy without bound on its scales needs laws beside it.
 
-        Their evidence has to be better by ``margin`` than that of the discrepancy alone, and its misfit no smaller.
+        Args:
+            imitation_margin: advantage in -2 log evidence that laws need over a discrepancy alone that fits better.
+            margin: advantage that they need in any case.
         """
         alone, beside = self.hypothesis(()), self.hypothesis(laws)
-        better = alone.neg2_log_evidence - beside.neg2_log_evidence > margin
-        return better and alone.misfit > beside.misfit - MIN_SCORE_GAIN
+        fits_better = alone.misfit < beside.misfit - MIN_SCORE_GAIN
+        advantage = alone.neg2_log_evidence - beside.neg2_log_evidence
+        return advantage > (imitation_margin if fits_better else margin)
 
     def gain_of_discrepancy(self, laws: Sequence[int], stage: str | None = None) -> float:
         """Fall of the misfit by the discrepancy terms of one stage, or of all, beside laws and all other terms."""
@@ -259,7 +262,7 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
         residual = residual - part
         blocks.append((candidate, columns, None, _shape_cost(fit, candidate)))
     present = {candidate.key for candidate in fit.model.candidates}
-    others = [candidate for candidate in candidates if candidate.key not in present]
+    others = [candidate for candidate in candidates if candidate.key not in present and is_linear(candidate)]
     for tests in score_candidate_starts(likelihood, fit, others):
         cost = 2.0 * float(np.log(len(tests)))
         blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
@@ -277,10 +280,10 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
 
 
 def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
-    """The best starts of one candidate that is linear in an amplitude and has an effect."""
-    linear = [test for test in tests if amplitude_indices(test.model, test.candidate) and np.any(test.columns)]
+    """The best starts of one candidate, where it has an effect."""
+    with_effect = [test for test in tests if np.any(test.columns)]
     most = 1 if tests[0].candidate.term.effect in DISCREPANCY_TERMS else MAX_STARTS
-    return sorted(linear, key=lambda test: -test.predicted_gain)[:most]
+    return sorted(with_effect, key=lambda test: -test.predicted_gain)[:most]
 
 
 def _part_of_fit(fit: Fit, candidate: Candidate) -> tuple[Array, Array]:

@@ -90,6 +90,11 @@ def is_amplitude(candidate: Candidate, parameter: Parameter) -> bool:
     return parameter.kind in AMPLITUDE_KINDS and not candidate.term.initial_seeds
 
 
+def is_linear(candidate: Candidate) -> bool:
+    """Whether a term is linear in an amplitude around zero."""
+    return any(is_amplitude(candidate, parameter) for parameter in candidate.term.free_parameters)
+
+
 def score_candidates(
     likelihood: Likelihood,
     base: Fit,

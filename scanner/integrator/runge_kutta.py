@@ -171,11 +171,13 @@ def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, laws, s
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)
-def _acceleration(s, lane, theta_row, omega_row, volt, electrostatic_volt):  # type: ignore[no-untyped-def]
+def _acceleration(s, lane, theta_row, omega_row, volt, electrostatic, electrostatic_volt):  # type: ignore[no-untyped-def]
     """Angular acceleration in one lane [rad/s2], from the nominal laws and what the terms add."""
-    u = (s[theta_row, lane] - s[THETA_TH, lane]) / s[THETA0, lane]
-    slope = gaussian_slope(u, negative_exponential(-u * u), s[C0, lane], s[THETA0, lane]) + s[TERM_SLOPE, lane]
-    torque = s[TORQUE_PER_VOLT, lane] * volt + electrostatic_torque(slope, electrostatic_volt) + s[TERM_TORQUE, lane]
+    torque = s[TORQUE_PER_VOLT, lane] * volt + s[TERM_TORQUE, lane]
+    if electrostatic:
+        u = (s[theta_row, lane] - s[THETA_TH, lane]) / s[THETA0, lane]
+        slope = gaussian_slope(u, negative_exponential(-u * u), s[C0, lane], s[THETA0, lane]) + s[TERM_SLOPE, lane]
+        torque += electrostatic_torque(slope, electrostatic_volt)
     return angular_acceleration(s[theta_row, lane], s[omega_row, lane], torque, s[J, lane], s[B, lane], s[K, lane])
 
 
@@ -198,6 +200,7 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
     nodes of every step, shape (n, 3). ``width``: lanes computed; those beyond the number of motions fill a vector.
     """
     half, used, any_term, hidden_states = 0.5 * step, start.shape[0], laws[2] + laws[5] > 0, laws[8]
+    electrostatic = laws[7] > 0.0
     s = np.zeros((ROWS, LANES))
     for lane in range(width):
         motion = min(lane, used - 1)
@@ -214,21 +217,21 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
             _evaluate_terms(t, THETA, OMEGA, Z, DZ1, o0, v0, laws, s, used)
             _set_stage_z(DZ1, half, s, hidden_states, width)
         for lane in range(width):
-            s[ALPHA1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, e0)
+            s[ALPHA1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, electrostatic, e0)
             s[OMEGA2, lane] = s[OMEGA, lane] + half * s[ALPHA1, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA, lane]
         if any_term:
             _evaluate_terms(t + half, STAGE_THETA, OMEGA2, STAGE_Z, DZ2, o1, v1, laws, s, used)
             _set_stage_z(DZ2, half, s, hidden_states, width)
         for lane in range(width):
-            s[ALPHA2, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA2, v1, e1)
+            s[ALPHA2, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA2, v1, electrostatic, e1)
             s[OMEGA3, lane] = s[OMEGA, lane] + half * s[ALPHA2, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA2, lane]
         if any_term:
             _evaluate_terms(t + half, STAGE_THETA, OMEGA3, STAGE_Z, DZ3, o1, v1, laws, s, used)
             _set_stage_z(DZ3, step, s, hidden_states, width)
         for lane in range(width):
-            s[ALPHA3, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA3, v1, e1)
+            s[ALPHA3, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA3, v1, electrostatic, e1)
             s[OMEGA4, lane] = s[OMEGA, lane] + step * s[ALPHA3, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + step * s[OMEGA3, lane]
         if any_term:
@@ -238,7 +241,7 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
                     rates = s[DZ1 + k, lane] + 2.0 * s[DZ2 + k, lane] + 2.0 * s[DZ3 + k, lane] + s[DZ4 + k, lane]
                     s[Z + k, lane] += step / 6.0 * rates
         for lane in range(width):
-            alpha4 = _acceleration(s, lane, STAGE_THETA, OMEGA4, v2, e2)
+            alpha4 = _acceleration(s, lane, STAGE_THETA, OMEGA4, v2, electrostatic, e2)
             omegas = s[OMEGA, lane] + 2.0 * s[OMEGA2, lane] + 2.0 * s[OMEGA3, lane] + s[OMEGA4, lane]
             alphas = s[ALPHA1, lane] + 2.0 * s[ALPHA2, lane] + 2.0 * s[ALPHA3, lane] + alpha4
             s[THETA, lane] += step / 6.0 * omegas
