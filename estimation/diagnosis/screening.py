@@ -171,11 +171,15 @@ def _score_starts(
 
 
 def set_amplitudes(x: Array, model: Model, candidate: Candidate, estimate: Array) -> None:
-    """Set a candidate's amplitudes and hidden states in ``x`` from estimates of amplitude and amplitude times state."""
+    """Set a candidate's amplitudes and hidden states in ``x`` from estimates of amplitude and amplitude times state.
+
+    Hidden states without an estimate, those of a candidate that the fit already contains, keep their values.
+    """
     amplitudes, hidden_states = amplitude_indices(model, candidate), hidden_state_indices(model, candidate)
     x[amplitudes] = estimate[: len(amplitudes)]
-    if hidden_states and x[amplitudes[0]]:
-        x[hidden_states] = np.clip(estimate[len(amplitudes) :] / x[amplitudes[0]], -MAX_PRIOR_SIGMAS, MAX_PRIOR_SIGMAS)
+    states = estimate[len(amplitudes) :]
+    if states.size and x[amplitudes[0]]:
+        x[hidden_states] = np.clip(states / x[amplitudes[0]], -MAX_PRIOR_SIGMAS, MAX_PRIOR_SIGMAS)
 
 
 def amplitude_indices(model: Model, candidate: Candidate) -> list[int]:
