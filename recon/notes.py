@@ -2,11 +2,39 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from estimation.diagnosis.clipping import upper_rail
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
+from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
 from scanner.recording import Recording
+
+MAX_SATURATION_SAMPLES = 1_000_000
+"""Samples from the start of the intensity in which a saturated detector is searched: 0.2 s at 5 MS/s. Sorting takes
+0.1 s."""
+
+
+def describe_saturation(intensity: Channel) -> list[str]:
+    """A line for each detector of which many samples stand exactly at the largest value.
+
+    Args:
+        intensity: shape (n,) or (n, detectors).
+    """
+    count = min(intensity.size, MAX_SATURATION_SAMPLES)
+    notes = []
+    for number, detector in enumerate(intensity.read(0, count).reshape(count, -1).T):
+        finite = detector[np.isfinite(detector)]
+        if finite.size and (rail := upper_rail(finite)):
+            name = "intensity" if len(intensity.shape) == 1 else f"intensity of detector {number}"
+            notes.append(
+                f"{name}: {rail[1] / finite.size:.2%} of the samples stand at the largest value, {rail[0]:.4g} "
+                f"{intensity.unit}: the detector is saturated there, and the picture shows no detail; "
+                "lower its gain or the light"
+            )
+    return notes
 
 
 def describe_ambiguous_signs(motion: Motion) -> list[str]:

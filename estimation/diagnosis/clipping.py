@@ -43,8 +43,8 @@ class Rail(NamedTuple):
     samples: int
 
 
-def _upper_rail(signal: Array) -> tuple[float, int] | None:
-    """Largest value of a signal and the number of samples there, None where it is no rail."""
+def upper_rail(signal: Array) -> tuple[float, int] | None:
+    """Largest value of a signal of shape (n,) and the number of samples there, None where it is no rail."""
     values, counts = np.unique(signal, return_counts=True)
     if values.size <= NEIGHBOURS or counts[-1] < MIN_CLIPPED_SAMPLES:
         return None
@@ -59,7 +59,7 @@ def find_rail(signal: Array) -> Rail | None:
     Two rails of one magnitude are one limit. Of two others the one with more samples is taken. A single rail is one of
     two, of which the other was not reached, where no sample exceeds its magnitude on the other side.
     """
-    upper, lower = _upper_rail(signal), _upper_rail(-signal)
+    upper, lower = upper_rail(signal), upper_rail(-signal)
     if upper and lower and np.isclose(upper[0], lower[0], rtol=SAME_LIMIT):
         return Rail(max(upper[0], lower[0]), "sense", upper[1] + lower[1])
     found = [

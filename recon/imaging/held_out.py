@@ -43,8 +43,11 @@ class SplitSums(NamedTuple):
 
     @property
     def kept_counts(self) -> Array:
-        """Counts of the samples that are not held out."""
-        return self.counts - self.held_counts
+        """Counts of the samples that are not held out, none negative.
+
+        Rounding may place a sample at the edge of a pixel in its neighbour where a part of the scan is gridded.
+        """
+        return np.maximum(self.counts - self.held_counts, 0.0)
 
 
 def held_out_ranges(first: int, stop: int) -> list[tuple[int, int]]:

@@ -86,8 +86,9 @@ def estimate_picture(
     """
     if kind not in PICTURE_KINDS:
         raise BadInput(f"no picture is called {kind!r}", channel="picture", hint=f"give {', '.join(PICTURE_KINDS)}")
+    flat = _describe_flat(means, noise)
     if kind == "mean":
-        return EstimatedPicture(means, pixel_sd(means, noise))
+        return EstimatedPicture(means, pixel_sd(means, noise), notes=flat)
     _require_spread(means)
     stop = intensity.size if stop is None else stop
     kept = subtract_ranges([(first, stop)], subtract_ranges(held_out_ranges(first, stop), unlocated))
@@ -108,10 +109,8 @@ def estimate_picture(
     ]
     if not np.isfinite(image).all():
         notes.append(f"{np.mean(np.isnan(image)):.1%} of the pixels are too far from any sample and have no value")
-    if any(_is_flat(samples, each) for samples, each in zip(detectors, noise, strict=True)):
-        notes.append("intensity: no structure beyond the noise was found; the picture is flat within its uncertainty")
     following = [each for each in carry if each is not None]
-    return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes, following)
+    return EstimatedPicture(replace(means, image=image), sd, share, resolution, [*notes, *flat], following)
 
 
 def _estimate_detector(
@@ -150,11 +149,14 @@ def _require_spread(means: Picture) -> None:
         raise BadInput(what, channel="intensity", hint="check the motion of both axes or use --picture mean")
 
 
-def _is_flat(samples: SplitSums, noise: SampleNoise | None) -> bool:
-    """Whether the means of the pixels scatter as the noise of the samples lets expect."""
-    counts = samples.counts[samples.counts > 0]
-    means, mean = samples.sums[samples.counts > 0] / counts, samples.sums.sum() / counts.sum()
-    if noise is None or not (variance := float(noise.variance(np.asarray(mean)))) > 0:
-        return False
-    excess = float(np.mean(counts * (means - mean) ** 2)) / variance - 1.0
-    return excess < MAX_FLAT_EXCESS_SD * float(np.sqrt(2.0 / counts.size))
+def _describe_flat(means: Picture, noise: Sequence[SampleNoise | None]) -> list[str]:
+    """A note where the means of the pixels of a detector scatter as the noise of the samples lets expect."""
+    counts = means.coverage[means.coverage > 0].astype(np.float64)
+    for detector, sample in zip(means.image[means.coverage > 0].reshape(counts.size, -1).T, noise, strict=True):
+        mean = float(np.average(detector, weights=counts)) if counts.size else 0.0
+        if sample is None or not (variance := float(sample.variance(np.asarray(mean)))) > 0:
+            continue
+        excess = float(np.mean(counts * (detector - mean) ** 2)) / variance - 1.0
+        if excess < MAX_FLAT_EXCESS_SD * float(np.sqrt(2.0 / counts.size)):
+            return ["intensity: no structure beyond the noise was found; the picture is flat within its uncertainty"]
+    return []

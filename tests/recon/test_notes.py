@@ -1,0 +1,28 @@
+"""Notes on a recording whose picture is right only in part."""
+
+import numpy as np
+
+from recon.notes import describe_saturation
+from scanner.arrays import Array
+from scanner.channel import Channel
+
+
+def detector(values: Array) -> Channel:
+    return Channel("intensity", "V", 1e6, 0.0, values, 0, len(values))
+
+
+def test_a_saturated_detector_is_named_with_its_share_and_level() -> None:
+    light = np.random.default_rng(0).normal(1.0, 0.3, 10_000)
+    assert describe_saturation(detector(light)) == []
+    level = float(np.quantile(light, 0.8))
+    (note,) = describe_saturation(detector(np.minimum(light, level)))
+    assert "20.00% of the samples" in note
+    assert f"{level:.4g} V" in note
+    (note,) = describe_saturation(detector(np.column_stack([light, np.minimum(light, level)])))
+    assert note.startswith("intensity of detector 1")
+
+
+def test_photon_counts_are_not_saturated() -> None:
+    for photons in (0.05, 2.0, 200.0):
+        counts = np.random.default_rng(1).poisson(photons, 100_000).astype(float)
+        assert describe_saturation(detector(counts)) == []
