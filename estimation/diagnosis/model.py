@@ -48,11 +48,8 @@ noise model, not an effect. A stronger tone is interference."""
 AXIS_CACHE_SIZE = 64
 """Axes with fitted nominal values that a model caches: about as many as one Jacobian has columns."""
 
-HUM_HARMONICS = 7
+HUM_HARMONICS = 3
 """Number of harmonics of the mains in the noise model, the n-th with a prior of 1/n, as rectifiers cause them."""
-
-MAINS_RELATIVE_SD = 5e-4
-"""Prior standard deviation of the mains frequency, relative: grids keep it within 0.02 to 0.03 Hz for most of a day."""
 
 HUM_RELATIVE_SD = 0.5
 """Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
@@ -361,19 +358,13 @@ def _on_grid(waveforms: Array, output: Output, run: Run) -> Array:
 
 @lru_cache(maxsize=16)
 def _hum_quadratures(mains: float, n: int, step: float) -> dict[str, Array]:
-    """Quadratures of the first harmonics of the mains, the n-th with amplitude 1/n.
-
-    Each is followed by its change, to first order, if the frequency deviates by ``MAINS_RELATIVE_SD``.
-    """
-    phase = 2 * np.pi * mains * step * np.arange(n)
-    deviation = MAINS_RELATIVE_SD * (phase - phase.mean())
-    waveforms = {}
-    for multiple in range(1, HUM_HARMONICS + 1):
-        for name, wave in (("cos", np.cos), ("sin", np.sin)):
-            line = wave(multiple * phase) / multiple
-            waveforms[f"{name} {mains * multiple:g} Hz"] = line
-            waveforms[f"{name} {mains * multiple:g} Hz, deviation"] = multiple * deviation * line
-    return waveforms
+    """Quadratures of the first harmonics of the mains, the n-th with amplitude 1/n."""
+    phase = 2 * np.pi * step * np.arange(n)
+    return {
+        f"{name} {mains * multiple:g} Hz": wave(mains * multiple * phase) / multiple
+        for multiple in range(1, HUM_HARMONICS + 1)
+        for name, wave in (("cos", np.cos), ("sin", np.sin))
+    }
 
 
 def _motion_terms(added: Iterable[ActiveTerm]) -> tuple[ActiveTerm, ...]:

@@ -129,8 +129,7 @@ def _fit_shortlist(likelihood: Likelihood, base: Fit, promising: Sequence[ScoreT
     """Fits, with possible signs, of the candidates with the largest predicted gains.
 
     If the misfit is large, predicted gains may be wrong by a factor of ten. Then all candidates are fitted for a few
-    iterations, and the worse half is dropped, without self-excited terms: a mode that grows from the noise fits only
-    once its frequency and growth are nearly right.
+    iterations, and the worse half is dropped.
     """
     starts = [(score.model, damped_newton_start(likelihood, base, score)) for score in promising]
     if promising and promising[0].predicted_gain > NONLINEAR_GAIN:
@@ -138,8 +137,7 @@ def _fit_shortlist(likelihood: Likelihood, base: Fit, promising: Sequence[ScoreT
             fits = sorted(
                 fit_models(likelihood, starts, max_iterations=max_iterations), key=lambda fit: fit.neg2_log_evidence
             )
-            kept = max(BEAM_WIDTH, len(fits) // 2)
-            starts = [(fit.model, fit.x) for i, fit in enumerate(fits) if i < kept or _is_self_excited(fit)]
+            starts = [(fit.model, fit.x) for fit in fits[: max(BEAM_WIDTH, len(fits) // 2)]]
         abort_above = (
             min((fit.neg2_log_evidence for fit in fits if satisfies_sign_constraints(fit)), default=np.inf)
             + ABORT_MARGIN
@@ -148,11 +146,6 @@ def _fit_shortlist(likelihood: Likelihood, base: Fit, promising: Sequence[ScoreT
         competitive = [score for score in promising if score.predicted_gain > 0.5 * promising[0].predicted_gain]
         starts, abort_above = starts[: max(BEAM_WIDTH, len(competitive))], np.inf
     return [fit for fit in fit_models(likelihood, starts, abort_above=abort_above) if satisfies_sign_constraints(fit)]
-
-
-def _is_self_excited(fit: Fit) -> bool:
-    """Whether the last candidate of a fit is a motion that grows from an initial state."""
-    return bool(fit.model.candidates[-1].term.initial_seeds)
 
 
 def fit_candidates_progressively(
