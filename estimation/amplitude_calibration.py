@@ -8,6 +8,7 @@ import numpy as np
 
 from scanner.device import Device
 from scanner.harmonics import capacitance_harmonics
+from scanner.motion import Motion
 from scanner.recording import Recording
 from scanner.stages import Amdm, Capacitance, MotionSensor, Transimpedance
 
@@ -52,6 +53,24 @@ def amplitude_calibration_sd(
     behind, ahead = (np.log(_second_harmonic(float(each), sensed.capacitance)) for each in steps)
     slope = max(abs(float(ahead - behind)) / (2 * RELATIVE_STEP), RELATIVE_STEP)  # d ln S / d ln A
     return hypot(gain_sd / slope, device.tolerance(axis, "theta0"))
+
+
+def motion_calibration_sd(recording: Recording, device: Device, axis: str, motion: Motion) -> float | None:
+    """Relative standard deviation of the amplitude of an estimated motion by the calibration.
+
+    Args:
+        recording, device: of the scan.
+        axis: its name.
+        motion: of all axes.
+
+    Returns:
+        As :func:`amplitude_calibration_sd`. Of an axis with edges, which use no readout: 0 where the stated angle of
+        the detector determines the amplitude, because this angle has no tolerance; None where nothing does.
+    """
+    own = motion.axes[axis]
+    if motion.estimator == "edges" and f"sync_{axis}" in recording.edges:
+        return None if own.amplitude_sd is None else 0.0
+    return amplitude_calibration_sd(recording, device, axis, float(np.mean(own.amplitude)), motion.estimator)
 
 
 def _second_harmonic(amplitude: float, comb: Capacitance) -> float:

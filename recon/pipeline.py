@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from estimation.amplitude_calibration import amplitude_calibration_sd
+from estimation.amplitude_calibration import motion_calibration_sd
 from estimation.estimate import default_estimator, estimate
 from estimation.optics.correction import beam_motion
 from recon.evaluation import Truth, evaluate_axis
@@ -255,10 +255,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         resolution_px=estimate.resolution_px,
         sample_noise=noise,
         amplitude_calibration={
-            name: amplitude_calibration_sd(
-                prepared.recording, prepared.device, name, float(np.mean(axis.amplitude)), motion.estimator
-            )
-            for name, axis in motion.axes.items()
+            name: motion_calibration_sd(prepared.recording, prepared.device, name, motion) for name in motion.axes
         },
         p=options.p,
         spot=options.spot,

@@ -156,5 +156,3 @@ def _fit_laws(likelihood: Likelihood, fit: Fit, linear: LinearModel, laws: Seque
                 x[i] = law.test.x[law.test.model.index("term", f.owner, f.name)]
         set_amplitudes(x, model, law.candidate, estimates[low:high])
     return fit_model(likelihood, model, x, max_iterations=20)
-
-

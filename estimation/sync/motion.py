@@ -144,7 +144,7 @@ def axis_motion_from_edges(
             what = "edges alone do not determine the amplitude"
             hint = "state the field of view, [scan], in the device, or the angle of a detector beside the centre"
             raise BadInput(what, file=edges.file, channel=edges.name, hint=hint)
-        amplitude = np.full(found.time.size, float(getattr(device.scan, f"half_angle_{name}")))
+        amplitude = np.full(found.time.size, device.scan.mechanical_half_angles["xy".index(name)])
         notes.append(f"{edges.name}: the edges do not determine the amplitude; the motion is taken to fill the field")
     else:
         amplitude = measured[0]

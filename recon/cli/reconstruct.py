@@ -247,9 +247,18 @@ def _format_axis(name: str, axis: Mapping[str, Any]) -> str:
     if measured["sd"] is not None:
         line += f", phase error measured in the picture {measured['value']:+.3f}° ± {measured['sd']:.3f}°"
     line += f", amplitude {axis['amplitude_rad']:.4g} rad"
+    return f"{line}{_format_amplitude_sd(axis)}; sign {axis['sign']}"
+
+
+def _format_amplitude_sd(axis: Mapping[str, Any]) -> str:
     sd, calibration = axis["amplitude_sd_rad"], axis["amplitude_sd_calibration_rad"]
-    line += " (scale not known)" if sd is None else f" ± {sd:.2g} (calibration {calibration:.2g})"
-    return f"{line}; sign {axis['sign']}"
+    if axis["amplitude_from"] == "field":
+        return " (the half angle of [scan], as the edges do not determine it)"
+    if sd is None:
+        return " (scale not known)"
+    if axis["amplitude_from"] == "edges":
+        return f" ± {sd:.2g} (by the stated angle of the detector, taken as exact)"
+    return f" ± {sd:.2g} (calibration {calibration:.2g})"
 
 
 def _format_live(live: Mapping[str, Any]) -> str:

@@ -199,9 +199,13 @@ def blur_figure_of(parts: Mapping[str, Mapping[str, float]], p: float) -> Figure
 def _format_amplitude_sd(axis: Mapping[str, Any]) -> str:
     """Relative standard deviation of the amplitude, with the part from the calibration."""
     sd, calibration = axis["amplitude_sd_rad"], axis["amplitude_sd_calibration_rad"]
+    if axis["amplitude_from"] == "field":
+        return "not known: the half angle of [scan] is assumed, as the edges do not determine it"
     if sd is None:
         return "not known: nothing calibrates it"
     percent = 100.0 / axis["amplitude_rad"]
+    if axis["amplitude_from"] == "edges":
+        return f"{percent * sd:.2g} % (by the stated angle of the detector, taken as exact)"
     return f"{percent * sd:.2g} % (calibration {percent * calibration:.2g} %)"
 
 

@@ -69,6 +69,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
         "sign": own.sign,
         "amplitude_rad": scale * float(np.mean(own.amplitude)),
         **amplitude_uncertainty(result, axis),
+        "amplitude_from": amplitude_source(result, axis),
         "frequency_hz": float(np.mean(own.frequency)),
         "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
         "picture_phase_error_deg": picture_phase_error(result.phase_errors, axis),
@@ -98,6 +99,14 @@ def amplitude_uncertainty(result: Reconstruction, axis: str) -> dict[str, float 
     calibration = scale * relative * float(np.mean(own.amplitude))
     noise = 0.0 if own.amplitude_sd is None else scale * float(np.sqrt(np.mean(own.amplitude_sd**2)))
     return {"amplitude_sd_rad": math.hypot(noise, calibration), "amplitude_sd_calibration_rad": calibration}
+
+
+def amplitude_source(result: Reconstruction, axis: str) -> str | None:
+    """What the amplitude comes from: "readout", "edges" or "field"; None where nothing calibrates it."""
+    calibrated = result.amplitude_calibration[axis] is not None
+    if result.motion.estimator == "edges" and f"sync_{axis}" in result.motion.info:
+        return "edges" if calibrated else "field"
+    return "readout" if calibrated else None
 
 
 def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEvaluation | None) -> dict[str, float]:

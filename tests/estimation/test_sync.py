@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from estimation.amplitude_calibration import motion_calibration_sd
 from estimation.estimate import default_estimator, estimate
 from estimation.sync.motion import amplitude_from_edges, phase_from_edges
 from phantoms.sync import SyncDetector, sync_edges
+from recon.cli import main
 from scanner.device import Device
 from scanner.edges import Edges, make_edges
 from scanner.errors import BadInput, UnitUnknown
@@ -112,7 +116,9 @@ def test_hysteresis_delays_both_edges_and_is_taken_off() -> None:
     recording = Recording.from_arrays(
         {**channels, "sync_x": (edges.times, "s", stated)}, Device("d", {"x": FIELD.axes["x"]})
     )
-    angle = estimate(recording).axes["x"].angle.read()
+    motion = estimate(recording)
+    assert motion_calibration_sd(recording, recording.device, "x", motion) == 0.0
+    angle = motion.axes["x"].angle.read()
     known = np.isfinite(angle)
     assert known.mean() > 0.99
     assert np.abs(angle - AMPLITUDE_RAD * np.sin(phase))[known].max() < 5e-4 * AMPLITUDE_RAD
@@ -131,12 +137,27 @@ def test_edges_are_the_default_where_nothing_else_shows_the_motion() -> None:
     assert motion.axes["x"].sign == "ambiguous"
     assert motion.axes["y"].sign == "known: angle_y"
     assert any("do not determine the amplitude" in note for note in motion.notes)
+    assert motion_calibration_sd(recording, FIELD, "x", motion) is None
     opposite = estimate(recording, flips={"x": True}).axes["x"].angle.read()
     error = min(np.nanmax(np.abs(sign * opposite - 0.1 * np.sin(phase))) for sign in (1.0, -1.0))
     assert error < 1e-3
     bare = Recording.from_arrays(channels, Device("bare", {"x": FIELD.axes["x"]}))
     with pytest.raises(BadInput, match="do not determine the amplitude"):
         estimate(bare)
+
+
+@pytest.mark.parametrize("optical", [False, True])
+def test_a_motion_that_fills_the_field_has_its_mechanical_half_angle(optical: bool) -> None:
+    edges, time, _ = detected(9, SyncDetector(jitter=JITTER_S))
+    assert FIELD.scan is not None
+    stated = replace(FIELD.scan, angle="optical") if optical else FIELD.scan
+    channels = {
+        "intensity": (np.zeros(time.size), "V", RATE_HZ),
+        "sync_x": (edges.times, "s", {"event": "both-edges"}),
+        "angle_y": (0.1 * np.sin(2 * np.pi * 700 * time), "rad", RATE_HZ),
+    }
+    motion = estimate(Recording.from_arrays(channels, replace(FIELD, scan=stated)))
+    assert np.allclose(motion.axes["x"].amplitude, FIELD.scan.half_angle_x * (0.5 if optical else 1.0))
 
 
 def test_edges_settle_the_sign_of_a_capacitive_signal() -> None:
@@ -190,3 +211,18 @@ def test_lists_without_a_regular_sequence_are_refused() -> None:
     for times in (np.sort(rng.random(500)), np.arange(5.0)):
         with pytest.raises(BadInput, match=r"no regular sequence|edges; 12 are needed"):
             phase_from_edges(make_edges("sync_x", times, {"unit": "s", "event": "zero-crossing-up"}))
+
+
+def test_the_amplitude_line_says_what_determines_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edges, time, phase = detected(8, SyncDetector(0.03), angle=0.03)
+    light = np.random.default_rng(0).normal(2.0 + np.sin(phase), 0.1)
+    channels = {"intensity": (light, "V", RATE_HZ), "angle_y": (0.1 * np.sin(4400.0 * time), "rad", RATE_HZ)}
+    words = {"angle": (0.03, "edges", "by the stated angle of the detector"),
+             "event": ("both-edges", "field", "the half angle of [scan]")}  # fmt: skip
+    for key, (value, source, line) in words.items():
+        path = tmp_path / f"{key}.h5"
+        recording = Recording.from_arrays({**channels, "sync_x": (edges.times, "s", {key: value})}, FIELD)
+        recording.write(path)
+        assert main(["reconstruct", str(path), "-o", str(tmp_path / key), "--pixels", "60x60"]) == 0
+        assert json.loads((tmp_path / key / "summary.json").read_text())["x"]["amplitude_from"] == source
+        assert line in capsys.readouterr().out

@@ -99,16 +99,16 @@ def map_blocks(blocks: Iterable[NDArray[Any]], file: Path) -> NDArray[Any]:
     Raises:
         BadInput: there are no rows.
     """
-    # The memory map below keeps the unnamed file; the system deletes it with the map or the process.
-    store = tempfile.TemporaryFile()  # noqa: SIM115
-    rows, shape, dtype = 0, (0,), np.dtype(np.float64)
-    for block in blocks:
-        store.write(np.ascontiguousarray(block).data)
-        rows, shape, dtype = rows + len(block), block.shape[1:], block.dtype
-    if not rows:
-        raise BadInput("holds no samples", file=file, hint="record or export it again")
-    store.flush()
-    return np.memmap(store, dtype, mode="r", shape=(rows, *shape))
+    # The memory map has its own handle of the unnamed file; the system deletes the file with the map or the process.
+    with tempfile.TemporaryFile() as store:
+        rows, shape, dtype = 0, (0,), np.dtype(np.float64)
+        for block in blocks:
+            store.write(np.ascontiguousarray(block).data)
+            rows, shape, dtype = rows + len(block), block.shape[1:], block.dtype
+        if not rows:
+            raise BadInput("holds no samples", file=file, hint="record or export it again")
+        store.flush()
+        return np.memmap(store, dtype, mode="r", shape=(rows, *shape))
 
 
 def rate_from_step(step: object) -> float | None:
