@@ -110,14 +110,11 @@ def frames(
         independent: posterior pictures use no samples of earlier frames.
 
     Raises:
-        BadInput: a frame would hold less than one sample, or is longer than the recording.
+        BadInput: a frame would hold less than one sample.
     """
     intensity = result.intensity
     time = frame_time or result.duration / (count or 1)
     length = time * intensity.sample_rate
-    if length > intensity.size + 1:
-        what = f"lasts {1e3 * result.duration:.4g} ms, less than one frame of {1e3 * time:.4g} ms"
-        raise BadInput(what, channel="intensity", hint="give a shorter --frame-time")
     if length < 1:
         what = f"has {intensity.sample_rate:.4g} samples a second, and frames of {time:.3g} s would hold none"
         raise BadInput(what, channel="intensity", hint="give fewer frames or more time to each")
@@ -138,7 +135,7 @@ def write_scan_frames(folder: Path, result: Reconstruction, options: Options) ->
         options: ``frames``, ``frame_time``, ``independent_frames``, ``fill_radius``, ``zarr`` and ``movie``.
 
     Raises:
-        BadInput: a frame would hold less than one sample, or is longer than the recording.
+        BadInput: a frame would hold less than one sample.
     """
     own = frames(result, options.frames, options.frame_time, options.independent_frames)
     count, frame_time = len(own), own.frame_time

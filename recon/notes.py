@@ -12,6 +12,9 @@ from scanner.device import AXES
 from scanner.motion import Motion
 from scanner.recording import Recording
 
+MAX_FRAME_EXCESS = 1e-3
+"""Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""
+
 MAX_SATURATION_SAMPLES = 1_000_000
 """Samples from the start of the intensity in which a saturated detector is searched: 0.2 s at 5 MS/s. Sorting takes
 0.1 s."""
@@ -35,6 +38,17 @@ def describe_saturation(intensity: Channel) -> list[str]:
                 "lower its gain or the light"
             )
     return notes
+
+
+def describe_long_frames(frame_time: float | None, intensity: Channel) -> list[str]:
+    """A line if one frame of ``frame_time`` [s] is longer than the intensity, so that the film has one short frame."""
+    duration = intensity.size / intensity.sample_rate
+    if frame_time is None or frame_time <= duration * (1.0 + MAX_FRAME_EXCESS):
+        return []
+    return [
+        f"--frame-time: {frame_time:.4g} s is longer than the intensity, {duration:.4g} s: the film has one frame; "
+        "give a shorter time"
+    ]
 
 
 def describe_ambiguous_signs(motion: Motion) -> list[str]:

@@ -30,7 +30,7 @@ from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
 from recon.imaging.sample_motion import SampleMotion
 from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion, relative_to_sample
-from recon.notes import describe_ambiguous_signs, describe_clock_jumps, describe_saturation
+from recon.notes import describe_ambiguous_signs, describe_clock_jumps, describe_long_frames, describe_saturation
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
@@ -279,6 +279,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_defects(prepared.defects),
             *describe_saturation(intensity),
             *estimate.notes,
+            *describe_long_frames(options.frame_time, intensity),
         ],
         intensity=intensity,
         name=prepared.recording.name,

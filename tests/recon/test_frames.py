@@ -17,7 +17,6 @@ from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
 from recon.report.movie import draw_frame
 from scanner.device import Device
-from scanner.errors import BadInput
 from scanner.recording import Recording
 from tests.support.simulated import imaging
 
@@ -110,12 +109,6 @@ def test_options_of_frames_need_frames(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.slow
-def test_a_frame_longer_than_the_recording_is_refused(result: Reconstruction) -> None:
-    with pytest.raises(BadInput, match=r"lasts .* ms, less than one frame of 1000 ms"):
-        frames(result, frame_time=1.0)
-    assert len(frames(result, frame_time=result.duration)) == 1
-
-
 def test_a_folder_of_frames_is_replaced(tmp_path: Path) -> None:
     pytest.importorskip("zarr")
     recording, _ = imaging()

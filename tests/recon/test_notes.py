@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from recon.notes import describe_saturation
+from recon.notes import describe_long_frames, describe_saturation
 from scanner.arrays import Array
 from scanner.channel import Channel
 
@@ -26,3 +26,11 @@ def test_photon_counts_are_not_saturated() -> None:
     for photons in (0.05, 2.0, 200.0):
         counts = np.random.default_rng(1).poisson(photons, 100_000).astype(float)
         assert describe_saturation(detector(counts)) == []
+
+
+def test_a_frame_longer_than_the_recording_is_stated() -> None:
+    second = detector(np.zeros(1_000_000))
+    (note,) = describe_long_frames(2.0, second)
+    assert "2 s is longer than the intensity, 1 s" in note
+    for frame_time in (None, 0.5, 1.0, 1.0005):
+        assert describe_long_frames(frame_time, second) == []
