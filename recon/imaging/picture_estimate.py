@@ -151,9 +151,12 @@ def _require_spread(means: Picture) -> None:
 
 def _describe_flat(means: Picture, noise: Sequence[SampleNoise | None]) -> list[str]:
     """A note where the means of the pixels of a detector scatter as the noise of the samples lets expect."""
-    counts = means.coverage[means.coverage > 0].astype(np.float64)
-    for detector, sample in zip(means.image[means.coverage > 0].reshape(counts.size, -1).T, noise, strict=True):
-        mean = float(np.average(detector, weights=counts)) if counts.size else 0.0
+    visited = means.coverage > 0
+    if not visited.any():
+        return []
+    counts = means.coverage[visited].astype(np.float64)
+    for detector, sample in zip(means.image[visited].reshape(counts.size, -1).T, noise, strict=True):
+        mean = float(np.average(detector, weights=counts))
         if sample is None or not (variance := float(sample.variance(np.asarray(mean)))) > 0:
             continue
         excess = float(np.mean(counts * (detector - mean) ** 2)) / variance - 1.0

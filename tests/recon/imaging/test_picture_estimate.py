@@ -143,6 +143,16 @@ def test_a_picture_of_samples_with_gaps_has_values() -> None:
     assert moved.kept_counts.min() == 0.0
 
 
+def test_a_frame_without_a_located_sample_is_empty() -> None:
+    motion, recording = scan(discs(), 20.0, 0.005)
+    channel = recording["intensity"]
+    everything = [(0, channel.size)]
+    means, noise = grid_intensity(motion, channel, GRID, everything), measure_noise(motion, channel, GRID)
+    estimated = estimate_picture("mean", means, noise, motion, channel, everything)
+    assert np.isnan(estimated.picture.image).all()
+    assert not estimated.notes
+
+
 def test_a_flat_scene_is_called_flat() -> None:
     for kind in PICTURE_KINDS:
         estimated = estimate(kind, *scan(np.full((96, 96), 0.5), 20.0, 0.005))
