@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.diagnosis.clipping import upper_rail
+from estimation.rail import upper_rail
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
 from scanner.channel import Channel
@@ -27,11 +27,13 @@ def describe_saturation(intensity: Channel) -> list[str]:
         intensity: shape (n,) or (n, detectors).
     """
     count = min(intensity.size, MAX_SATURATION_SAMPLES)
+    columns = intensity.read(0, count).reshape(count, -1).T
+    several = intensity.detectors or [f"detector {number}" for number in range(len(columns))]
+    names = [f"intensity, {name}" for name in several] if len(columns) > 1 else ["intensity"]
     notes = []
-    for number, detector in enumerate(intensity.read(0, count).reshape(count, -1).T):
+    for name, detector in zip(names, columns, strict=True):
         finite = detector[np.isfinite(detector)]
         if finite.size and (rail := upper_rail(finite)):
-            name = "intensity" if len(intensity.shape) == 1 else f"intensity of detector {number}"
             notes.append(
                 f"{name}: {rail[1] / finite.size:.2%} of the samples stand at the largest value, {rail[0]:.4g} "
                 f"{intensity.unit}: the detector is saturated there, and the picture shows no detail; "

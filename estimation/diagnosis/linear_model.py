@@ -234,7 +234,7 @@ class LinearModel:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
-    def are_needed(self, laws: Sequence[int], imitation_margin: float, margin: float = 0.0) -> bool:
+    def are_needed(self, laws: Sequence[int], imitation_margin: float, margin: float) -> bool:
         """Whether a discrepancy without bound on its scales needs laws beside it.
 
         Args:

@@ -11,7 +11,7 @@ from estimation.signals import phase_reference
 from estimation.sync.numbering import NumberedEdges, number_edges
 from estimation.sync.smoother import SmoothedPhase, smooth_phase
 from scanner.arrays import Array
-from scanner.device import Device
+from scanner.device import AXES, Device
 from scanner.edges import Edges
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, SampledAngle
@@ -144,7 +144,7 @@ def axis_motion_from_edges(
             what = "edges alone do not determine the amplitude"
             hint = "state the field of view, [scan], in the device, or the angle of a detector beside the centre"
             raise BadInput(what, file=edges.file, channel=edges.name, hint=hint)
-        amplitude = np.full(found.time.size, device.scan.mechanical_half_angles["xy".index(name)])
+        amplitude = np.full(found.time.size, device.scan.mechanical_half_angles[AXES.index(name)])
         notes.append(f"{edges.name}: the edges do not determine the amplitude; the motion is taken to fill the field")
     else:
         amplitude = measured[0]

@@ -19,7 +19,7 @@ def test_a_saturated_detector_is_named_with_its_share_and_level() -> None:
     assert "20.00% of the samples" in note
     assert f"{level:.4g} V" in note
     (note,) = describe_saturation(detector(np.column_stack([light, np.minimum(light, level)])))
-    assert note.startswith("intensity of detector 1")
+    assert note.startswith("intensity, detector 1:")
 
 
 def test_photon_counts_are_not_saturated() -> None:
