@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
@@ -24,10 +25,19 @@ def to_sample_ranges(intervals: Iterable[tuple[float, float]], channel: Channel)
 
 
 def subtract_ranges(ranges: SampleRanges, removed: SampleRanges) -> SampleRanges:
-    """Return the parts of ``ranges`` outside ``removed``."""
-    left = ranges
-    for low, high in removed:
-        left = [part for a, b in left for part in ((a, min(b, low)), (max(a, high), b)) if part[0] < part[1]]
+    """Return the parts of ``ranges`` outside ``removed``, in the order of ``ranges``."""
+    ends = [high for _, high in removed]
+    left: SampleRanges = []
+    for begin, end in ranges:
+        for k in range(bisect_right(ends, begin), len(removed)):
+            low, high = removed[k]
+            if low >= end:
+                break
+            if begin < low:
+                left.append((begin, low))
+            begin = high
+        if begin < end:
+            left.append((begin, end))
     return left
 
 

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import prod
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.imaging.gridding import find_sample_pixels
-from recon.imaging.intensity_drift import DriftKind, IntensityDrift, estimate_intensity_drift
+from recon.imaging.intensity_drift import DriftKind, IntensityDrift, SampleReader, estimate_intensity_drift
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
-from scanner.channel import READ_CHUNK_SAMPLES, Channel, LazySamples
+from scanner.channel import Channel, LazySamples
 from scanner.device import AXES
 from scanner.motion import Motion
+
+UNDETERMINED = (
+    "no drift was removed, because the samples do not determine one; that needs samples with noise in pixels that were "
+    "visited several times and are not dark"
+)
+"""Note where :func:`measure_intensity_drift` returns None."""
 
 
 def measure_intensity_drift(
     beam: Motion, intensity: Channel, grid: Grid, kind: DriftKind
 ) -> tuple[IntensityDrift | None, ...]:
-    """Drift of each detector; None where too few pixels were visited twice.
+    """Drift of each detector; None where the samples do not determine one.
 
     Args:
         beam: motion whose angles are on the intensity's clock.
@@ -28,15 +36,19 @@ def measure_intensity_drift(
         kind: what drifts.
     """
     x, y = (beam.axes[axis].angle for axis in AXES)
-    pixel = np.empty(intensity.size, np.int32)
-    for first in range(0, intensity.size, READ_CHUNK_SAMPLES):
-        stop = min(first + READ_CHUNK_SAMPLES, intensity.size)
-        pixel[first:stop] = find_sample_pixels(x.read(first, stop), y.read(first, stop), grid)
-    values = intensity.read().reshape(intensity.size, -1)
-    pixels = grid.width * grid.height
+
+    def reader(detector: int) -> SampleReader:
+        def read(first: int, stop: int) -> tuple[NDArray[np.int32], Array]:
+            values = intensity.read(first, stop).reshape(stop - first, -1)
+            pixel = find_sample_pixels(x.read(first, stop), y.read(first, stop), grid)
+            return pixel, np.ascontiguousarray(values[:, detector])
+
+        return read
+
+    detectors, pixels = prod(intensity.shape[1:]), grid.width * grid.height
     return tuple(
-        estimate_intensity_drift(pixel, np.ascontiguousarray(detector), pixels, intensity.sample_rate, kind)
-        for detector in values.T
+        estimate_intensity_drift(reader(detector), intensity.size, pixels, intensity.sample_rate, kind)
+        for detector in range(detectors)
     )
 
 
@@ -71,9 +83,12 @@ def describe_drift(drifts: Sequence[IntensityDrift | None], unit: str) -> list[s
     for number, drift in enumerate(drifts):
         detector = f"detector {number}" if len(drifts) > 1 else "the detector"
         if drift is None:
-            lines.append(f"{detector}: too few pixels were visited twice to determine a drift; nothing was removed")
+            lines.append(f"{detector}: {UNDETERMINED}")
             continue
         change, sd = float(np.std(drift.values)), drift.sd
+        if change == 0.0:
+            lines.append(f"{detector}: no {drift.kind} drift was found")
+            continue
         size = f"{change:.3g} {unit} rms" if drift.kind == "offset" else f"{100 * change:.3g} % rms"
         error = f"{sd:.1g} {unit}" if drift.kind == "offset" else f"{100 * sd:.1g} %"
         lines.append(f"{detector}: {drift.kind} drift of {size}, known to {error} at each moment, was removed")

@@ -13,6 +13,7 @@ Poutanen 2005, doi:10.1111/j.1365-2966.2005.09055.x, there for maps of the micro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -26,6 +27,10 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scanner.arrays import Array
 
 DriftKind = Literal["offset", "gain"]
+
+SampleReader = Callable[[int, int], tuple[NDArray[np.int32], Array]]
+"""Reads samples from the first number up to the second: the number of the pixel of each, negative where it belongs to
+none, and the intensity, both of shape (n,). Samples that are not finite are left out."""
 
 BLOCK_S = 3e-6
 """Length of a block [s]: blocks resolve drift up to 170 kHz. Faster drift lies below the noise of a sample."""
@@ -141,35 +146,34 @@ class IntensityDrift:
 
 
 def estimate_intensity_drift(
-    pixel: NDArray[np.int32], intensity: Array, pixels: int, sample_rate: float, kind: DriftKind
+    read: SampleReader, size: int, pixels: int, sample_rate: float, kind: DriftKind
 ) -> IntensityDrift | None:
-    """Estimate the drift of a detector; None where too few pixels were visited twice.
+    """Estimate the drift of a detector; None where the samples do not determine one.
 
     Args:
-        pixel: number of the pixel of each sample, negative where it belongs to none, shape (n,).
-        intensity: shape (n,); samples that are not finite are left out.
+        read: reads the samples; called once for each window, so memory does not grow with the recording.
+        size: number of samples.
         pixels: number of pixels of the picture.
         sample_rate: [Hz].
         kind: what drifts.
     """
     block = max(1, round(BLOCK_S * sample_rate))
-    missing = -pixel.size % block
-    used = (pixel >= 0) & np.isfinite(intensity)
-    pixel = np.pad(np.where(used, pixel, pixels), (0, missing), constant_values=pixels)  # one more pixel for the rest
-    intensity = np.pad(np.where(used, intensity, 0.0), (0, missing))
     window = WINDOW_SAMPLES // block * block
-    nothing = SceneSums(np.zeros(pixels + 1), np.zeros(pixels + 1))
-    model = fit_drift_model(pixel[:window], intensity[:window], nothing, sample_rate / block, block, kind)
+    nothing, model, parts = SceneSums(np.zeros(pixels + 1), np.zeros(pixels + 1)), None, []
+    scene = nothing
+    for first in range(0, size, window):
+        pixel, intensity = _fill_blocks(*read(first, min(first + window, size)), pixels, block)
+        if model is None:
+            model = fit_drift_model(pixel, intensity, nothing, sample_rate / block, block, kind)
+        if model is None:
+            return None
+        if model.flicker == model.walk == 0.0:
+            return IntensityDrift(kind, block, np.zeros(-(-size // block)), 0.0)
+        drift = _solve_window(pixel, intensity, scene, model)
+        scene = scene.add(pixel, model.remove(intensity, drift))
+        parts.append(drift)
     if model is None:
         return None
-    if model.flicker == model.walk == 0.0:
-        return IntensityDrift(kind, block, np.zeros(pixel.size // block), 0.0)
-    scene, parts = nothing, []
-    for first in range(0, pixel.size, window):
-        part = pixel[first : first + window], intensity[first : first + window]
-        drift = _solve_window(*part, scene, model)
-        scene = scene.add(part[0], model.remove(part[1], drift))
-        parts.append(drift)
     values = np.concatenate(parts) / model.level
     return IntensityDrift(kind, block, values - values.mean(), drift_sd(model, window // block) / model.level)
 
@@ -177,13 +181,15 @@ def estimate_intensity_drift(
 def fit_drift_model(
     pixel: NDArray[np.int32], intensity: Array, nothing: SceneSums, rate: float, block: int, kind: DriftKind
 ) -> DriftModel | None:
-    """Fit the spectrum of the drift to the residual of the mean picture; None without degrees of freedom.
+    """Fit the spectrum of the drift to the residual of the mean picture; None where the samples do not determine it.
+
+    That needs pixels that were visited several times and, for a gain, that are not dark, and samples with noise.
 
     The mean picture takes some of the power out of the residual; simulated white noise on the same path shows how much.
     The median density of each octave is fitted by non-negative least squares on the relative deviation.
 
     Args:
-        pixel: as for :func:`estimate_intensity_drift`, but the last pixel where a sample belongs to none.
+        pixel: number of the pixel of each sample, the last one where a sample belongs to none, shape (n,).
         intensity: shape (n,), n a multiple of ``block``.
         nothing: sums without samples.
         rate, block, kind: as in :class:`DriftModel`.
@@ -191,9 +197,9 @@ def fit_drift_model(
     scene = nothing.add(pixel, intensity)
     samples = scene.number[:-1].sum()
     free = 1.0 - np.count_nonzero(scene.number[:-1]) / max(samples, 1.0)
-    if not free > 0.0 or pixel.size < MIN_BLOCKS * block:
+    level = 1.0 if kind == "offset" else float(np.sqrt(scene.number[:-1] @ scene.mean[:-1] ** 2 / max(samples, 1.0)))
+    if not free > 0.0 or not level > 0.0 or pixel.size < MIN_BLOCKS * block:
         return None
-    level = 1.0 if kind == "offset" else float(np.sqrt(scene.number[:-1] @ scene.mean[:-1] ** 2 / samples))
     model = DriftModel(kind, block, rate, free, level)
     sensitivity = model.sensitivity(scene)
     frequency = rfftfreq(pixel.size // block, 1.0 / rate)[1:]
@@ -211,6 +217,8 @@ def fit_drift_model(
     power = residual_power(intensity)
     median = np.array([np.median(power[octave == k]) for k in range(number.size)]) / MEDIAN_OF_EXPONENTIAL
     density = median / transmission / (rate * block)
+    if not (density > 0.0).all():  # NaN where no sample of an octave can show a drift
+        return None
     middle = np.bincount(octave, frequency) / number
     terms = np.column_stack([np.ones_like(middle), 1.0 / middle, 1.0 / middle**2])
     expected, scale = np.full_like(density, density.mean()), terms.max(axis=0)
@@ -224,7 +232,17 @@ def fit_drift_model(
 def drift_sd(model: DriftModel, blocks: int) -> float:
     """Standard deviation of the drift of a block, in the intensity's unit, for noise that is the same in all blocks."""
     precision = model.precision(rfftfreq(blocks, 1.0 / model.rate))[1:]
-    return float(np.sqrt(np.mean(1.0 / (model.free / (model.white * model.rate) + precision))))
+    variance = model.white * model.rate
+    return float(np.sqrt(np.mean(variance / (model.free + variance * precision))))
+
+
+def _fill_blocks(
+    pixel: NDArray[np.int32], intensity: Array, pixels: int, block: int
+) -> tuple[NDArray[np.int32], Array]:
+    """Samples of whole blocks; those without a pixel or a value, and those added, get one pixel more, the last."""
+    used, missing = (pixel >= 0) & np.isfinite(intensity), -pixel.size % block
+    pixel = np.pad(np.where(used, pixel, np.int32(pixels)), (0, missing), constant_values=pixels)
+    return pixel, np.pad(np.where(used, intensity, 0.0), (0, missing))
 
 
 def _solve_window(pixel: NDArray[np.int32], intensity: Array, earlier: SceneSums, model: DriftModel) -> Array:

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.imaging.intensity_drift import SceneSums, estimate_intensity_drift, fit_drift_model
+from recon.imaging.intensity_drift import (
+    DriftKind,
+    IntensityDrift,
+    SceneSums,
+    estimate_intensity_drift,
+    fit_drift_model,
+)
 from tests.support.simulated import imaging
 
 RATE, PIXELS, NOISE_SD = 5e6, 200, 0.1
@@ -23,6 +29,13 @@ def crossing_scan(duration: float, pixels: int = PIXELS) -> tuple[np.ndarray, np
     pixel = (row * pixels + column).astype(np.int32)
     scene = np.random.default_rng(0).uniform(0.2, 1.0, pixels**2)
     return pixel, scene[pixel]
+
+
+def estimate(pixel: np.ndarray, values: np.ndarray, pixels: int, rate: float, kind: DriftKind) -> IntensityDrift | None:
+    """Drift of samples in memory."""
+    return estimate_intensity_drift(
+        lambda first, stop: (pixel[first:stop], values[first:stop]), pixel.size, pixels, rate, kind
+    )
 
 
 def flicker(samples: int, knee: float, rng: np.random.Generator) -> np.ndarray:
@@ -51,7 +64,7 @@ def test_flicker_noise_at_ten_times_the_slow_axis_costs_at_most_5_percent() -> N
     rng = np.random.default_rng(1)
     white = clean + NOISE_SD * rng.standard_normal(clean.size)
     drift = NOISE_SD * flicker(clean.size, 41e3, rng)
-    found = estimate_intensity_drift(pixel, white + drift, 400**2, RATE, "offset")
+    found = estimate(pixel, white + drift, 400**2, RATE, "offset")
     assert found is not None
     before, after, best = (mean_error(pixel, v, clean) for v in (white + drift, found.correct(white + drift), white))
     assert after <= 1.05 * best < before
@@ -63,7 +76,7 @@ def test_bleaching_is_a_gain() -> None:
     pixel, clean = crossing_scan(0.02)
     gain = np.exp(-np.linspace(0.0, 0.7, clean.size))
     noise = NOISE_SD * np.random.default_rng(2).standard_normal(clean.size)
-    found = estimate_intensity_drift(pixel, clean * gain + noise, PIXELS**2, RATE, "gain")
+    found = estimate(pixel, clean * gain + noise, PIXELS**2, RATE, "gain")
     assert found is not None
     corrected, best = found.correct(clean * gain + noise) / gain.mean(), clean + noise / gain
     assert mean_error(pixel, corrected, clean) <= 1.02 * mean_error(pixel, best, clean)
@@ -72,7 +85,7 @@ def test_bleaching_is_a_gain() -> None:
 def test_a_steady_detector_stays_as_it_is() -> None:
     pixel, clean = crossing_scan(0.02)
     values = clean + NOISE_SD * np.random.default_rng(3).standard_normal(clean.size)
-    found = estimate_intensity_drift(pixel, values, PIXELS**2, RATE, "offset")
+    found = estimate(pixel, values, PIXELS**2, RATE, "offset")
     assert found is not None
     assert mean_error(pixel, found.correct(values), clean) <= 1.002 * mean_error(pixel, values, clean)
 
@@ -83,7 +96,7 @@ def test_windows_join(monkeypatch: pytest.MonkeyPatch) -> None:
     drift = np.linspace(0.0, 0.5, clean.size)
     values = clean + drift + NOISE_SD * np.random.default_rng(4).standard_normal(clean.size)
     monkeypatch.setattr("recon.imaging.intensity_drift.WINDOW_SAMPLES", clean.size // 3)
-    found = estimate_intensity_drift(pixel, values, PIXELS**2, RATE, "offset")
+    found = estimate(pixel, values, PIXELS**2, RATE, "offset")
     assert found is not None
     np.testing.assert_allclose(
         found.values[: clean.size // found.block], block_means(drift - drift.mean(), found.block), atol=0.05
@@ -96,7 +109,7 @@ def test_samples_outside_and_without_a_value_are_left_out() -> None:
     values = clean + np.linspace(0.0, 0.5, clean.size) + NOISE_SD * rng.standard_normal(clean.size)
     values[1000:2000] = np.nan
     pixel[5000:6000] = -1
-    found = estimate_intensity_drift(pixel, values, PIXELS**2, RATE, "offset")
+    found = estimate(pixel, values, PIXELS**2, RATE, "offset")
     assert found is not None
     assert np.isfinite(found.values).all()
     assert np.ptp(found.values) == pytest.approx(0.5, abs=0.1)
@@ -121,7 +134,32 @@ def test_the_command_removes_a_drift_and_states_it(kind: str, tmp_path: Path) ->
 
 def test_without_crossings_nothing_is_estimated() -> None:
     pixel = np.arange(PIXELS**2, dtype=np.int32)
-    assert estimate_intensity_drift(pixel, np.ones(pixel.size), PIXELS**2, RATE, "offset") is None
+    assert estimate(pixel, np.ones(pixel.size), PIXELS**2, RATE, "offset") is None
+
+
+def test_memory_does_not_grow_with_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples are read once, a window at a time."""
+    pixel, clean = crossing_scan(0.02)
+    values = clean + np.linspace(0.0, 0.5, clean.size) + NOISE_SD * np.random.default_rng(7).standard_normal(clean.size)
+    parts = []
+
+    def read(first: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        parts.append((first, stop))
+        return pixel[first:stop], values[first:stop]
+
+    monkeypatch.setattr("recon.imaging.intensity_drift.WINDOW_SAMPLES", 30_000)
+    assert estimate_intensity_drift(read, pixel.size, PIXELS**2, RATE, "offset") is not None
+    assert parts == [(first, min(first + 30_000, 100_000)) for first in range(0, 100_000, 30_000)]
+
+
+@pytest.mark.parametrize("kind", ["offset", "gain"])
+@pytest.mark.parametrize("bright", [0, 1])
+def test_samples_without_noise_determine_no_drift(kind: DriftKind, bright: int) -> None:
+    pixel, clean = crossing_scan(0.02)
+    values = np.zeros(clean.size)
+    values[:bright] = 1.0
+    found = estimate(pixel, values, PIXELS**2, RATE, kind)
+    assert found is None or np.abs(found.values).max() <= 3 * found.sd
 
 
 def test_the_spectrum_of_flicker_noise_is_measured() -> None:
