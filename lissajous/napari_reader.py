@@ -55,7 +55,7 @@ def read_recording(path: str | Sequence[str]) -> list[Layer]:
     corner = (-0.5 * height * (grid.height - 1), -0.5 * width * (grid.width - 1))
     place = {"scale": (height, width), "translate": corner}
     units = {"units": ("mrad", "mrad")}
-    metadata = {"metadata": {"notes": list(result.notes), "angle": grid.angle}}
+    metadata = {"metadata": {"notes": [*result.limits, *result.notes], "angle": grid.angle}}
     layers: list[Layer] = []
     planes = [picture.image] if picture.image.ndim == 2 else list(np.moveaxis(picture.image, -1, 0))
     names = picture.detectors or tuple(f"detector {k + 1}" for k in range(len(planes)))

@@ -61,6 +61,10 @@ MAX_REPEAT_PERIODS = 4000
 NOISE_SAMPLES = 1 << 17
 """Samples of a frame from which its noise is measured, in some 10 ms: 10^4 pairs determine a variance to 1.5 %."""
 
+MAX_FRAMES_BETWEEN_MEASUREMENTS = 64
+"""Frames between two measurements of the readout's phase error: half a second of computing every few seconds, in which
+temperature changes no readout."""
+
 SIGN_TEST_SAMPLES = 4096
 """Samples over which the signs of two motions are compared."""
 
@@ -88,12 +92,14 @@ class PreviousFrame(NamedTuple):
         grid: shared by all frames.
         readout_phase: phase error of the readout by axis, from all frames so far.
         estimate: picture of the frame.
+        number: of the frame, from 1 on.
     """
 
     motion: Motion
     grid: Grid
     readout_phase: Mapping[str, ReadoutPhase]
     estimate: EstimatedPicture
+    number: int
 
 
 @dataclass
@@ -251,9 +257,19 @@ def reconstruct_frame(
     data = estimated.beam, intensity, unlocated, first
     picture = estimate_picture(options.picture, means, noise, *data, before=before)
     _replace_pictures(output, picture)
-    if wants_readout_phase(sensed, options):  # after the picture, which therefore comes no later
+    number = previous.number + 1 if previous else 1
+    if measures_readout_phase(number) and wants_readout_phase(sensed, options):  # after the picture, to delay none
         known = update_readout_phase(sensed, estimated.motion, measure_phase_errors(estimated), known)
-    return PreviousFrame(sensed, estimated.grid, known, picture)
+    return PreviousFrame(sensed, estimated.grid, known, picture, number)
+
+
+def measures_readout_phase(number: int) -> bool:
+    """Whether the phase error of the readout is measured in the frame of this number, from 1 on.
+
+    It takes longer than a short frame lasts. Frames at doubling numbers find it early and then refine it; in a long
+    scan every ``MAX_FRAMES_BETWEEN_MEASUREMENTS`` follow it.
+    """
+    return number & (number - 1) == 0 or number % MAX_FRAMES_BETWEEN_MEASUREMENTS == 0
 
 
 def match_signs(motion: Motion, before: Motion) -> Motion:

@@ -15,9 +15,12 @@ from scanner.recording import Recording
 MAX_FRAME_EXCESS = 1e-3
 """Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""
 
-MAX_SATURATION_SAMPLES = 1_000_000
-"""Samples from the start of the intensity in which a saturated detector is searched: 0.2 s at 5 MS/s. Sorting takes
-0.1 s."""
+MAX_CHECKED_SAMPLES = 1_000_000
+"""Samples from the start of the intensity in which saturation and negative counts are searched: 0.2 s at 5 MS/s.
+Sorting takes 0.1 s."""
+
+COUNT_UNITS = ("count", "counts", "photon", "photons")
+"""Units of an intensity that cannot be negative."""
 
 
 def describe_saturation(intensity: Channel) -> list[str]:
@@ -26,7 +29,7 @@ def describe_saturation(intensity: Channel) -> list[str]:
     Args:
         intensity: shape (n,) or (n, detectors).
     """
-    count = min(intensity.size, MAX_SATURATION_SAMPLES)
+    count = min(intensity.size, MAX_CHECKED_SAMPLES)
     columns = intensity.read(0, count).reshape(count, -1).T
     several = intensity.detectors or [f"detector {number}" for number in range(len(columns))]
     names = [f"intensity, {name}" for name in several] if len(columns) > 1 else ["intensity"]
@@ -40,6 +43,17 @@ def describe_saturation(intensity: Channel) -> list[str]:
                 "lower its gain or the light"
             )
     return notes
+
+
+def describe_negative_counts(intensity: Channel) -> list[str]:
+    """A line if samples of an intensity in counts or photons are negative."""
+    values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
+    if intensity.unit not in COUNT_UNITS or not (values < 0.0).any():
+        return []
+    return [
+        f"intensity: {np.mean(values < 0.0):.2g} of the samples are negative, down to {np.nanmin(values):.4g} "
+        f"{intensity.unit}, which counts cannot be: check the offset and whether the integers are unsigned"
+    ]
 
 
 def describe_long_frames(frame_time: float | None, intensity: Channel) -> list[str]:

@@ -30,7 +30,13 @@ from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
 from recon.imaging.sample_motion import SampleMotion
 from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion, relative_to_sample
-from recon.notes import describe_ambiguous_signs, describe_clock_jumps, describe_long_frames, describe_saturation
+from recon.notes import (
+    describe_ambiguous_signs,
+    describe_clock_jumps,
+    describe_long_frames,
+    describe_negative_counts,
+    describe_saturation,
+)
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
@@ -270,6 +276,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         defects=list(prepared.defects),
         unlocated_samples=sum(stop - first for first, stop in gridded.unlocated),
         affected=gridded.affected,
+        limits=[*describe_saturation(intensity), *estimate.limits],
         notes=[
             *estimated.field_notes,
             *gridded.field_notes,
@@ -277,7 +284,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *estimated.motion_notes,
             *describe_ambiguous_signs(motion),
             *describe_defects(prepared.defects),
-            *describe_saturation(intensity),
+            *describe_negative_counts(intensity),
             *estimate.notes,
             *describe_long_frames(options.frame_time, intensity),
         ],

@@ -99,7 +99,8 @@ class Reconstruction:
         defects: clock jumps, gaps, clipping and missing parts of the recording.
         unlocated_samples: number of samples left out because the mirror's angle is unknown there.
         affected: pixels that hold samples from defects, shape (height, width).
-        notes: what a reader has to know, a line each.
+        limits: reasons why the picture does not show the scene, or only a part, a line each.
+        notes: what else a reader has to know, a line each.
         intensity: the channel that was gridded: the segment in use, corrected for the device's optics.
         name: of the recording.
         seconds: computing time without writing [s].
@@ -125,6 +126,7 @@ class Reconstruction:
     defects: list[Defect]
     unlocated_samples: int
     affected: NDArray[np.bool_]
+    limits: list[str]
     notes: list[str]
     intensity: Channel
     name: str
@@ -136,7 +138,7 @@ class Reconstruction:
             f"  {axis}: phase error against the truth {np.degrees(error.phase_rmse):.4f}° rms"
             for axis, error in self.evaluation.items()
         ]
-        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
+        return "\n".join([*lines, *(f"  note: {note}" for note in [*self.limits, *self.notes])])
 
     @property
     def duration(self) -> float:

@@ -33,6 +33,13 @@ MAX_FLAT_EXCESS_SD = 4.0
 """Scatter of the pixels' means beyond their noise, in its standard deviations, up to which a scene is called flat."""
 
 
+FLOAT32_RELATIVE_ERROR = 1e-6
+"""Relative difference up to which pixels stored as float32 are equal: eight times the resolution of the format."""
+
+ONE_LINE = "all samples lie on one line"
+"""Why samples determine no picture, for notes and errors."""
+
+
 @dataclass(frozen=True)
 class EstimatedPicture:
     """A picture with its uncertainty.
@@ -43,7 +50,8 @@ class EstimatedPicture:
         data_share: weight of the pixel's own samples in its value, 0 where it was not visited, of the shape of the
             image; None for a picture of means.
         resolution_px: distance between independent values [px]; None for a picture of means.
-        notes: limits of the picture, a line each.
+        notes: what a reader has to know of the picture, a line each.
+        limits: reasons why it does not show the scene, or only a part, a line each.
         carried: what the next frame can use of this one, by detector; empty for a kind whose frames are independent.
     """
 
@@ -52,6 +60,7 @@ class EstimatedPicture:
     data_share: NDArray[np.float32] | None = None
     resolution_px: float | None = None
     notes: list[str] = field(default_factory=list)
+    limits: list[str] = field(default_factory=list)
     carried: Sequence[CarriedFrames] = ()
 
     @property
@@ -86,10 +95,13 @@ def estimate_picture(
     """
     if kind not in PICTURE_KINDS:
         raise BadInput(f"no picture is called {kind!r}", channel="picture", hint=f"give {', '.join(PICTURE_KINDS)}")
-    flat = _describe_flat(means, noise)
+    limits, line = _describe_flat(means, noise), _lies_on_one_line(means)
     if kind == "mean":
-        return EstimatedPicture(means, pixel_sd(means, noise), notes=flat)
-    _require_spread(means)
+        limits += [f"intensity: {ONE_LINE}; check the motion of both axes"] if line else []
+        return EstimatedPicture(means, pixel_sd(means, noise), limits=limits)
+    if line:
+        hint = "check the motion of both axes or use --picture mean"
+        raise BadInput(f"{ONE_LINE}, which determines no picture", channel="intensity", hint=hint)
     stop = intensity.size if stop is None else stop
     kept = subtract_ranges([(first, stop)], subtract_ranges(held_out_ranges(first, stop), unlocated))
     held = grid_intensity(beam, intensity, means.grid, kept, first, stop)
@@ -110,7 +122,7 @@ def estimate_picture(
     if not np.isfinite(image).all():
         notes.append(f"{np.mean(np.isnan(image)):.1%} of the pixels are too far from any sample and have no value")
     following = [each for each in carry if each is not None]
-    return EstimatedPicture(replace(means, image=image), sd, share, resolution, [*notes, *flat], following)
+    return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes, limits, following)
 
 
 def _estimate_detector(
@@ -140,23 +152,23 @@ def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:
     return [SplitSums(each, counts, other, held_counts) for each, other in zip(sums, held_sums, strict=True)]
 
 
-def _require_spread(means: Picture) -> None:
-    """Require samples that spread over the picture in every direction."""
+def _lies_on_one_line(means: Picture) -> bool:
+    """Whether the visited pixels, of which there is at least one, spread in one direction at most."""
     places = np.argwhere(means.coverage > 0).astype(float)
     spread = np.linalg.eigvalsh(np.cov(places.T))[0] if len(places) > 2 else 0.0
-    if not spread > MIN_SPREAD_PX**2:
-        what = "all samples lie on one line, which determines no picture"
-        raise BadInput(what, channel="intensity", hint="check the motion of both axes or use --picture mean")
+    return len(places) > 0 and not spread > MIN_SPREAD_PX**2
 
 
 def _describe_flat(means: Picture, noise: Sequence[SampleNoise | None]) -> list[str]:
-    """A note where the means of the pixels of a detector scatter as the noise of the samples lets expect."""
+    """A line where the means of the pixels of a detector are equal, or scatter as the noise of the samples alone."""
     visited = means.coverage > 0
     if not visited.any():
         return []
     counts = means.coverage[visited].astype(np.float64)
     for detector, sample in zip(means.image[visited].reshape(counts.size, -1).T, noise, strict=True):
         mean = float(np.average(detector, weights=counts))
+        if np.allclose(detector, mean, rtol=FLOAT32_RELATIVE_ERROR, atol=0.0):
+            return [f"intensity: every sample is {mean:g}: the picture shows nothing; check the detector"]
         if sample is None or not (variance := float(sample.variance(np.asarray(mean)))) > 0:
             continue
         excess = float(np.mean(counts * (detector - mean) ** 2)) / variance - 1.0

@@ -18,6 +18,9 @@ from scanner.recording import Recording
 MERGE_GAP_S = 1e-3
 """Intervals of one kind that are closer than this are reported as one: a signal that clips clips in every period."""
 
+MAX_STATED_FRACTION = 0.995
+"""Fraction of affected samples in an interval up to which it is stated: larger ones read as 1 with two digits."""
+
 MAX_PHASE_SD_RAD = 0.25
 """Standard deviation of the phase above which a sample gets no pixel. It corresponds to 50 pixels of 400."""
 
@@ -41,12 +44,14 @@ class Defect:
             earlier than the intensity) or ``PHASE_JUMP`` (see :mod:`recon.quality.clock_jumps`; of the intensity, see
             :mod:`recon.quality.dropped_samples`).
         start, stop: [s] on the recording's clock.
+        fraction: of the samples in the interval that are affected.
     """
 
     channel: str
     kind: str
     start: float
     stop: float
+    fraction: float = 1.0
 
 
 def find_defects(recording: Recording) -> list[Defect]:
@@ -101,7 +106,9 @@ def describe_defects(defects: Sequence[Defect]) -> Iterator[str]:
         total = sum(defect.stop - defect.start for defect in same)
         places = "one interval" if len(same) == 1 else f"{len(same)} intervals"
         name = KIND_NAMES.get(kind, kind)
-        yield f"{channel}: {name} for {1e3 * total:.4g} ms in {places}, the first at {same[0].start:.6g} s"
+        fraction = sum(defect.fraction * (defect.stop - defect.start) for defect in same) / total
+        share = "" if fraction > MAX_STATED_FRACTION else f", {fraction:.2g} of the samples there"
+        yield f"{channel}: {name} for {1e3 * total:.4g} ms in {places}, the first at {same[0].start:.6g} s{share}"
 
 
 def _find_missing_ends(channel: Channel, intensity: Channel) -> list[Defect]:
@@ -113,11 +120,16 @@ def _find_missing_ends(channel: Channel, intensity: Channel) -> list[Defect]:
 
 def _as_defects(channel: Channel, kind: str, ranges: SampleRanges) -> list[Defect]:
     """Ranges of samples as defects of one kind, merged where they are close together."""
-    rate = channel.sample_rate
-    merged = merge_ranges(ranges, round(MERGE_GAP_S * rate))
-    return [
-        Defect(channel.name, kind, channel.start + first / rate, channel.start + stop / rate) for first, stop in merged
-    ]
+    rate, start = channel.sample_rate, channel.start
+    affected = np.concatenate([[0], np.cumsum([stop - first for first, stop in ranges], dtype=int)])
+    ends = np.array([stop for _, stop in ranges])
+    defects, before = [], 0
+    for first, stop in merge_ranges(ranges, round(MERGE_GAP_S * rate)):
+        after = int(np.searchsorted(ends, stop, "right"))
+        fraction = float(affected[after] - affected[before]) / (stop - first)
+        defects.append(Defect(channel.name, kind, start + first / rate, start + stop / rate, fraction))
+        before = after
+    return defects
 
 
 def _read_chunks(channel: Channel) -> Iterator[tuple[int, NDArray[Any]]]:

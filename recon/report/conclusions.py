@@ -23,7 +23,7 @@ number are filled from their neighbours without visible loss."""
 
 
 def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
-    """How sharp the picture is, and what would improve it."""
+    """What the picture does not show, how sharp it is, and what would improve it."""
     axes = summary["axes"]
     within = min(summary[axis]["within_bound"] for axis in axes)
     measured = all("phase_rmse_deg" in summary[axis] for axis in axes)
@@ -31,8 +31,10 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
     errors = " and ".join(f"{_degrees(summary[axis][key])} in {axis}" for axis in axes)
     bounds = sorted({f"{summary[axis]['bound_deg']:.3f}°" for axis in axes})
     verdict = "sharp" if within >= SHARP_FRACTION else "partly blurred" if within >= 0.5 else "blurred"
-    text = _describe_readout_phase(summary) + (
-        f"The picture is {verdict}: {what} {errors} ({'rms' if measured else '1 sd'}), and {within:.1%} of the scan "
+    limits = "".join(f"{limit[0].upper()}{limit[1:]}. " for limit in summary["limits"])
+    subject = "The motion alone would give a picture that is" if limits else "The picture is"
+    text = f"{limits}{_describe_readout_phase(summary)}" + (
+        f"{subject} {verdict}: {what} {errors} ({'rms' if measured else '1 sd'}), and {within:.1%} of the scan "
         f"lies within the bound of {' / '.join(bounds)}."
     )
     if verdict != "sharp":

@@ -172,6 +172,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "seconds": result.seconds,
         "recorded_seconds": result.duration,
         "picture": _picture_score(result),
+        "limits": result.limits,
         "notes": result.notes,
         "info": dict(result.motion.info),
     }

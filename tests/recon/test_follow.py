@@ -17,7 +17,7 @@ import tifffile
 
 from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
-from recon.follow import follow_recording, match_signs, reconstruct_frame, repeat_time
+from recon.follow import follow_recording, match_signs, measures_readout_phase, reconstruct_frame, repeat_time
 from recon.imaging.readout_phase import apply_readout_phase
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
@@ -151,9 +151,15 @@ def test_an_interrupt_ends_the_following_and_keeps_the_frames(written, tmp_path:
 
     thread = threading.Thread(target=interrupt)
     thread.start()
-    assert main(["reconstruct", "--follow", str(path), "-o", str(out), "--frame-time", "0.01", *PIXELS]) == 0
+    arguments = ["--frame-time", "0.01", "--quiet-time", "60", *PIXELS]  # compilation takes longer than the usual 5 s
+    assert main(["reconstruct", "--follow", str(path), "-o", str(out), *arguments]) == 0
     thread.join()
     assert json.loads((out / "summary.json").read_text())["live"]["ended"] == "interrupted"
+
+
+def test_the_readout_error_is_measured_ever_more_rarely_and_never_stops() -> None:
+    measured = [number for number in range(1, 260) if measures_readout_phase(number)]
+    assert measured == [1, 2, 4, 8, 16, 32, 64, 128, 192, 256]
 
 
 @pytest.mark.slow

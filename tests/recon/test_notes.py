@@ -1,8 +1,10 @@
 """Notes on a recording whose picture is right only in part."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from recon.notes import describe_long_frames, describe_saturation
+from recon.notes import describe_long_frames, describe_negative_counts, describe_saturation
 from scanner.arrays import Array
 from scanner.channel import Channel
 
@@ -26,6 +28,16 @@ def test_photon_counts_are_not_saturated() -> None:
     for photons in (0.05, 2.0, 200.0):
         counts = np.random.default_rng(1).poisson(photons, 100_000).astype(float)
         assert describe_saturation(detector(counts)) == []
+
+
+def test_negative_counts_are_stated_and_negative_volts_are_not() -> None:
+    values = np.random.default_rng(2).poisson(5.0, 1000).astype(float)
+    counts = replace(detector(values), unit="counts")
+    assert describe_negative_counts(counts) == []
+    values[:10] = -3.0
+    (note,) = describe_negative_counts(counts)
+    assert "0.01 of the samples are negative, down to -3 counts" in note
+    assert describe_negative_counts(detector(values)) == []
 
 
 def test_a_frame_longer_than_the_recording_is_stated() -> None:

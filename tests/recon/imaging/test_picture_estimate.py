@@ -151,14 +151,23 @@ def test_a_frame_without_a_located_sample_is_empty() -> None:
     estimated = estimate_picture("mean", means, noise, motion, channel, everything)
     assert np.isnan(estimated.picture.image).all()
     assert not estimated.notes
+    assert not estimated.limits
 
 
 def test_a_flat_scene_is_called_flat() -> None:
     for kind in PICTURE_KINDS:
         estimated = estimate(kind, *scan(np.full((96, 96), 0.5), 20.0, 0.005))
-        assert any("no structure" in note for note in estimated.notes)
+        assert any("no structure" in limit for limit in estimated.limits)
         assert np.nanmax(np.abs(estimated.picture.image - 10.0)) < 5.0 * np.nanmax(estimated.sd)
-    assert not any("no structure" in note for note in estimate("kernel", *scan(discs(), 20.0, 0.005)).notes)
+    assert not estimate("kernel", *scan(discs(), 20.0, 0.005)).limits
+
+
+def test_a_mean_of_equal_samples_or_of_one_line_says_so() -> None:
+    (limit,) = estimate("mean", *scan(np.zeros((96, 96)), 20.0, 0.005)).limits
+    assert "every sample is 0" in limit
+    (limit,) = estimate("mean", *scan(discs(), 20.0, 0.005, fast_hz=0.0)).limits
+    assert "one line" in limit
+    assert estimate("mean", *scan(discs(), 20.0, 0.005)).limits == []
 
 
 @pytest.mark.parametrize("kind", ["kernel", "posterior"])

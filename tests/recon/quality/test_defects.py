@@ -19,7 +19,7 @@ from recon.imaging.bidirectional_phase import PhaseError, PhaseEstimate
 from recon.imaging.gridding import map_samples
 from recon.pipeline import reconstruct
 from recon.quality.clock_jumps import detect_clock_jumps
-from recon.quality.defects import Defect, find_defects
+from recon.quality.defects import Defect, describe_defects, find_defects
 from recon.quality.dropped_samples import first_late_slice, slice_delays
 from recon.reconstruction import Options, Reconstruction
 from recon.sample_ranges import subtract_ranges, to_sample_ranges
@@ -79,6 +79,16 @@ def test_missing_intensities_change_only_the_coverage(whole: Reconstruction) -> 
     assert np.array_equal(result.affected, missing_coverage > 0)
     both = (result.picture.coverage > 0) & ~result.affected
     np.testing.assert_array_equal(result.picture.image[both], whole.picture.image[both])
+
+
+def test_single_missing_samples_are_stated_with_their_share() -> None:
+    """They are closer than the merged gap, so they are one interval, of which few samples are missing."""
+    signal = damaged()["intensity"].read()
+    signal[::50] = np.nan
+    (defect,) = find_defects(damaged(intensity=signal))
+    assert defect.fraction == pytest.approx(0.02, rel=1e-3)
+    (line,) = describe_defects([defect])
+    assert line.endswith("0.02 of the samples there")
 
 
 def test_a_gap_in_the_sense_signal_is_bridged_and_its_pixels_marked(whole: Reconstruction) -> None:
@@ -241,7 +251,9 @@ def test_folder_and_summary_report_defects(tmp_path: Path) -> None:
     damaged(intensity=with_gap("intensity", 20_000, 25_000)).write(tmp_path / "a.h5")
     assert main(["reconstruct", str(tmp_path / "a.h5"), "-o", str(tmp_path / "out"), "--pixels", "100x100"]) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["trouble"] == [{"channel": "intensity", "kind": "gap", "start": 0.004, "stop": 0.005}]
+    assert summary["trouble"] == [
+        {"channel": "intensity", "kind": "gap", "start": 0.004, "stop": 0.005, "fraction": 1.0}
+    ]
     affected = tifffile.imread(tmp_path / "out" / "affected.tif")
     assert affected.dtype == np.uint8
     assert set(np.unique(affected)) == {0, 1}

@@ -1,0 +1,29 @@
+"""The sentence at the start of a report."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
+from recon.report.conclusions import conclude_reconstruction
+from recon.report.summary import summarise
+from tests.support.simulated import imaging
+
+
+def conclude(intensity: np.ndarray) -> str:
+    recording = imaging()[0]
+    recording = recording.with_channel(replace(recording["intensity"], raw=intensity, gain=1.0, offset=0.0))
+    return conclude_reconstruction(summarise(reconstruct(recording, Options(pixels=(100, 100)), quiet=True)))
+
+
+def test_only_a_picture_that_shows_its_scene_is_called_sharp() -> None:
+    light = imaging()[0]["intensity"].read()
+    assert conclude(light).startswith("The picture is sharp")
+    saturated = conclude(np.minimum(light, np.quantile(light, 0.3)))
+    assert "the detector is saturated" in saturated.split(". ")[0]
+    noise = np.random.default_rng(0).normal(1.0, 0.1, light.size)
+    assert conclude(noise).startswith("Intensity: no structure beyond the noise")
+    for text in (saturated, conclude(noise)):
+        assert "The picture is" not in text
+        assert "The motion alone would give a picture that is" in text
