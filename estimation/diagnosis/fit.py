@@ -270,4 +270,5 @@ def _finalise_fit(likelihood: Likelihood, model: Model, x: Array, residual: Arra
     chi2, penalty = float(residual[rows] @ residual[rows]), float(model.precision @ (x * x))
     information = jacobian[rows].T @ jacobian[rows]
     evidence = laplace_neg2_log_evidence(chi2 + penalty, information, model.precision**-0.5)
+    evidence += sum(mains.cost for mains in model.mains)
     return Fit(model, x, chi2, penalty, residual, jacobian, rows, likelihood.validation_rows, evidence)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
 
 from estimation.diagnosis.data import Output, Run, readout_of
+from estimation.diagnosis.mains import HUM_RELATIVE_SD, NOMINAL_MAINS, Mains, hum_quadratures
 from estimation.diagnosis.parameters import (
     OFFSET_RELATIVE_SD,
     REFERENCE_GAIN_RELATIVE_SD,
@@ -40,19 +40,8 @@ START_STATE_SD = 3.0
 """Prior standard deviation of the initial angle and rate in amplitudes of the motion: so wide that the data determine
 both."""
 
-
-MAINS_HZ = (50.0, 60.0)
-"""Mains frequencies [Hz]. Their first ``HUM_HARMONICS`` harmonics below the noise's standard deviation are part of the
-noise model, not an effect. A stronger tone is interference."""
-
 AXIS_CACHE_SIZE = 64
 """Axes with fitted nominal values that a model caches: about as many as one Jacobian has columns."""
-
-HUM_HARMONICS = 3
-"""Number of harmonics of the mains in the noise model, the n-th with a prior of 1/n, as rectifiers cause them."""
-
-HUM_RELATIVE_SD = 0.5
-"""Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
 
 
 _Key = tuple[object, ...]
@@ -85,7 +74,7 @@ class Model:
         runs: the recordings.
         device: the nominal device.
         candidates: added terms.
-        mains: frequencies of the mains whose hum is part of the noise model [Hz].
+        mains: whose hum is part of the noise model.
         given: terms that the device states, by axis.
         axes: axes that the recordings contain.
         parameters: specification of each element of x.
@@ -98,7 +87,7 @@ class Model:
         runs: Sequence[Run],
         device: Device,
         candidates: Sequence[Candidate] = (),
-        mains: Sequence[float] = MAINS_HZ,
+        mains: Sequence[Mains] = NOMINAL_MAINS,
     ):
         self.runs, self.device, self.candidates = tuple(runs), device, tuple(candidates)
         self.mains = tuple(mains)
@@ -161,10 +150,8 @@ class Model:
         if output.kind == "sense":
             noise = output.noise_sd or 0.0
             for mains in self.mains:
-                waveforms |= {
-                    name: HUM_RELATIVE_SD * noise * values
-                    for name, values in _hum_quadratures(mains, output.data.size, output.step).items()
-                }
+                lines = hum_quadratures(mains.frequency, mains.harmonics, output.data.size, output.step)
+                waveforms |= {name: HUM_RELATIVE_SD * noise * values for name, values in lines.items()}
         return waveforms
 
     def _additive_basis(self, r: int, output: Output) -> tuple[list[int], Array]:
@@ -354,17 +341,6 @@ def _on_grid(waveforms: Array, output: Output, run: Run) -> Array:
     return np.array([np.interp(positions, samples, waveform) for waveform in waveforms]).reshape(
         len(waveforms), grid.size
     )
-
-
-@lru_cache(maxsize=16)
-def _hum_quadratures(mains: float, n: int, step: float) -> dict[str, Array]:
-    """Quadratures of the first harmonics of the mains, the n-th with amplitude 1/n."""
-    phase = 2 * np.pi * step * np.arange(n)
-    return {
-        f"{name} {mains * multiple:g} Hz": wave(mains * multiple * phase) / multiple
-        for multiple in range(1, HUM_HARMONICS + 1)
-        for name, wave in (("cos", np.cos), ("sin", np.sin))
-    }
 
 
 def _motion_terms(added: Iterable[ActiveTerm]) -> tuple[ActiveTerm, ...]:

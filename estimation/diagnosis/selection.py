@@ -120,9 +120,9 @@ def select_terms(
     likelihood = Likelihood(runs, flat_whiteners(model))
     early = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)
     likelihood = Likelihood(runs, min_entropy_whiteners(fit_hum_variants(likelihood, early[-1])))
-    nominal = fit_model(likelihood, model, early[-1].x)
+    nominal = select_mains_hum(likelihood, fit_model(likelihood, model, early[-1].x))
     named = [term for term in terms.values() if term.effect not in {certain.term.effect for certain in clipped}]
-    states = [SelectionState(likelihood, nominal, select_mains_hum(likelihood, nominal), {})]
+    states = [SelectionState(likelihood, nominal, nominal, {})]
     states += _forward_steps(states[0], [*named, *DISCREPANCY_TERMS.values()], early, stops, progress)
     selected = states[-1]
     if not selected.settled and len(uncertain(selected.best.model)) > 1:
