@@ -1,4 +1,4 @@
-"""Frames of a scan: pictures of successive parts of the time, with the motion of the whole scan."""
+"""Frames of a scan: pictures of successive parts of the time or of slices in z, with the motion of the whole scan."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.frame_axis import FrameAxis, position_axis
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, fill_holes
 from recon.imaging.picture_estimate import EstimatedPicture, estimate_picture
+from recon.imaging.pixel_noise import MAX_NOISE_SAMPLES, measure_noise
 from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
 from recon.quality.defects import unrecoverable_intervals
 from recon.reconstruction import Options, Reconstruction
 from recon.report.movie import write_movie
 from recon.sample_ranges import SampleRanges, to_sample_ranges
+from recon.z_slices import ZSlices, find_z_slices
 from scanner.errors import BadInput
 
 if TYPE_CHECKING:
@@ -35,20 +38,22 @@ class ScanFrames:
 
     Attributes:
         result: the reconstruction of the whole scan.
-        frame_time: time from one frame to the next [s].
-        edges: first sample of each frame, and the end of the last one.
+        axis: time or position z of each frame.
+        spans: first sample of each frame, and the end of its last one.
         unlocated: samples that belong to no pixel.
         independent: frames of posterior pictures use no samples of earlier frames.
+        slices: samples of each slice of a stack, whose frames are always independent; None for frames over time.
     """
 
     result: Reconstruction
-    frame_time: float
-    edges: Sequence[int]
+    axis: FrameAxis
+    spans: Sequence[tuple[int, int]]
     unlocated: SampleRanges
     independent: bool = False
+    slices: ZSlices | None = None
 
     def __len__(self) -> int:
-        return len(self.edges) - 1
+        return len(self.spans)
 
     def __iter__(self) -> Iterator[Picture]:
         for frame in self.estimates():
@@ -61,26 +66,40 @@ class ScanFrames:
         the samples of earlier frames where they agree with its own.
         """
         result, before = self.result, None
-        for begin, end in pairwise(self.edges):
-            means = grid_intensity(result.beam, result.intensity, result.picture.grid, self.unlocated, begin, end)
-            data = result.beam, result.intensity, self.unlocated, begin, end
+        grid, noise, intensity = result.picture.grid, result.sample_noise, result.intensity
+        for number, (begin, end) in enumerate(self.spans):
+            if self.slices is not None:
+                intensity = self.slices.intensity_of(number, result.intensity)
+                noise = measure_noise(result.beam, intensity, grid, min(end - begin, MAX_NOISE_SAMPLES), begin)
+            means = grid_intensity(result.beam, intensity, grid, self.unlocated, begin, end)
+            data = result.beam, intensity, self.unlocated, begin, end
             try:
-                frame = estimate_picture(result.picture_kind, means, result.sample_noise, *data, before)
+                frame = estimate_picture(result.picture_kind, means, noise, *data, before)
             except BadInput:
                 nothing = np.full(means.image.shape, np.nan, np.float32)
                 yield EstimatedPicture(replace(means, image=nothing), nothing)
                 continue
             yield frame
-            before = None if self.independent else frame
+            before = None if self.independent or self.slices else frame
+
+    @property
+    def frame_time(self) -> float | None:
+        """Time from one frame to the next [s]; None for slices."""
+        return self.axis.step if self.slices is None else None
 
     @property
     def times(self) -> list[float]:
-        """Beginning of each frame on the recording's clock [s]."""
+        """Beginning of each frame, or time of the first sample of each slice, on the recording's clock [s]."""
         intensity = self.result.intensity
-        return [intensity.start + edge / intensity.sample_rate for edge in self.edges[:-1]]
+        return [intensity.start + begin / intensity.sample_rate for begin, _ in self.spans]
+
+    @property
+    def z(self) -> list[float] | None:
+        """Position of each slice, increasing [m]; None for frames over time."""
+        return None if self.slices is None else list(self.slices.positions)
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return all frames as an xarray dataset: ``image``, ``image_sd`` and ``coverage`` over time, y and x.
+        """Return all frames as an xarray dataset: ``image``, ``image_sd`` and ``coverage`` over time or z, y and x.
 
         Raises:
             BadInput: xarray is not installed.
@@ -89,77 +108,101 @@ class ScanFrames:
 
         xr = import_extra("xarray", "xarray")
         parts = []
-        for frame, time in zip(self.estimates(), self.times, strict=True):
+        dimension, unit, what = "time", "s", "beginning of the frame"
+        if self.slices is not None:
+            dimension, unit, what = "z", "m", "position of the slice"
+        for frame, value in zip(self.estimates(), self.axis.values, strict=True):
             part = frame.picture.to_xarray().assign(image_sd=frame.sd_picture.to_xarray()["image"])
-            parts.append(part.expand_dims(time=[time]))
-        frames: xarray.Dataset = xr.concat(parts, "time")
-        frames["time"].attrs = {"units": "s", "long_name": "beginning of the frame"}
+            parts.append(part.expand_dims({dimension: [value]}))
+        frames: xarray.Dataset = xr.concat(parts, dimension)
+        frames[dimension].attrs = {"units": unit, "long_name": what}
         frames["image"].attrs["units"] = frames["image_sd"].attrs["units"] = self.result.intensity.unit
         return frames
 
 
 def frames(
-    result: Reconstruction, count: int | None = None, frame_time: float | None = None, independent: bool = False
+    result: Reconstruction,
+    count: int | None = None,
+    frame_time: float | None = None,
+    independent: bool = False,
+    z_step: float | None = None,
 ) -> ScanFrames:
-    """Return the frames of a reconstructed scan.
+    """Return the frames of a reconstructed scan: parts of the time, or slices in z.
+
+    Without ``count`` and ``frame_time`` a recording with a channel ``position_z`` gives a slice for each position at
+    which z rests, and any other a single frame.
 
     Args:
         result: of :func:`lissajous.reconstruct`.
         count: number of frames, or
         frame_time: duration of a frame [s]; the last one may be shorter.
-        independent: posterior pictures use no samples of earlier frames.
+        independent: posterior pictures use no samples of earlier frames; those of slices never do.
+        z_step: thickness of a slice [m]: samples are sorted by z, whether it rests or not.
 
     Raises:
-        BadInput: a frame would hold less than one sample.
+        BadInput: a frame or a slice would hold less than one sample; slices are asked for, and ``position_z`` is
+            missing or does not rest.
     """
     intensity = result.intensity
+    unlocated = to_sample_ranges(unrecoverable_intervals(result.motion, result.defects), intensity)
+    if z_step is not None and (count or frame_time):
+        raise BadInput("sorts the samples by z, not by time", channel="z_step", hint="leave out the frames or the step")
+    if z_step is not None and result.position_z is None:
+        raise BadInput("is not in the recording", channel="position_z", hint="record the position of the objective")
+    if result.position_z is not None and not (count or frame_time):
+        slices = find_z_slices(result.position_z, intensity, z_step)
+        return ScanFrames(result, position_axis(slices.positions), slices.spans, unlocated, True, slices)
     time = frame_time or result.duration / (count or 1)
     length = time * intensity.sample_rate
     if length < 1:
         what = f"has {intensity.sample_rate:.4g} samples a second, and frames of {time:.3g} s would hold none"
         raise BadInput(what, channel="intensity", hint="give fewer frames or more time to each")
     number = count or math.ceil(intensity.size / length - 1e-6)
-    unlocated = to_sample_ranges(unrecoverable_intervals(result.motion, result.defects), intensity)
     edges = [min(round(k * length), intensity.size) for k in range(number + 1)]
-    return ScanFrames(result, time, edges, unlocated, independent)
+    times = [intensity.start + edge / intensity.sample_rate for edge in edges[:-1]]
+    return ScanFrames(result, FrameAxis("t", times, time), list(pairwise(edges)), unlocated, independent)
 
 
-def write_scan_frames(folder: Path, result: Reconstruction, options: Options) -> None:
-    """Write the frames of ``options.frames`` or ``options.frame_time`` and their standard deviations.
+def write_scan_frames(folder: Path, result: Reconstruction, options: Options) -> ScanFrames:
+    """Write the frames that the options ask for and their standard deviations; return them.
 
     With ``options.fill_radius`` the frames with holes filled are written too, and shown in the movie.
 
     Args:
         folder: for ``frames.ome.tif``, ``frames_sd.ome.tif`` and what the options ask for.
         result: the reconstruction of the whole scan.
-        options: ``frames``, ``frame_time``, ``independent_frames``, ``fill_radius``, ``zarr`` and ``movie``.
+        options: ``frames``, ``frame_time``, ``z_stack``, ``z_step``, ``independent_frames``, ``fill_radius``, ``zarr``
+            and ``movie``.
 
     Raises:
-        BadInput: a frame would hold less than one sample.
+        BadInput: as :func:`frames`.
     """
-    own = frames(result, options.frames, options.frame_time, options.independent_frames)
-    count, frame_time = len(own), own.frame_time
+    if options.wants_stack and result.position_z is None:
+        raise BadInput("has no sample in the part of the recording that is used", channel="position_z")
+    own = frames(result, options.frames, options.frame_time, options.independent_frames, options.z_step)
+    axis = own.axis
     with tempfile.TemporaryFile(dir=folder) as stored:  # on disk: all frames of a long recording exceed the memory
         for frame in own.estimates():
             pickle.dump((frame.picture, frame.sd), stored)
 
         def pairs() -> Iterator[tuple[Picture, NDArray[np.float32]]]:
             stored.seek(0)
-            for _ in range(count):
+            for _ in range(len(own)):
                 yield pickle.load(stored)
 
         def filled() -> Iterator[Picture]:
             for picture, _ in pairs():
                 yield replace(picture, image=fill_holes(picture, options.fill_radius)[0])
 
-        write_frames(folder / "frames.ome.tif", (picture for picture, _ in pairs()), count, frame_time)
+        write_frames(folder / "frames.ome.tif", (picture for picture, _ in pairs()), axis)
         deviations = (replace(picture, image=sd) for picture, sd in pairs())
-        write_frames(folder / "frames_sd.ome.tif", deviations, count, frame_time)
+        write_frames(folder / "frames_sd.ome.tif", deviations, axis)
         if options.fill_radius:
-            write_frames(folder / "frames_filled.ome.tif", filled(), count, frame_time)
+            write_frames(folder / "frames_filled.ome.tif", filled(), axis)
         if options.zarr:
-            write_ome_zarr(folder / "frames.ome.zarr", pairs(), count, frame_time)
+            write_ome_zarr(folder / "frames.ome.zarr", pairs(), axis)
         if options.movie:
             shown = filled() if options.fill_radius else (picture for picture, _ in pairs())
             low, high = np.nanpercentile(result.picture.image, [0.5, 99.5])
-            write_movie(folder / f"frames.{options.movie}", shown, own.times, frame_time, (float(low), float(high)))
+            write_movie(folder / f"frames.{options.movie}", shown, axis, (float(low), float(high)))
+    return own

@@ -289,6 +289,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_long_frames(options.frame_time, intensity),
         ],
         intensity=intensity,
+        position_z=prepared.recording.channels.get("position_z"),
         name=prepared.recording.name,
     )
 

@@ -44,6 +44,8 @@ class Options:
         sample_motion: estimate the motion of the sample and remove it.
         frames: number of frames to write; None for none.
         frame_time: duration of a frame to write [s], instead of ``frames``.
+        z_stack: write a slice for each position at which ``position_z`` rests, instead of frames.
+        z_step: thickness of the slices [m]: the samples are sorted by ``position_z``, whether it rests or not.
         independent_frames: frames of posterior pictures use no samples of earlier frames.
         zarr: write the frames as OME-Zarr too.
         movie: write the frames as a movie too, ``"mp4"`` or ``"gif"``.
@@ -63,9 +65,21 @@ class Options:
     sample_motion: bool = False
     frames: int | None = None
     frame_time: float | None = None
+    z_stack: bool = False
+    z_step: float | None = None
     independent_frames: bool = False
     zarr: bool = False
     movie: str | None = None
+
+    @property
+    def wants_stack(self) -> bool:
+        """Whether slices by z are to be written."""
+        return self.z_stack or self.z_step is not None
+
+    @property
+    def wants_frames(self) -> bool:
+        """Whether frames or slices are to be written."""
+        return self.frames is not None or self.frame_time is not None or self.wants_stack
 
     @property
     def undo_lag(self) -> bool:
@@ -102,6 +116,7 @@ class Reconstruction:
         limits: reasons why the picture does not show the scene, or only a part, a line each.
         notes: what else a reader has to know, a line each.
         intensity: the channel that was gridded: the segment in use, corrected for the device's optics.
+        position_z: position of the objective or the stage; None where it was not recorded.
         name: of the recording.
         seconds: computing time without writing [s].
     """
@@ -129,6 +144,7 @@ class Reconstruction:
     limits: list[str]
     notes: list[str]
     intensity: Channel
+    position_z: Channel | None
     name: str
     seconds: float = 0.0
 

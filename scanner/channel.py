@@ -37,7 +37,7 @@ CHANNEL_UNITS = {
     "velocity_x": "rad/s", "velocity_y": "rad/s",
     "acceleration_x": "rad/s2", "acceleration_y": "rad/s2",
     "phase_x": "rad", "phase_y": "rad",
-    "range": "m",
+    "range": "m", "position_z": "m",
 }  # fmt: skip
 """Unit of the samples that a channel returns, by its name. Other channels keep the unit that they were recorded in."""
 
@@ -45,7 +45,7 @@ CONVERSIONS = {
     "V": {"V": 1.0, "mV": 1e-3, "uV": 1e-6},
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": pi / 180},
     "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": pi / 180},
-    "m": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
+    "m": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9},
     "rad/s2": {"rad/s2": 1.0, "rad/s²": 1.0, "rad/s^2": 1.0, "mrad/s2": 1e-3, "deg/s2": pi / 180},
 }
 """Accepted units for each unit of ``CHANNEL_UNITS``, with the factor that converts to it."""

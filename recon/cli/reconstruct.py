@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from recon.reconstruction import Options
 
 
+BY_POSITION = 0
+"""Value of ``--frames`` without a number: the steps of ``position_z`` give the frames."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
@@ -33,13 +37,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     frame_options = parser.add_mutually_exclusive_group()
     frame_options.add_argument(
-        "--frames", type=parse_count, metavar="N", help="write N frames of the scan to frames.ome.tif"
+        "--frames",
+        type=parse_count,
+        nargs="?",
+        const=BY_POSITION,
+        metavar="N",
+        help="write N frames of the scan to frames.ome.tif; without N a slice for each position of position_z",
     )
     frame_options.add_argument(
         "--frame-time",
         type=parse_positive,
         metavar="S",
         help="or frames of S seconds; follow: so long (the scan's repeat)",
+    )
+    parser.add_argument(
+        "--z-step", type=parse_positive, metavar="M", help="slices M metres thick, where position_z does not rest"
     )
     parser.add_argument(
         "--independent-frames",
@@ -119,15 +131,19 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         allow_outside=args.allow_outside,
         intensity_drift=args.intensity_drift,
         sample_motion=args.sample_motion,
-        frames=args.frames,
+        frames=args.frames or None,
         frame_time=args.frame_time,
+        z_stack=args.frames == BY_POSITION,
+        z_step=args.z_step,
         independent_frames=args.independent_frames,
         zarr=args.zarr,
         movie=args.movie,
     )
-    if (args.zarr or args.movie) and not (args.frames or args.frame_time):
+    if (args.zarr or args.movie) and not options.wants_frames:
         option = "--zarr" if args.zarr else "--movie"
-        raise BadInput("needs frames", channel=option, hint="add --frames or --frame-time")
+        raise BadInput("needs frames", channel=option, hint="add --frames, --frame-time or --z-step")
+    if args.z_step and (options.frames or options.frame_time):
+        raise BadInput("sorts the samples by z, not by time", channel="--z-step", hint="give --frames without a number")
     if args.zarr:
         import_extra("zarr", "zarr")
     if args.fill and args.picture != "mean":
@@ -177,6 +193,8 @@ def reconstruct_file(
     Raises:
         BadInput: the recording or the device cannot be used.
     """
+    from dataclasses import replace
+
     import numpy as np
 
     from recon.evaluation import load_truth
@@ -189,12 +207,19 @@ def reconstruct_file(
     from recon.report.figures import save_picture
     from recon.report.reconstruction import reconstruction_report
     from recon.report.summary import summarise
+    from recon.z_slices import find_z_slices
 
     growing = live is not None
     with open_any(path, mapping, growing) as recording, replacing_folder(output) as folder:
+        if options.wants_stack:  # what prevents a stack is found before the motion is estimated
+            reason = "--frames without a number and --z-step cut the scan by it"
+            find_z_slices(recording.require("position_z", reason), recording.require("intensity"), options.z_step)
         result = reconstruct(recording, options, None if mapping or growing else load_truth(path), quiet)
         origin = {"output": str(output), "recording": str(path)} | ({"live": live} if live else {})
-        summary: dict[str, Any] = finite(summarise(result) | origin)
+        slices = write_scan_frames(folder, result, options).slices if options.wants_frames else None
+        if slices is not None:
+            result = replace(result, notes=[*result.notes, *slices.notes])
+        summary: dict[str, Any] = finite(summarise(result, slices) | origin)
         summary["conclusion"] = conclude_reconstruction(summary)
         grid, detectors = result.picture.grid, result.picture.detectors
         write_tiff(folder / "image.tif", result.picture.image, grid, detectors)
@@ -208,8 +233,6 @@ def reconstruct_file(
             write_tiff(folder / "fill.tif", mask.astype(np.uint8), grid)
         if result.defects:
             write_tiff(folder / "affected.tif", result.affected.astype(np.uint8), grid)
-        if options.frames or options.frame_time:
-            write_scan_frames(folder, result, options)
         write_motion(folder / "motion.h5", result.motion, grid)
         if result.sample_motion is not None and result.sample_motion.moving:
             write_sample_motion(folder / "sample_motion.csv", result.sample_motion, result.intensity, grid)
@@ -226,11 +249,15 @@ def format_summary(summary: dict[str, Any]) -> str:
         from recon.cli.reconstruct_many import format_summary as format_many
 
         return format_many(summary)
+    from recon.report.conclusions import describe_stack
+
     lines = [
         summary["conclusion"],
         f"{summary['output']}: {summary['estimator']}, {summary['samples']} samples, fill {summary['fill']:.1%}",
     ]
     lines += [_format_axis(name, summary[name]) for name in summary["axes"]]
+    if summary["stack"]:
+        lines.append(f"  {describe_stack(summary['stack'])}")
     if "live" in summary:
         lines.append(_format_live(summary["live"]))
     lines += [f"  {note}" for note in summary["notes"]]

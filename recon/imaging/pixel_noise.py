@@ -70,7 +70,7 @@ def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> S
 
 
 def measure_noise(
-    beam: Motion, intensity: Channel, grid: Grid, samples: int = MAX_NOISE_SAMPLES
+    beam: Motion, intensity: Channel, grid: Grid, samples: int = MAX_NOISE_SAMPLES, first: int = 0
 ) -> tuple[SampleNoise | None, ...]:
     """Noise of a sample of each detector; None where too few pixels were visited twice.
 
@@ -78,12 +78,13 @@ def measure_noise(
         beam: motion whose angles are on the intensity's clock.
         intensity: shape (n,) or (n, detectors).
         grid: the pixels.
-        samples: number of samples from the start that are used.
+        samples: number of samples from ``first`` on that are used.
+        first: first sample that is used.
     """
-    count = min(intensity.size, samples)
-    x, y = (beam.axes[axis].angle.read(0, count) for axis in AXES)
+    stop = min(intensity.size, first + samples)
+    x, y = (beam.axes[axis].angle.read(first, stop) for axis in AXES)
     pixel = find_sample_pixels(x, y, grid)
-    values = intensity.read(0, count).reshape(count, -1)
+    values = intensity.read(first, stop).reshape(stop - first, -1)
     return tuple(measure_sample_noise(pixel, detector) for detector in values.T)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.frame_axis import FrameAxis
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.sample_motion import SampleMotion
 from scanner.channel import Channel
@@ -147,22 +148,23 @@ def write_tiff(path: Path, image: NDArray[Any], grid: Grid, detectors: Sequence[
     )
 
 
-def write_frames(path: Path, frames: Iterable[Picture], count: int, frame_time: float) -> None:
+def write_frames(path: Path, frames: Iterable[Picture], axis: FrameAxis) -> None:
     """Write frames as OME-TIFF, float32 with NaN for pixels never visited; one frame at a time is in memory.
 
-    OME has no angles: the pixel size is written only if the scale of the sample is known.
+    OME has no angles: the pixel size is written only if the scale of the sample is known. Slices have their position,
+    and their spacing if they are evenly spaced.
 
     Args:
         path: the file.
         frames: at least one, all of one shape.
-        count: number of frames.
-        frame_time: time from one frame to the next [s].
+        axis: time or position of each frame.
     """
     import tifffile
 
     pictures = iter(frames)
     first = next(pictures)
-    metadata: dict[str, Any] = {"TimeIncrement": frame_time, "TimeIncrementUnit": "s"}
+    detectors = first.image.shape[2:]
+    metadata = _frame_metadata(axis, *detectors)
     if first.grid.metres_per_radian is not None:
         width, height, _ = pixel_size(first.grid)
         metadata |= {
@@ -174,7 +176,8 @@ def write_frames(path: Path, frames: Iterable[Picture], count: int, frame_time: 
     if first.detectors and first.image.ndim == 3:
         metadata["Channel"] = {"Name": list(first.detectors)}
     planes = (plane for frame in chain([first], pictures) for plane in np.atleast_3d(frame.image).transpose(2, 0, 1))
-    shape, axes = (count, *first.image.shape[2:], *first.image.shape[:2]), "TCYX" if first.image.ndim == 3 else "TYX"
+    shape = (len(axis.values), *detectors, *first.image.shape[:2])
+    axes = f"{axis.name.upper()}CYX" if detectors else f"{axis.name.upper()}YX"
     tifffile.imwrite(
         path,
         planes,
@@ -184,6 +187,17 @@ def write_frames(path: Path, frames: Iterable[Picture], count: int, frame_time: 
         photometric="minisblack",
         metadata={"axes": axes, **metadata},
     )
+
+
+def _frame_metadata(axis: FrameAxis, detectors: int = 1) -> dict[str, Any]:
+    """What OME states of the frames' times or positions."""
+    if axis.name == "t":
+        return {"TimeIncrement": axis.step, "TimeIncrementUnit": "s"}
+    positions = [1e6 * z for z in axis.values for _ in range(detectors)]  # of each plane, detectors varying first
+    metadata: dict[str, Any] = {"Plane": {"PositionZ": positions, "PositionZUnit": ["µm"] * len(positions)}}
+    if axis.even:
+        metadata |= {"PhysicalSizeZ": 1e6 * axis.step, "PhysicalSizeZUnit": "µm"}
+    return metadata
 
 
 def write_json(path: Path, summary: Mapping[str, Any]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from recon.frame_axis import format_positions
 from recon.report.numbers import format_interval, format_uncertain, format_value
 
 SHARP_FRACTION = 0.99
@@ -42,6 +43,15 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
     if summary["fill"] < SUFFICIENT_FILL:
         text += f" Only {summary['fill']:.0%} of the pixels were visited: record longer or choose fewer pixels."
     return text
+
+
+def describe_stack(stack: Mapping[str, Any]) -> str:
+    """Number of the slices, their spacing and their range; ``stack`` is an entry of the summary."""
+    z = format_positions(stack["z_m"])
+    if len(z) == 1:
+        return f"stack of a single slice at z = {z[0]} µm"
+    uneven = "" if stack["even"] else " in the mean, unevenly spaced"
+    return f"stack of {len(z)} slices {1e6 * stack['step_m']:.4g} µm apart{uneven}, from z = {z[0]} µm to {z[-1]} µm"
 
 
 def _describe_readout_phase(summary: Mapping[str, Any]) -> str:

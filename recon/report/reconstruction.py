@@ -13,7 +13,7 @@ from recon.imaging.picture import Grid
 from recon.imaging.sample_motion_correction import describe_sample_motion
 from recon.io.output import pixel_size
 from recon.reconstruction import Reconstruction
-from recon.report.conclusions import conclude_reconstruction
+from recon.report.conclusions import conclude_reconstruction, describe_stack
 from recon.report.figures import (
     blur_figure,
     contrast_limits,
@@ -46,6 +46,9 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fi
         f"{summary['fill']:.1%} of them visited. Estimator: {result.motion.estimator}; computed in "
         f"{result.seconds:.2f} s."
     )
+    if summary["stack"]:
+        stack = describe_stack(summary["stack"])
+        subject += f" {stack[0].upper()}{stack[1:]}; the picture below is that of the whole scan."
     shown = shown_image(result.picture, fill_radius)
     image, limits = to_rgb(shown), contrast_limits(shown)
     filling = f"holes up to {fill_radius} pixels wide filled from their neighbours" if fill_radius else "not filled"

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from recon.evaluation import AxisEvaluation
+from recon.frame_axis import position_axis
 from recon.imaging import blur
 from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
 from recon.reconstruction import Reconstruction
+from recon.z_slices import ZSlices
 from scanner.device import AXES
 from scanner.motion import AxisMotion
 
@@ -143,8 +145,13 @@ def sample_motion_summary(result: Reconstruction) -> dict[str, Any] | None:
     }
 
 
-def summarise(result: Reconstruction) -> dict[str, Any]:
-    """The summary: quantities by axis, and the same grouped by quantity as CONTRACT names them."""
+def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str, Any]:
+    """The summary: quantities by axis, and the same grouped by quantity as CONTRACT names them.
+
+    Args:
+        result: of the reconstruction.
+        slices: of the stack that was written.
+    """
     axes = {axis: axis_summary(result, axis) for axis in AXES}
     grouped = {
         key: {axis: axes[axis][key] for axis in AXES}
@@ -167,6 +174,7 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "dropped": result.unlocated_samples,
         "intensity_drift": intensity_drift_summary(result),
         "sample_motion": sample_motion_summary(result),
+        "stack": stack_summary(slices),
         "trouble": [asdict(each) for each in result.defects],
         "affected": float(np.mean(result.affected)),
         "seconds": result.seconds,
@@ -175,6 +183,19 @@ def summarise(result: Reconstruction) -> dict[str, Any]:
         "limits": result.limits,
         "notes": result.notes,
         "info": dict(result.motion.info),
+    }
+
+
+def stack_summary(slices: ZSlices | None) -> dict[str, Any] | None:
+    """Positions and samples of the slices of a stack; None without one."""
+    if slices is None:
+        return None
+    axis = position_axis(slices.positions)
+    return {
+        "z_m": list(axis.values),
+        "step_m": axis.step,
+        "even": axis.even,
+        "samples": list(slices.samples),
     }
 
 

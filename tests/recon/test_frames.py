@@ -80,7 +80,7 @@ def test_an_mp4_shows_every_frame(result: Reconstruction, tmp_path: Path) -> Non
 def test_a_drawn_frame_has_a_bar_and_a_time(result: Reconstruction) -> None:
     picture = next(iter(frames(result, 3)))
     dark = replace(picture, image=np.zeros((50, 60), np.float32))
-    rgb = draw_frame(dark, 0.0123, (0.0, 1.0))
+    rgb = draw_frame(dark, "12.3 ms", (0.0, 1.0))
     assert rgb.shape[0] % 2 == rgb.shape[1] % 2 == 0
     bar = (rgb[-16:-11] == 255).all(axis=2).any(axis=0)
     assert 0.1 * rgb.shape[1] <= bar.sum() <= 0.26 * rgb.shape[1]

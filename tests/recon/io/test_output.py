@@ -10,6 +10,7 @@ import pytest
 import tifffile
 
 from recon.cli import main
+from recon.frame_axis import FrameAxis
 from recon.frames import write_scan_frames
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
@@ -110,7 +111,11 @@ def test_a_frame_is_the_picture_of_its_time_interval(
 def test_frames_of_a_known_sample_and_several_detectors(tmp_path: Path) -> None:
     images = np.random.default_rng(1).random((3, 60, 80, 2)).astype(np.float32)
     path = tmp_path / "frames.ome.tif"
-    write_frames(path, (Picture(each, np.ones((60, 80), np.uint32), SAMPLE) for each in images), 3, 0.01)
+    write_frames(
+        path,
+        (Picture(each, np.ones((60, 80), np.uint32), SAMPLE) for each in images),
+        FrameAxis("t", [0.0, 0.01, 0.02], 0.01),
+    )
     with tifffile.TiffFile(path) as file:
         assert file.series[0].axes == "TCYX"
         assert np.array_equal(file.asarray(), images.transpose(0, 3, 1, 2))
