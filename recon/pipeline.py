@@ -19,7 +19,7 @@ from estimation.estimate import default_estimator, estimate
 from estimation.optics.correction import beam_motion
 from recon.evaluation import Truth, evaluate_axis
 from recon.field_check import check_field, check_units
-from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
+from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors
 from recon.imaging.image_phase import refine_motion
 from recon.imaging.intensity_correction import correct_drift, describe_drift, measure_intensity_drift
 from recon.imaging.intensity_drift import IntensityDrift
@@ -42,16 +42,12 @@ from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
 from recon.quality.dropped_samples import find_timing_break, first_late_slice, restore_timing, slices_aligned
 from recon.reconstruction import Options, Reconstruction
+from recon.registration_segments import registration_segments
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
-from scanner.channel import Channel
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
-
-MAX_REGISTERED_PERIODS = 200
-"""Periods of the slower axis in which phase errors are measured. A scan of 60 ms has as many; in a longer recording
-three parts of this total length are measured, because the cost grows with the number of samples."""
 
 ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor")
 """Estimators whose motion is corrected by the phase error that the picture shows. ``picture`` has its phase from the
@@ -180,8 +176,9 @@ def wants_readout_phase(motion: Motion, options: Options) -> bool:
 
 def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
     """Return the phase errors that forward and backward half-periods show in slices of the scan."""
-    segments = _registration_segments(estimated.motion, estimated.prepared.intensity)
-    return measure_motion_phase_errors(estimated.beam, estimated.prepared.intensity, estimated.grid, segments)
+    intensity, position_z = estimated.prepared.intensity, estimated.prepared.position_z
+    segments = registration_segments(estimated.motion, intensity, position_z)
+    return measure_motion_phase_errors(estimated.beam, intensity, estimated.grid, segments)
 
 
 def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
@@ -289,7 +286,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_long_frames(options.frame_time, intensity),
         ],
         intensity=intensity,
-        position_z=prepared.recording.channels.get("position_z"),
+        position_z=prepared.position_z,
         name=prepared.recording.name,
     )
 
@@ -298,7 +295,9 @@ def _repair_dropped_samples(
     prepared: PreparedRecording, result: Reconstruction, options: Options, truth: Truth | None, quiet: bool
 ) -> Reconstruction:
     """Reconstruct again with the timing restored if the picture shows that samples of the intensity were dropped."""
-    if len(_registration_segments(result.motion, result.intensity)) > 1:  # the slices do not cover the whole scan
+    if (
+        len(registration_segments(result.motion, result.intensity, result.position_z)) > 1
+    ):  # the slices do not cover the whole scan
         return result
     timing_break = find_timing_break(result.phase_errors, result.motion, result.intensity, result.picture.grid)
     if timing_break is None:
@@ -338,12 +337,3 @@ def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Gri
         f"the device states no [scan]: the field is the motion's own, {half['x']:.4g} x {half['y']:.4g} rad half angles"
     )
     return Grid(*options.pixels, half["x"], half["y"]), [note]
-
-
-def _registration_segments(motion: Motion, intensity: Channel) -> list[tuple[int, int]]:
-    """Samples (first, stop) in which phase errors are measured: all of a short recording, three parts of a long one."""
-    whole = round(MAX_REGISTERED_PERIODS * slow_period(motion) * intensity.sample_rate)
-    if intensity.size <= whole:
-        return [(0, intensity.size)]
-    part = whole // 3
-    return [(first, first + part) for first in (0, (intensity.size - part) // 2, intensity.size - part)]

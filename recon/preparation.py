@@ -51,6 +51,11 @@ class PreparedRecording:
         """The corrected intensity of the segment."""
         return self.recording["intensity"]
 
+    @property
+    def position_z(self) -> Channel | None:
+        """Position of the objective or the stage; None where it was not recorded."""
+        return self.recording.channels.get("position_z")
+
 
 def prepare(
     recording: Recording, device: DeviceSource | None = None, undo_lag: bool = False

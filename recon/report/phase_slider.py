@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.pipeline import MAX_REGISTERED_PERIODS
 from recon.quality.defects import unrecoverable_intervals
 from recon.reconstruction import Reconstruction
+from recon.registration_segments import MAX_REGISTERED_PERIODS
 from recon.report.figures import contrast_limits
 from recon.sample_ranges import to_sample_ranges
 from scanner.arrays import Array

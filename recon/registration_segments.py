@@ -1,0 +1,36 @@
+"""Segments of a scan in which the phase errors are measured by comparing forward with backward half-periods."""
+
+from __future__ import annotations
+
+from recon.imaging.bidirectional_phase import PERIODS_PER_SLICE, slow_period
+from recon.sample_ranges import SampleRanges
+from recon.z_rests import rest_ranges
+from scanner.channel import Channel
+from scanner.motion import Motion
+
+MAX_REGISTERED_PERIODS = 200
+"""Periods of the slower axis in which phase errors are measured. A scan of 60 ms has as many; in a longer recording
+three parts of this total length are measured, because the cost grows with the number of samples."""
+
+
+def registration_segments(motion: Motion, intensity: Channel, position_z: Channel | None = None) -> SampleRanges:
+    """Return the samples (first, stop) in which phase errors are measured, each segment at one position z.
+
+    These are all samples of a short recording, three parts of a long one. The segments of a stack lie within rests of
+    z, because the two directions are compared by one picture; rests too short for a phase error are left out, unless
+    all are too short.
+    """
+    to_samples = slow_period(motion) * intensity.sample_rate
+    whole = round(MAX_REGISTERED_PERIODS * to_samples)
+    rests = [(0, intensity.size)] if position_z is None else rest_ranges(position_z, intensity)
+    rests = [(first, stop) for first, stop in rests if stop - first >= PERIODS_PER_SLICE * to_samples]
+    if len(rests) < 2:
+        rests = rests or [(0, intensity.size)]
+        (first, stop), part = rests[0], whole // 3
+        if stop - first <= whole:
+            return rests
+        return [(begin, begin + part) for begin in (first, first + (stop - first - part) // 2, stop - part)]
+    if sum(stop - first for first, stop in rests) <= whole:
+        return rests
+    chosen = rests if len(rests) < 3 else [rests[0], rests[len(rests) // 2], rests[-1]]
+    return [(first, min(stop, first + whole // len(chosen))) for first, stop in chosen]
