@@ -203,6 +203,9 @@ def write_scan_frames(folder: Path, result: Reconstruction, options: Options) ->
             write_ome_zarr(folder / "frames.ome.zarr", pairs(), axis)
         if options.movie:
             shown = filled() if options.fill_radius else (picture for picture, _ in pairs())
-            low, high = np.nanpercentile(result.picture.image, [0.5, 99.5])
-            write_movie(folder / f"frames.{options.movie}", shown, axis, (float(low), float(high)))
+            # Slices show different scenes, which differ from their mean more than successive frames do.
+            compared = [result.picture.image] if own.slices is None else (picture.image for picture, _ in pairs())
+            limits = np.array([np.nanpercentile(image, [0.5, 99.5]) for image in compared])
+            low, high = float(np.nanmin(limits[:, 0])), float(np.nanmax(limits[:, 1]))
+            write_movie(folder / f"frames.{options.movie}", shown, axis, (low, high))
     return own

@@ -1,11 +1,11 @@
 """Where the position z of the objective or the stage rests.
 
 z rests in an interval in which it moves at less than ``REST_SPEED`` of its mean speed. The mean speed is the length of
-its path over the duration. Both are measured with a band of one width: a part of the recording in which z stays within a
-band of width w moves at the speed w over its duration. Narrow bands break at the noise of z, wide ones contain movement.
-The width is chosen such that the rests last longest beyond the time in which a steady movement crosses their bands. A
-ramp moves at its mean speed throughout and has no rests; a sinusoid is slower than a quarter of its mean speed for 41 %
-of the time at most, so that rests are accepted from ``MIN_REST_SHARE`` of the time on.
+its path over the duration. Both are measured with a band of one width: a part of the recording in which z stays within
+a band of width w moves at the speed w over its duration. Narrow bands break at the noise of z, wide ones contain
+movement. The width is chosen such that the rests last longest beyond the time in which a steady movement crosses their
+bands. A ramp moves at its mean speed throughout and has no rests; a sinusoid is slower than a quarter of its mean speed
+for 41 % of the time at most, so that rests are accepted from ``MIN_REST_SHARE`` of the time on.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
 
-MAX_BLOCKS = 4096
-"""Blocks into which z is divided to find its rests. A block of a stack of 100 slices is a fortieth of a slice."""
+BLOCK_COUNTS = (2048, 512, 128)
+"""Numbers of blocks into which z is divided, the next one only where no rests are found with the one before. Of 100
+slices, each has twenty of the first. A rest loses up to a block at both ends, and longer blocks average the noise."""
 
 REST_SPEED = 0.25
-"""Speed of a resting z, relative to its mean speed: the steps of a stack have to exceed the noise within a rest about
-fourfold, and the slow parts of a sinusoid around its turning points are a minority."""
+"""Speed of a resting z, relative to its mean speed: the steps of a stack have to exceed the noise within a rest
+fourfold (a single step eightfold), and the slow parts of a sinusoid around its turning points are a minority."""
 
 MIN_REST_SHARE = 0.5
 """Part of the time that z has to rest: a sinusoid reaches 0.41, a stack of a microscope nearly 1."""
@@ -67,11 +68,10 @@ def rest_ranges(position: Channel, intensity: Channel) -> SampleRanges:
     """Return the samples of the intensity during which z rests at one position; all where z nowhere rests."""
     try:
         position = cut_to_intensity(position, intensity)
-        blocks = read_blocks(position)
+        blocks, rests, _ = find_rests(position)
     except BadInput:
         return [(0, intensity.size)]
-    rests = np.empty((0, 2), np.intp) if blocks.constant else find_rests(blocks)[0]
-    if not rests.size:
+    if blocks.constant or not rests.size:
         return [(0, intensity.size)]
     return to_sample_ranges(np.stack(rest_times(position, blocks, rests), axis=1).tolist(), intensity)
 
@@ -91,13 +91,13 @@ def cut_to_intensity(position: Channel, intensity: Channel) -> Channel:
     return replace(position, start=start, first=position.first + begin, stop=position.first + end)
 
 
-def read_blocks(position: Channel) -> PositionBlocks:
+def read_blocks(position: Channel, blocks: int = BLOCK_COUNTS[0]) -> PositionBlocks:
     """Return mean and scatter of z in each block, read block by block.
 
     Raises:
         BadInput: no block is without a missing sample.
     """
-    count = min(position.size, MAX_BLOCKS)
+    count = min(position.size, blocks)
     edges = np.linspace(0, position.size, count + 1).astype(np.intp)
     mean, sd = np.empty(count), np.empty(count)
     finite, before = 0, np.nan
@@ -128,11 +128,24 @@ def read_blocks(position: Channel) -> PositionBlocks:
     return PositionBlocks(edges, mean, low, high, least, most, position.size - finite, constant)
 
 
-def find_rests(blocks: PositionBlocks) -> tuple[NDArray[np.intp], float]:
-    """Return first block and end of each rest, shape (rests, 2), and the width of the band [m].
+def find_rests(position: Channel) -> tuple[PositionBlocks, NDArray[np.intp], float]:
+    """Return the blocks of z, first block and end of each rest, shape (rests, 2), and the width of the band [m].
 
     There are no rests if they last less than ``MIN_REST_SHARE`` in total.
+
+    Raises:
+        BadInput: as :func:`read_blocks`.
     """
+    for count in BLOCK_COUNTS:
+        blocks = read_blocks(position, count)
+        rests, width = _longest_rests(blocks)
+        if rests.size or blocks.constant:
+            break
+    return blocks, rests, width
+
+
+def _longest_rests(blocks: PositionBlocks) -> tuple[NDArray[np.intp], float]:
+    """Rests of the best width, none if they are too short in total, and that width."""
     best, rests, width = 0.0, np.empty((0, 2), np.intp), 0.0
     for band in (blocks.most - blocks.least) * BAND_WIDTHS:
         found, excess = _slow_segments(blocks, band)

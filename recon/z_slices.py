@@ -62,13 +62,15 @@ def find_z_slices(position: Channel, intensity: Channel, step: float | None = No
     if step is not None and not 0.0 < step < np.inf:
         raise BadInput(f"a step of {step} m", channel="z_step", hint="give a positive thickness in metres")
     position = cut_to_intensity(position, intensity)
-    blocks = read_blocks(position)
     if step is not None:
+        blocks = read_blocks(position)
         positions, label_times = _bins(position, blocks, step, intensity.size)
-    elif blocks.constant:
-        positions, label_times = _bins(position, blocks, np.inf, 1)
     else:
-        positions, label_times = _rests(position, blocks)
+        blocks, rests, band = find_rests(position)
+        if blocks.constant:
+            positions, label_times = _bins(position, blocks, np.inf, 1)
+        else:
+            positions, label_times = _levels(position, blocks, rests, band)
 
     def labels(first: int, stop: int) -> NDArray[np.intp]:
         return label_times(intensity.start + np.arange(first, stop) / intensity.sample_rate)
@@ -119,10 +121,9 @@ def _bins(
         hint = "give a larger step in metres, as 1e-6"
         raise BadInput(f"{what}, more than there are samples", file=position.file, channel=position.name, hint=hint)
     count = round(intervals) + 1
-    middle = 0.5 * (blocks.least + blocks.most)
-    positions = np.full(count, middle)
-    if count > 1:  # the step may be infinite
-        positions += step * (np.arange(count) - 0.5 * (count - 1))
+    positions = np.full(count, float(np.nanmean(blocks.mean)))
+    if count > 1:
+        positions = 0.5 * (blocks.least + blocks.most) + step * (np.arange(count) - 0.5 * (count - 1))
 
     def label(times: Array) -> NDArray[np.intp]:
         z = _interpolate(position, times)
@@ -141,12 +142,13 @@ def _interpolate(position: Channel, times: Array) -> Array:
     return np.where((at > -1.0) & (at < position.size), z, np.nan)
 
 
-def _rests(position: Channel, blocks: PositionBlocks) -> tuple[Array, Callable[[Array], NDArray[np.intp]]]:
+def _levels(
+    position: Channel, blocks: PositionBlocks, rests: NDArray[np.intp], band: float
+) -> tuple[Array, Callable[[Array], NDArray[np.intp]]]:
     """Positions at which z rests, and the number of the position at any times; -1 while it moves.
 
     Rests whose positions differ by less than the band are one position.
     """
-    rests, width = find_rests(blocks)
     if not rests.size:
         what = f"does not rest: it moves between {blocks.least:.6g} m and {blocks.most:.6g} m for most of the time"
         hint = "give --z-step M, the thickness of a slice in metres, to sort the samples by z"
@@ -154,14 +156,14 @@ def _rests(position: Channel, blocks: PositionBlocks) -> tuple[Array, Callable[[
     levels = np.array([blocks.mean[first:stop].mean() for first, stop in rests])
     order = np.argsort(levels)
     number = np.empty(levels.size, np.intp)
-    number[order] = np.concatenate([[0], np.cumsum(np.diff(levels[order]) > width)])
+    number[order] = np.concatenate([[0], np.cumsum(np.diff(levels[order]) > band)])
     lengths = rests[:, 1] - rests[:, 0]
     positions = np.bincount(number, levels * lengths) / np.bincount(number, lengths)
     starts, stops = rest_times(position, blocks, rests)
 
     def label(times: Array) -> NDArray[np.intp]:
         inside = np.searchsorted(starts, times, side="right") - 1
-        return np.where((inside >= 0) & (times <= stops[inside]), number[inside], -1)
+        return np.where((inside >= 0) & (times < stops[inside]), number[inside], -1)
 
     return positions, label
 
