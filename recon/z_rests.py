@@ -21,9 +21,11 @@ from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
 
-BLOCK_COUNTS = (2048, 512, 128)
-"""Numbers of blocks into which z is divided, the next one only where no rests are found with the one before. Of 100
-slices, each has twenty of the first. A rest loses up to a block at both ends, and longer blocks average the noise."""
+MAX_BLOCKS = 2048
+"""Blocks into which z is divided: of 100 slices, each has twenty. A rest loses up to a block at both ends."""
+
+MERGED_BLOCKS = 4
+"""Blocks that are merged to one, once and twice, to find rests in a noisy z: longer blocks average its noise."""
 
 REST_SPEED = 0.25
 """Speed of a resting z, relative to its mean speed: the steps of a stack have to exceed the noise within a rest
@@ -68,7 +70,7 @@ def rest_ranges(position: Channel, intensity: Channel) -> SampleRanges:
     """Return the samples of the intensity during which z rests at one position; all where z nowhere rests."""
     try:
         position = cut_to_intensity(position, intensity)
-        blocks, rests, _ = find_rests(position)
+        blocks, rests, _ = find_rests(read_blocks(position))
     except BadInput:
         return [(0, intensity.size)]
     if blocks.constant or not rests.size:
@@ -91,13 +93,15 @@ def cut_to_intensity(position: Channel, intensity: Channel) -> Channel:
     return replace(position, start=start, first=position.first + begin, stop=position.first + end)
 
 
-def read_blocks(position: Channel, blocks: int = BLOCK_COUNTS[0]) -> PositionBlocks:
+def read_blocks(
+    position: Channel,
+) -> PositionBlocks:
     """Return mean and scatter of z in each block, read block by block.
 
     Raises:
         BadInput: no block is without a missing sample.
     """
-    count = min(position.size, blocks)
+    count = min(position.size, MAX_BLOCKS)
     edges = np.linspace(0, position.size, count + 1).astype(np.intp)
     mean, sd = np.empty(count), np.empty(count)
     finite, before = 0, np.nan
@@ -128,31 +132,37 @@ def read_blocks(position: Channel, blocks: int = BLOCK_COUNTS[0]) -> PositionBlo
     return PositionBlocks(edges, mean, low, high, least, most, position.size - finite, constant)
 
 
-def find_rests(position: Channel) -> tuple[PositionBlocks, NDArray[np.intp], float]:
-    """Return the blocks of z, first block and end of each rest, shape (rests, 2), and the width of the band [m].
+def find_rests(blocks: PositionBlocks) -> tuple[PositionBlocks, NDArray[np.intp], float]:
+    """Return where z rests: of all band widths and three lengths of the blocks, those rests that last longest.
 
-    There are no rests if they last less than ``MIN_REST_SHARE`` in total.
-
-    Raises:
-        BadInput: as :func:`read_blocks`.
+    Returns:
+        The blocks in use, first block and end of each rest, shape (rests, 2), and the width of the band [m]. There are
+        no rests if they last less than ``MIN_REST_SHARE`` in total.
     """
-    for count in BLOCK_COUNTS:
-        blocks = read_blocks(position, count)
-        rests, width = _longest_rests(blocks)
-        if rests.size or blocks.constant:
-            break
-    return blocks, rests, width
+    best, used, rests, width = 0.0, blocks, np.empty((0, 2), np.intp), 0.0
+    longer = merge_blocks(blocks)
+    for each in (blocks, longer, merge_blocks(longer)):
+        for band in (blocks.most - blocks.least) * BAND_WIDTHS:
+            found, excess = _slow_segments(each, band)
+            if excess > best:
+                best, used, rests, width = excess, each, found, band
+    enough = np.sum(rests[:, 1] - rests[:, 0]) > MIN_REST_SHARE * used.mean.size
+    return used, rests if enough else rests[:0], width
 
 
-def _longest_rests(blocks: PositionBlocks) -> tuple[NDArray[np.intp], float]:
-    """Rests of the best width, none if they are too short in total, and that width."""
-    best, rests, width = 0.0, np.empty((0, 2), np.intp), 0.0
-    for band in (blocks.most - blocks.least) * BAND_WIDTHS:
-        found, excess = _slow_segments(blocks, band)
-        if excess > best:
-            best, rests, width = excess, found, band
-    enough = np.sum(rests[:, 1] - rests[:, 0]) > MIN_REST_SHARE * blocks.mean.size
-    return rests if enough else rests[:0], width
+def merge_blocks(blocks: PositionBlocks) -> PositionBlocks:
+    """Return the blocks with ``MERGED_BLOCKS`` merged to one each."""
+    firsts = np.arange(0, blocks.mean.size, MERGED_BLOCKS)
+    length = np.diff(blocks.edges).astype(np.float64)
+    total = np.add.reduceat(length, firsts)
+    offset = np.nanmean(blocks.mean)  # without which squares would hide the noise of a z far from 0
+    mean, sd = blocks.mean - offset, 0.5 * (blocks.high - blocks.low)
+    merged = np.add.reduceat(length * mean, firsts) / total
+    variance = np.add.reduceat(length * (sd**2 + mean**2), firsts) / total - merged**2
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    edges = np.append(blocks.edges[firsts], blocks.edges[-1])
+    low, high = (np.nan_to_num(merged + offset + side * sd, nan=side * np.inf) for side in (-1.0, 1.0))
+    return blocks._replace(edges=edges, mean=merged + offset, low=low, high=high)
 
 
 def rest_times(position: Channel, blocks: PositionBlocks, rests: NDArray[np.intp]) -> tuple[Array, Array]:

@@ -62,15 +62,11 @@ def find_z_slices(position: Channel, intensity: Channel, step: float | None = No
     if step is not None and not 0.0 < step < np.inf:
         raise BadInput(f"a step of {step} m", channel="z_step", hint="give a positive thickness in metres")
     position = cut_to_intensity(position, intensity)
-    if step is not None:
-        blocks = read_blocks(position)
-        positions, label_times = _bins(position, blocks, step, intensity.size)
+    blocks = read_blocks(position)
+    if step is not None or blocks.constant:
+        positions, label_times = _bins(position, blocks, step or np.inf, intensity.size)
     else:
-        blocks, rests, band = find_rests(position)
-        if blocks.constant:
-            positions, label_times = _bins(position, blocks, np.inf, 1)
-        else:
-            positions, label_times = _levels(position, blocks, rests, band)
+        positions, label_times = _levels(position, *find_rests(blocks))
 
     def labels(first: int, stop: int) -> NDArray[np.intp]:
         return label_times(intensity.start + np.arange(first, stop) / intensity.sample_rate)

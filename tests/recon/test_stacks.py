@@ -47,7 +47,7 @@ def test_each_rest_is_a_slice(positions: tuple[float, ...], rate: float, sd: flo
     move = 0.1 * DURATION_S / len(positions)
     z = staircase(times(rate), positions, move)
     slices = find_z_slices(z_channel(z + noise(sd, z.size), rate), LIGHT)
-    assert slices.positions == pytest.approx(sorted(positions), abs=max(0.3 * sd, 1e-12))
+    assert slices.positions == pytest.approx(sorted(positions), abs=max(sd, 1e-12))
     labels = slices.labels(0, LIGHT.size)
     steady = np.abs(np.subtract.outer(staircase(LIGHT.time(), positions, move), sorted(positions)))
     assert (steady[labels >= 0, labels[labels >= 0]] < 0.25e-6 + 1.2 * sd).all()  # z is the slice's own
