@@ -41,6 +41,8 @@ from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
 from recon.quality.dropped_samples import find_timing_break, first_late_slice, restore_timing, slices_aligned
+from recon.quality.sensor_noise import check_sensor_noise
+from recon.quality.sensor_sign import describe_unconfirmed_signs
 from recon.reconstruction import Options, Reconstruction
 from recon.registration_segments import registration_segments
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
@@ -119,11 +121,12 @@ def reconstruct(
     """
     began = time.perf_counter()
     prepared = prepare(recording, options.device, options.undo_lag)
+    sensor_notes = check_sensor_noise(prepared.recording, prepared.device, options.estimator)
     result = _reconstruct_prepared(prepared, options, truth, quiet)
     result = _repair_dropped_samples(prepared, result, options, truth, quiet)
     if prepared.clock_jumps:
         result = replace(result, notes=[*result.notes, describe_clock_jumps(recording, prepared)])
-    return replace(result, seconds=time.perf_counter() - began)
+    return replace(result, notes=[*result.notes, *sensor_notes], seconds=time.perf_counter() - began)
 
 
 def _reconstruct_prepared(
@@ -166,7 +169,8 @@ def estimate_motion(prepared: PreparedRecording, options: Options, before: Motio
     check_units(grid, motion)
     motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)
     grid, field_notes = _picture_grid(device, motion, options)
-    return EstimatedMotion(prepared, motion, grid, field_notes, [*notes, *motion.notes])
+    notes = [*notes, *motion.notes, *describe_unconfirmed_signs(recording, device, motion)]
+    return EstimatedMotion(prepared, motion, grid, field_notes, notes)
 
 
 def wants_readout_phase(motion: Motion, options: Options) -> bool:

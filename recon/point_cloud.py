@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from recon.pipeline import EstimatedMotion, correct_readout_phase, estimate_motion
 from recon.preparation import prepare
 from recon.quality.defects import unrecoverable_intervals
+from recon.quality.sensor_noise import check_sensor_noise
+from recon.quality.sensor_sign import describe_inverted_sensors
 from recon.reconstruction import Options
 from recon.sample_ranges import to_sample_ranges
 from scanner.arrays import Array
@@ -96,6 +98,7 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     if stated is not None and _same_clock(stated, shots):
         channels["intensity"] = stated
     prepared = prepare(replace(recording, channels=channels), options.device)
+    sensor_notes = check_sensor_noise(prepared.recording, prepared.device, options.estimator)
     estimated = correct_readout_phase(estimate_motion(prepared, options), options)
     cut = prepared.recording["range"]
     distance = cut.read()
@@ -111,7 +114,9 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     geometry = prepared.device.geometry or Geometry()
     angles = {axis: estimated.beam.axes[axis].angle.read()[kept] for axis in AXES}
     when = cut.start + kept / cut.sample_rate
-    notes = [*estimated.motion_notes, *_notes(geometry, prepared.device.geometry is None, distance, estimated)]
+    inverted = describe_inverted_sensors(prepared.recording, prepared.device)
+    notes = [*inverted, *sensor_notes, *estimated.motion_notes]
+    notes += _notes(geometry, prepared.device.geometry is None, distance, estimated)
     return PointCloud(
         time=when,
         position=locate_points(geometry, angles["x"], angles["y"], distance[kept]),

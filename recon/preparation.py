@@ -11,7 +11,8 @@ from estimation.optics.correction import correct_intensity
 from estimation.signals import require_device
 from recon.quality.clock_jumps import detect_clock_jumps, longest_segment
 from recon.quality.defects import Defect, find_defects
-from recon.quality.drive_check import check_drives, check_rates, check_signals, describe_inverted_sensors
+from recon.quality.drive_check import check_drives, check_rates, check_signals
+from recon.quality.sensor_sign import describe_inverted_sensors
 from scanner import devices
 from scanner.channel import CHANNEL_UNITS, Channel, check_signal, suggest_name
 from scanner.device import AXES, Device
@@ -57,9 +58,7 @@ class PreparedRecording:
         return self.recording.channels.get("position_z")
 
 
-def prepare(
-    recording: Recording, device: DeviceSource | None = None, undo_lag: bool = False
-) -> PreparedRecording:
+def prepare(recording: Recording, device: DeviceSource | None = None, undo_lag: bool = False) -> PreparedRecording:
     """Check a recording and cut it to its longest segment without a clock jump.
 
     Args:

@@ -193,7 +193,7 @@ def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool
         if sign == "ambiguous" and f"angle_{name}" in recording and not turn:
             turn, sign = _opposes(axis, recording[f"angle_{name}"]), f"known: angle_{name}"
         elif sign == "ambiguous" and f"sync_{name}" in recording.edges and not turn:
-            turn, sign = _sign_from_edges(axis, recording, name)
+            turn, sign = sign_from_edges(axis, recording, name)
         elif turn:
             sign = f"known: --flip-{name}"
         if turn:
@@ -202,8 +202,8 @@ def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool
     return replace(motion, axes=axes)
 
 
-def _sign_from_edges(axis: AxisMotion, recording: Recording, name: str) -> tuple[bool, str]:
-    """Whether the edges of an axis show the opposite of its motion, and what they say of its sign."""
+def sign_from_edges(axis: AxisMotion, recording: Recording, name: str) -> tuple[bool, str]:
+    """Whether the edges of an axis show the opposite of its motion, and the source of its sign or "ambiguous"."""
     from estimation.sync.motion import phase_from_edges
 
     edges = recording.edges[f"sync_{name}"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from math import isclose
 
 import numpy as np
@@ -29,13 +28,6 @@ COMPARED_SAMPLES = 1 << 16
 
 MAX_RATE_RATIO_ERROR = 1e-3
 """Relative deviation from 2 or 1/2 up to which a motion at a multiple of its drive's frequency shows a wrong rate."""
-
-MIN_LEAD_SINE = 0.5
-"""Sine of the phase by which a motion has to lead its torque for a note: 30 to 150 degrees. A passive oscillator lags
-by 0 to 180 degrees, and a delay of the readout adds less than 30."""
-
-MIN_DRIVEN_FRACTION = 0.5
-"""Fraction of a motion's power at its drive's frequency from which its phase to the drive is used."""
 
 
 def check_signals(recording: Recording, device: Device) -> None:
@@ -101,43 +93,12 @@ def check_rates(recording: Recording, device: Device) -> None:
             raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
 
 
-def describe_inverted_sensors(recording: Recording, device: Device) -> Iterator[str]:
-    """A line for every position signal that leads its linear drive, which no passive oscillator does."""
-    for axis in AXES:
-        signal, drive = _position_signal(recording, device, axis), recording.channels.get(f"drive_{axis}")
-        own = device.axis(axis).drive
-        if signal is None or drive is None or own is None or own.motion_per_drive != 1.0:
-            continue
-        try:
-            frequency = dominant_frequency(drive)
-        except BadInput:
-            continue
-        readout = device.axis(axis).readout
-        gain = readout.gain if isinstance(readout, Position) and signal.name.startswith("sense") else 1.0
-        motion, power = _phasor(signal, frequency)
-        lead = float(np.angle(motion / gain / _phasor(drive, frequency)[0]))
-        if np.sin(lead) > MIN_LEAD_SINE and 0.5 * abs(motion) ** 2 > MIN_DRIVEN_FRACTION * power:
-            yield (
-                f"{signal.name}: the motion leads {drive.name} by {np.degrees(lead):.0f}°, and a passive scanner "
-                f"lags: the signal, its gain or the drive is inverted; if it is the signal or the gain, the picture is "
-                f"mirrored in {axis}, and --flip-{axis} turns it"
-            )
-
-
 def _position_signal(recording: Recording, device: Device, axis: str) -> Channel | None:
     """The channel that shows the angle of an axis, if one does."""
     if f"angle_{axis}" in recording:
         return recording[f"angle_{axis}"]
     is_position = isinstance(device.axis(axis).readout, Position)
     return recording.channels.get(f"sense_{axis}") if is_position else None
-
-
-def _phasor(channel: Channel, frequency: float) -> tuple[complex, float]:
-    """Phasor of a channel at ``frequency`` [Hz], and the channel's variance: of its first ``COMPARED_SAMPLES``."""
-    values = np.nan_to_num(channel.read(0, COMPARED_SAMPLES), nan=0.0)
-    values = values - values.mean()
-    time = channel.start + np.arange(values.size) / channel.sample_rate
-    return complex(2.0 * np.mean(values * np.exp(-2j * np.pi * frequency * time))), float(np.mean(values**2))
 
 
 def check_drives(recording: Recording, device: Device) -> None:
