@@ -12,7 +12,7 @@ import numpy as np
 
 from estimation.filters.baselines import sign_from_edges
 from estimation.reference import dominant_frequency
-from scanner.channel import Channel
+from scanner.channel import Channel, check_signal
 from scanner.device import AXES, Axis, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
@@ -121,6 +121,8 @@ def _lead_of_torque(
     if drive is None or own is None or own.motion_per_drive != 1.0:
         return None
     try:
+        check_signal(channel, gaps_ok=True)
+        check_signal(drive, gaps_ok=True)
         frequency = dominant_frequency(drive)
     except BadInput:
         return None
@@ -154,6 +156,8 @@ def _sign_by_angle(recording: Recording, axis: Axis, name: str) -> int:
     if channel is None or not isinstance(readout, MotionSensor):
         return 0
     try:
+        check_signal(channel, gaps_ok=True)
+        check_signal(angle, gaps_ok=True)
         phasors = _common_phasors(channel, angle, dominant_frequency(angle))
     except BadInput:
         return 0
@@ -166,11 +170,11 @@ def _sign_by_angle(recording: Recording, axis: Axis, name: str) -> int:
 def _common_phasors(first: Channel, second: Channel, frequency: float) -> tuple[complex, complex, float] | None:
     """Phasors of two channels at ``frequency`` [Hz] over the same time, and the variance of the first.
 
-    None if they share no period.
+    None if they share no period, or one is too slow to show it.
     """
     start, stop = max(first.start, second.start), min(first.end, second.end)
     stop = min(stop, start + COMPARED_SAMPLES / max(first.sample_rate, second.sample_rate))
-    if not (stop - start) * frequency > 1.0:
+    if not (stop - start) * frequency > 1.0 or min(first.sample_rate, second.sample_rate) < 2.0 * frequency:
         return None
     (a, variance), (b, _) = (_phasor(each, start, stop, frequency) for each in (first, second))
     return (a, b, variance) if abs(b) > 0.0 else None
