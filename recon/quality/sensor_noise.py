@@ -115,7 +115,8 @@ def _drive_frequencies(recording: Recording, device: Device, name: str) -> list[
     axis, drive = device.axis(name), recording.channels.get(f"drive_{name}")
     if axis.drive is None:
         return []
-    ratio, found = axis.drive.motion_per_drive, []
+    ratio = axis.drive.motion_per_drive
+    found: list[float] = []
     if drive is None:
         return [] if axis.drive.frequency is None else [axis.drive.frequency * ratio]
     for low in (0.0, 0.1 * axis.resonance) if axis.mechanics else (0.0,):
