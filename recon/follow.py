@@ -34,6 +34,7 @@ from recon.io.output import check_folder, write_tiff
 from recon.pipeline import estimate_motion, measure_phase_errors, wants_readout_phase
 from recon.preparation import prepare_frame, select_device
 from recon.quality.defects import unrecoverable_intervals
+from recon.quality.sensor_noise import check_sensor_noise
 from recon.reconstruction import Options
 from recon.report.figures import save_picture
 from recon.sample_ranges import to_sample_ranges
@@ -62,8 +63,7 @@ NOISE_SAMPLES = 1 << 17
 """Samples of a frame from which its noise is measured, in some 10 ms: 10^4 pairs determine a variance to 1.5 %."""
 
 MAX_FRAMES_BETWEEN_MEASUREMENTS = 64
-"""Frames between two measurements of the readout's phase error: half a second of computing every few seconds, in which
-temperature changes no readout."""
+"""Frames between two measurements of the readout's phase error: seconds, in which temperature changes it little."""
 
 SIGN_TEST_SAMPLES = 4096
 """Samples over which the signs of two motions are compared."""
@@ -136,9 +136,7 @@ def follow_recording(
     quiet_time: float = 5.0,
     quiet: bool = False,
 ) -> FollowSummary:
-    """Write the frames of a growing recording into ``output``, each over the previous one.
-
-    The files are image.tif, image_sd.tif and image.png.
+    """Write the frames of a growing recording as image.tif, image_sd.tif and image.png, each over the previous one.
 
     It ends when the writer closes the file, when the file's attribute ``finished`` is true, when the file did not grow
     for ``quiet_time``, or at an interrupt.
@@ -157,7 +155,8 @@ def follow_recording(
     """
     check_folder(output)
     check_ends(path)  # only once, because a poll has to be fast
-    summary, previous, frames_done, needed = FollowSummary(frame_time or np.nan), None, 0, FIRST_REPEAT_SEARCH_S
+    summary, previous, frames_done, refusal = FollowSummary(frame_time or np.nan), None, 0, ""
+    needed = FIRST_REPEAT_SEARCH_S
     arrivals: list[tuple[float, float]] = []  # end of the recording [s on its clock], and when it was read [s]
     with (
         suppress(KeyboardInterrupt),
@@ -174,15 +173,15 @@ def follow_recording(
                 stop = begin + due * summary.frame_s
                 try:
                     previous = reconstruct_frame(recording, stop - summary.frame_s, stop, previous, output, options)
-                except BadInput:  # no motion in this frame; the next one may have one
-                    summary.dropped += 1
+                except BadInput as error:  # no motion in this frame; the next one may have one
+                    summary.dropped, refusal = summary.dropped + 1, f": {error}"
                 else:
                     summary.frames += 1
                     summary.latency_s.append(time.monotonic() - float(np.interp(stop, *np.array(arrivals).T)))
                 summary.dropped += due - 1 - frames_done
                 frames_done = due
                 bar.update(summary.frames - bar.n)
-                late = f", {summary.latency_s[-1]:.2f} s late" if summary.latency_s else ""
+                late = f", {summary.latency_s[-1]:.2f} s late" if summary.latency_s else refusal
                 bar.set_postfix_str(f"{summary.dropped} dropped{late}")
             summary.ended = ended or summary.ended
     acknowledge_stop()
@@ -236,11 +235,13 @@ def reconstruct_frame(
         options: as for :func:`recon.pipeline.reconstruct`.
 
     Raises:
-        BadInput: the motion of the frame cannot be estimated.
+        BadInput: the motion of the frame cannot be estimated, or in the first frame a sensor holds only noise.
     """
     device = select_device(recording, options.device)
     lead_in = LEAD_IN_PERIODS * slow_period(previous.motion) if previous else 0.0
     prepared = prepare_frame(recording, device, start - lead_in, stop, options.undo_lag)
+    if previous is None:
+        check_sensor_noise(prepared.recording, device, options.estimator)
     estimated = estimate_motion(prepared, options, previous.motion if previous else None)
     if previous:
         motion = match_signs(estimated.motion, previous.motion)

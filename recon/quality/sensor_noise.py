@@ -13,6 +13,7 @@ from estimation.filters.baselines import find_position_signal
 from estimation.reference import dominant_frequency
 from estimation.signals import is_capacitive, sense_channels
 from recon.quality.drive_check import SAME_FREQUENCY
+from recon.quality.hum_check import describe_hum
 from recon.quality.line_search import LineSearch, search_lines
 from scanner.channel import Channel, check_signal
 from scanner.device import AXES, Device
@@ -59,7 +60,7 @@ def check_sensor_noise(recording: Recording, device: Device, estimator: str | No
         estimator: name of the estimator; the default one where None.
 
     Returns:
-        A line for each position sensor that moves, but not at the frequency of its drive.
+        A line for each position sensor that moves, but not at the frequency of its drive, or that shows only hum.
 
     Raises:
         BadInput: a sensor shows no line where the motion is expected.
@@ -68,12 +69,18 @@ def check_sensor_noise(recording: Recording, device: Device, estimator: str | No
     for sensor in _sensors_in_use(recording, device, estimator or default_estimator(recording, device)):
         channel = sensor.channel
         expected = search_lines(channel, sensor.bands, sensor.driven)
-        if expected is None or expected.found:
+        if expected is None:
+            continue
+        hint = "check the sensor, its cable and amplifier, and check drive voltage and frequency"
+        hint += _alternatives(recording, device, sensor)
+        if expected.found:
+            hum = None if sensor.bands else describe_hum(channel, expected.frequency)
+            if hum:
+                driven = f"if the mirror is driven at it, state frequency in [{sensor.axes[0]}.drive]"
+                notes.append(f"{channel.name}: {hum}: it is hum, not a motion; {hint}; {driven}")
             continue
         other = search_lines(channel, ()) if sensor.bands else None
         what = _describe_search(sensor, expected)
-        hint = "check the sensor, its cable and amplifier, and check drive voltage and frequency"
-        hint += _alternatives(recording, device, sensor)
         if other is None or not other.found:
             what = f"shows no motion, only noise: {what}"
             raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)

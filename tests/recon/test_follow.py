@@ -21,6 +21,7 @@ from recon.follow import follow_recording, match_signs, measures_readout_phase, 
 from recon.imaging.readout_phase import apply_readout_phase
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
+from scanner.errors import BadInput
 from scanner.recording import Recording
 from tests.support import sample_files
 from tests.support.simulated import imaging, with_sense
@@ -247,3 +248,11 @@ def test_a_frame_uses_the_readout_error_that_earlier_frames_showed(tmp_path: Pat
         errors.append(np.degrees(evaluate_axis(motion.axes["x"], *angle).phase_rmse))
     assert errors[0] > 2.0  # half a microsecond late at 13.8 kHz
     assert errors[1] < 0.1
+
+
+def test_a_sensor_of_noise_gives_no_frame(tmp_path: Path) -> None:
+    recording, _ = imaging()
+    dead = with_sense(recording, lambda sense: np.random.default_rng(4).normal(0.0, 0.01, sense.size))
+    with pytest.raises(BadInput, match="sense: shows no motion, only noise"):
+        reconstruct_frame(dead, 0.0, 0.01, None, tmp_path, Options(pixels=(100, 100)))
+    assert not list(tmp_path.iterdir())

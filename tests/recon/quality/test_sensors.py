@@ -139,6 +139,31 @@ def test_hum_without_a_motion_is_refused_or_noted_with_its_frequency() -> None:
     assert note.startswith("sense_x: shows no motion where it is expected")
 
 
+def mains_hum(frequency: float, samples: int, rate: float = RATE) -> np.ndarray:
+    """Hum of a rectifier: harmonics that fall with their number."""
+    phase = 2 * np.pi * frequency / rate * np.arange(samples)
+    return sum(0.3 / order * np.sin(order * phase + order) for order in range(1, 6))
+
+
+@pytest.mark.parametrize("frequency", [50.0, 49.9, 60.05])
+@pytest.mark.parametrize("seconds", [0.1, 2.0])
+def test_hum_in_a_position_sensor_without_a_drive_is_noted(frequency: float, seconds: float) -> None:
+    samples = round(seconds * RATE)
+    recording = scan(drive_x=None, sense_x=(mains_hum(frequency, samples) + noise(1, samples), "V", RATE))
+    (note,) = check_sensor_noise(recording, DEVICE, "sensor")
+    assert note.startswith(
+        f"sense_x: shows nothing but the frequency of the mains, {round(frequency, -1):g} Hz, and its harmonics: it is"
+    )
+    assert "if the mirror is driven at it, state frequency in [x.drive]" in note
+
+
+@pytest.mark.parametrize("beside", [25.0, 470.0, 2000.0])
+def test_a_motion_beside_hum_is_no_hum(beside: float) -> None:
+    time = np.arange(20_000) / RATE
+    moved = mains_hum(50.0, 20_000) + 0.02 * np.sin(2 * np.pi * beside * time) + noise(2, 20_000)
+    assert check_sensor_noise(scan(drive_x=None, sense_x=(moved, "V", RATE)), DEVICE, "sensor") == []
+
+
 @pytest.mark.parametrize("shape", ["ramp", "step", "raster"])
 def test_any_waveform_of_a_position_sensor_without_a_drive_passes(shape: str) -> None:
     time = np.arange(10_000) / RATE
