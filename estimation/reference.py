@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.short_tone import MIN_PERIODS, fit_short_tone
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
-from scanner.lock_in import block_length, block_phasors, unwrap_phase
+from scanner.lock_in import block_phasors, slow_clock_block, unwrap_phase
 
 BLOCK_CYCLES = 4
 """Cycles of the drive per block: the phase then advances by less than half a cycle a block for a chirp of up to an
@@ -91,11 +92,11 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> PhaseReferen
     Raises:
         BadInput: the drive holds no oscillation.
     """
-    f = dominant_frequency(drive, low)
-    block = block_length(f, drive.sample_rate, BLOCK_CYCLES)
+    f = tone_frequency(drive, low)
+    block = slow_clock_block(f, drive.sample_rate, BLOCK_CYCLES, drive.size)
     if drive.size < 2 * block:
         raise BadInput(
-            f"is {drive.size / drive.sample_rate:.3g} s long, less than {2 * BLOCK_CYCLES} periods of its {f:.6g} Hz",
+            f"is {drive.size / drive.sample_rate:.3g} s long, less than {MIN_PERIODS:g} periods of its {f:.6g} Hz",
             file=drive.file,
             channel=drive.name,
             hint="record for longer",
@@ -115,6 +116,21 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> PhaseReferen
     return PhaseReference(kind, ratio * f, time, ratio * slow)
 
 
+def tone_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
+    """Frequency of a tone in (low, high) [Hz], also of few periods; arguments as for ``dominant_frequency``.
+
+    Raises:
+        BadInput: the channel holds no oscillation there.
+    """
+    duration, most = channel.size / channel.sample_rate, 2 * BLOCK_CYCLES
+    found = _spectral_frequency(channel, low, high, window)
+    if (found is None or found * duration < most) and low * duration < most:
+        found = fit_short_tone(channel, low, min(most, high * duration)) or found
+    if found is None:
+        raise _no_oscillation(channel)
+    return found
+
+
 def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
     """Frequency of the strongest line in (low, high) over the first ``window`` seconds (at most 2^18 samples) [Hz].
 
@@ -123,6 +139,14 @@ def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf,
     Raises:
         BadInput: no line exceeds the noise there.
     """
+    found = _spectral_frequency(channel, low, high, window)
+    if found is None:
+        raise _no_oscillation(channel)
+    return found
+
+
+def _spectral_frequency(channel: Channel, low: float, high: float, window: float | None) -> float | None:
+    """As ``dominant_frequency``; None if no line exceeds the noise."""
     window_samples = round(window * channel.sample_rate) if window else MAX_SPECTRUM_SAMPLES
     most = min(channel.size, MAX_SPECTRUM_SAMPLES, window_samples)
     few = round(min(most, SHORT_SPECTRUM_PERIODS * channel.sample_rate / low)) if low > 0.0 else most
@@ -131,7 +155,13 @@ def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf,
         found = _strongest(channel.read(0, n), channel.sample_rate, low, high)
         if found is not None:
             return found
-    raise BadInput("holds no oscillation", file=channel.file, channel=channel.name, hint="check that it was recorded")
+    return None
+
+
+def _no_oscillation(channel: Channel) -> BadInput:
+    """The error for a channel without a line."""
+    hint = "check that it was recorded"
+    return BadInput("holds no oscillation", file=channel.file, channel=channel.name, hint=hint)
 
 
 def has_slow_oscillation(channel: Channel, high: float) -> bool:

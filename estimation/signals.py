@@ -9,9 +9,9 @@ import numpy as np
 from estimation.reference import (
     PhaseReference,
     absolute_reference,
-    dominant_frequency,
     drive_reference,
     has_slow_oscillation,
+    tone_frequency,
 )
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
@@ -159,7 +159,7 @@ def phase_reference(
     double = 2.0 if even else 1.0
     band = (0.8 * double * stated.resonance, 1.25 * double * stated.resonance) if stated.mechanics else (0.0, np.inf)
     window = 60.0 / stated.resonance if stated.mechanics else None
-    frequency = dominant_frequency(sense, *band, window=window) / double
+    frequency = tone_frequency(sense, *band, window=window) / double
     return absolute_reference(frequency, sense.start, sense.end)
 
 

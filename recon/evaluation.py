@@ -11,7 +11,7 @@ import numpy as np
 
 from scanner.arrays import Array
 from scanner.errors import BadInput
-from scanner.lock_in import block_length, block_phasors
+from scanner.lock_in import block_phasors, slow_clock_block
 from scanner.motion import AxisMotion
 from scanner.truth import read_truth
 
@@ -113,7 +113,7 @@ def evaluate_axis(axis: AxisMotion, angle: Array, rate: float, start: float) -> 
     first, last = int(both.argmax()), both.size - int(both[::-1].argmax())
     begin = track.start + first / track.sample_rate
     frequency = float(np.median(axis.frequency))
-    block = block_length(frequency, track.sample_rate, CYCLES_PER_PHASE)
+    block = slow_clock_block(frequency, track.sample_rate, CYCLES_PER_PHASE, last - first)
     time, estimated = block_phasors(track_angle[first:last], track.sample_rate, begin, frequency, block)
     _, true = block_phasors(angle[first:last], track.sample_rate, begin, frequency, block)
     mirrored = bool(np.sum((np.conj(estimated) * true).real) < 0.0)

@@ -19,6 +19,9 @@ BLOCKS_PER_PASS = 4
 TILE_SAMPLES = 256
 """Samples of a block that are folded at a time: their sums, 16 kB, fit the first-level cache."""
 
+MIN_BLOCK_CYCLES = 0.75
+"""Cycles of a block that distinguish a sine from an offset: noise has 1.4 times the effect of that in one cycle."""
+
 COMPILED_DTYPES = (np.dtype(np.int16), np.dtype(np.float32), np.dtype(np.float64))
 """Types of samples for which there is a compiled kernel; other types are converted to float64 first."""
 
@@ -47,6 +50,11 @@ def block_phasors(
     fitted, _ = block_products(values, starts, _phasor_weights(block, frequency / rate), 1, gain)
     centres = start + (starts + 0.5 * (block - 1)) / rate
     return np.asarray(centres, np.float64), np.asarray(fitted[:, 1] + 1j * fitted[:, 0], np.complex128)
+
+
+def phasor_noise(rate: float, frequency: float, block: int) -> float:
+    """Return the sd of the component of Z that white noise of sd 1 affects most, for ``block_phasors``' arguments."""
+    return float(np.sqrt((_phasor_weights(block, frequency / rate) ** 2).sum(axis=1).max()))
 
 
 @lru_cache(maxsize=4)
@@ -154,6 +162,17 @@ def _add_products(x, table, first, stop, at, n, products):  # type: ignore[no-un
 def block_length(frequency: float, rate: float, cycles: float) -> int:
     """Return the number of samples in a block of about ``cycles`` cycles."""
     return max(4, round(cycles * rate / frequency))
+
+
+def slow_clock_block(frequency: float, rate: float, cycles: float, samples: int) -> int:
+    """Return the number of samples in a block of about ``cycles`` cycles, of which ``samples`` hold two.
+
+    Few samples are divided into two blocks of at least ``MIN_BLOCK_CYCLES``; fewer do not hold two.
+    """
+    block = block_length(frequency, rate, cycles)
+    if samples >= 2 * block:
+        return block
+    return max(block_length(frequency, rate, MIN_BLOCK_CYCLES), min(samples // 2, block))
 
 
 def unwrap_phase(phase: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
 from estimation.initial import fit_initial_motion
 from estimation.lock_in_channels import lock_in_angle
-from estimation.reference import PhaseReference, absolute_reference, dominant_frequency
+from estimation.reference import PhaseReference, absolute_reference, tone_frequency
 from estimation.signals import (
     NOISE_SAMPLES,
     intensity_clock,
@@ -23,7 +23,7 @@ from scanner.arrays import Array
 from scanner.channel import Channel, check_signal, make_channel, suggest_name
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
-from scanner.lock_in import block_length, block_phasors, unwrap_phase
+from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block, unwrap_phase
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 from scanner.stages import Position
@@ -119,7 +119,7 @@ def reference_from_drive_or_signal(recording: Recording, device: Device, name: s
         return phase_reference(recording, device, name, channel)
     axis = device.axis(name)
     band = (0.8 * axis.resonance, 1.25 * axis.resonance) if axis.mechanics else (0.0, np.inf)
-    return absolute_reference(dominant_frequency(channel, *band), channel.start, channel.end)
+    return absolute_reference(tone_frequency(channel, *band), channel.start, channel.end)
 
 
 def reference_of_any_waveform(recording: Recording, device: Device, name: str, channel: Channel) -> PhaseReference:
@@ -128,11 +128,11 @@ def reference_of_any_waveform(recording: Recording, device: Device, name: str, c
     It is that of :func:`reference_from_drive_or_signal`, else the strongest line of the position signal, else a
     frequency that makes the whole recording ``MIN_BLOCKS`` blocks of the slow clock. The angle does not depend on it.
     """
-    lowest = MIN_BLOCKS * (BLOCK_CYCLES + 1.0) * channel.sample_rate / channel.size
     with suppress(BadInput):
         return reference_from_drive_or_signal(recording, device, name, channel)
     with suppress(BadInput):
-        return absolute_reference(max(dominant_frequency(channel), lowest), channel.start, channel.end)
+        return absolute_reference(tone_frequency(channel), channel.start, channel.end)
+    lowest = MIN_BLOCKS * (BLOCK_CYCLES + 1.0) * channel.sample_rate / channel.size
     return absolute_reference(lowest, channel.start, channel.end)
 
 
@@ -150,7 +150,7 @@ def axis_motion_from_angle(
         BadInput: the channel is shorter than two blocks.
     """
     rate = channel.sample_rate
-    block = block_length(reference.frequency, rate, BLOCK_CYCLES)
+    block = slow_clock_block(reference.frequency, rate, BLOCK_CYCLES, channel.size)
     time, phasors = block_phasors(angle, rate, channel.start, reference.frequency, block)
     if time.size < MIN_BLOCKS:
         raise BadInput(
@@ -168,8 +168,8 @@ def axis_motion_from_angle(
         phase=phase,
         amplitude=amplitude,
         frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
-        phase_sd=np.minimum(  # 3/N: Hann weights, 2/N unweighted
-            noise_sd / np.maximum(amplitude, 1e-300) * np.sqrt(3.0 / block), UNIFORM_PHASE_SD
+        phase_sd=np.minimum(
+            noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block), UNIFORM_PHASE_SD
         ),
         angle=SampledAngle(resample_to_clock(angle, channel, clock), clock[0], clock[1]),
         reference=reference.kind,

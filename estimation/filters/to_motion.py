@@ -15,7 +15,7 @@ from estimation.reference import PhaseReference
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
-from scanner.lock_in import block_length, block_phasors, unwrap_phase
+from scanner.lock_in import block_phasors, slow_clock_block, unwrap_phase
 from scanner.motion import AxisMotion, SampledAngle
 
 BLOCK_CYCLES = 4.0
@@ -66,7 +66,7 @@ def axis_motion_from_filter(
     """
     channel, reference = problem.sense.channel, problem.references[name]
     f = reference.frequency
-    block = block_length(f, channel.sample_rate, BLOCK_CYCLES)
+    block = slow_clock_block(f, channel.sample_rate, BLOCK_CYCLES, channel.size)
     time, phasors = block_phasors(filtered.theta[i], channel.sample_rate, channel.start, f, block)
     if time.size < 2:
         raise BadInput(

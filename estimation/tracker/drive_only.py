@@ -18,7 +18,7 @@ from estimation.tracker.block_tracking import track_blocks
 from estimation.tracker.drive_blocks import BlockDrive, demodulate_drive
 from estimation.tracker.initial_state import RELATIVE_STIFFNESS_SD, STIFFNESS_RATE_SD_PER_S
 from estimation.tracker.kalman_filter import StateEstimate
-from estimation.tracker.observations import MAX_AMPLITUDE_THETA0, NO_CLIPPED_BLOCKS, BlockObservations
+from estimation.tracker.observations import MAX_AMPLITUDE_THETA0, MIN_BLOCKS, NO_CLIPPED_BLOCKS, BlockObservations
 from estimation.tracker.phase_measurements import PhaseMeasurement, with_phase_measurements
 from estimation.tracker.process_noise import MIN_DENSITIES
 from estimation.tracker.state_space import AXIS_STATES, DAMPING, LOG_AMPLITUDE, PHASE, STIFFNESS, STIFFNESS_RATE
@@ -32,7 +32,7 @@ from scanner.recording import Recording
 from scanner.stages import Position
 
 BLOCK_CYCLES = 2.0
-"""Length of a block in cycles of the axis."""
+"""Length of a block in cycles of the axis; shorter where the recording holds fewer than ``MIN_BLOCKS`` of them."""
 
 NO_READOUT = Position(gain=1.0, noise_sd=0.0)
 """Stands in where a readout is required; no sample is read through it."""
@@ -119,7 +119,7 @@ def drive_only_observations(recording: Recording, device: Device, name: str) -> 
 
 def _block_times(channel: Channel, frequency: float) -> tuple[Array, float]:
     """Middles of the blocks, shape (blocks,), and width of a block [s]."""
-    length = round(BLOCK_CYCLES / frequency * channel.sample_rate)
+    length = min(round(BLOCK_CYCLES / frequency * channel.sample_rate), channel.size // MIN_BLOCKS)
     starts = np.arange(channel.size // length) * length
     return channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate), length / channel.sample_rate
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -35,8 +36,15 @@ from scanner.laws import capacitance
 from scanner.recording import Recording
 from scanner.stages import Amdm
 
+MIN_BLOCKS = 3
+"""Least number of blocks: a smoother needs a block between a first and a last one."""
+
 MIN_BLOCK_CYCLES = 2.0
 """Least length of a block in cycles of the slowest axis: its harmonics are then separable from the other axis's."""
+
+MIN_CYCLES_OF_RECORDING = 1.5
+"""Least length of a recording in cycles of the slowest axis. Blocks of a recording that is shorter than ``MIN_BLOCKS``
+usual ones are shorter too. A capacitance then repeats at least once in each, so that a block determines its mean."""
 
 MAX_BLOCK_S = 1e-3
 """Largest length of a block with more than MIN_BLOCK_CYCLES [s]. Drift, and the change of the phase while the
@@ -162,11 +170,14 @@ def lay_out_blocks(
         DeviceInvalid: the device lacks a value.
     """
     channel, axes = sense.channel, tuple(device.axis(name) for name in sense.axes)
-    length = _block_length(axes, [references[name].frequency for name in sense.axes], channel.sample_rate)
-    count = channel.size // length
-    if count < 3:
+    slowest = min(references[name].frequency for name in sense.axes)
+    length = _block_length(axes, slowest, channel.sample_rate)
+    least = max(MIN_BLOCKS * MIN_BLOCK_SAMPLES, ceil(MIN_CYCLES_OF_RECORDING / slowest * channel.sample_rate))
+    length = min(length, channel.size // MIN_BLOCKS)
+    count = channel.size // max(length, 1)
+    if channel.size < least:
         raise BadInput(
-            f"is {channel.size} samples long; {3 * length} are needed to track a motion",
+            f"is {channel.size} samples long; {least} are needed to track a motion",
             file=channel.file,
             channel=channel.name,
             hint="record for longer",
@@ -251,11 +262,15 @@ def _clipped_blocks(projections: Projections, starts: Index, pieces: Index, sett
     return ClippedBlocks(block, starts[block], used, projections.rails[block])
 
 
-def _block_length(axes: Sequence[Axis], frequencies: list[float], rate: float) -> int:
-    """Samples of a block, from MIN_BLOCK_CYCLES, BLOCK_DECAY_TIMES and MAX_BLOCK_S."""
+def _block_length(axes: Sequence[Axis], slowest: float, rate: float) -> int:
+    """Samples of a block of a long recording, from MIN_BLOCK_CYCLES, BLOCK_DECAY_TIMES and MAX_BLOCK_S.
+
+    Args:
+        slowest: frequency of the slowest axis [Hz]. rate: of the samples [Hz].
+    """
     decays = [axis.quality / (np.pi * axis.resonance) for axis in axes if axis.mechanics is not None]
     width = min(BLOCK_DECAY_TIMES * min(decays), MAX_BLOCK_S) if decays else 0.0
-    return max(MIN_BLOCK_SAMPLES, round(max(MIN_BLOCK_CYCLES / min(frequencies), width) * rate))
+    return max(MIN_BLOCK_SAMPLES, round(max(MIN_BLOCK_CYCLES / slowest, width) * rate))
 
 
 def _usable_lines(axes: Sequence[Axis], sense: SenseChannel, w: Array, rate: float) -> Index:

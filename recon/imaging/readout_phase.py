@@ -262,9 +262,12 @@ def advance_axis(axis: AxisMotion, error: ReadoutPhase) -> AxisMotion:
 
 def widen_undetermined(axis: AxisMotion) -> AxisMotion:
     """The motion with the uncertainty of a readout that the picture does not measure in its ``phase_sd``."""
-    undescribed = 2.0 * np.pi * axis.frequency * UNDESCRIBED_DELAY_SD_S
-    variance = axis.phase_sd**2 + (1.0 - PRIOR_PROBABILITY_AS_STATED) * undescribed**2
-    return replace(axis, phase_sd=np.sqrt(variance))
+    return replace(axis, phase_sd=np.sqrt(axis.phase_sd**2 + _undescribed_variance(axis)))
+
+
+def _undescribed_variance(axis: AxisMotion) -> Array:
+    """Variance of the phase by a delay that the device file does not state [rad^2]."""
+    return (1.0 - PRIOR_PROBABILITY_AS_STATED) * (2.0 * np.pi * axis.frequency * UNDESCRIBED_DELAY_SD_S) ** 2
 
 
 def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) -> list[str]:
@@ -276,9 +279,9 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
     """
     notes = [
         f"the picture determines no phase of {name}: no feature across it, a pattern that repeats, or too few photons. "
-        f"The standard deviation of the phase allows for "
-        f"{UNDESCRIBED_DELAY_SD_S * 1e6:.2g} µs of readout delay that the device file does not "
-        "state; a specimen with detail, more light or a longer scan narrows it"
+        f"The standard deviation of the phase allows for {UNDESCRIBED_DELAY_SD_S * 1e6:.2g} µs of readout delay that "
+        f"the device file does not state; without such a delay it is {_sd_as_stated(motion.axes[name]):.2g}°. "
+        "A specimen with detail, more light or a longer scan narrows it"
         for name in AXES
         if name not in found
     ]
@@ -296,6 +299,12 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
             "run `lissajous diagnose`"
         )
     return notes
+
+
+def _sd_as_stated(axis: AxisMotion) -> float:
+    """Standard deviation of the phase, rms [deg], if the readout is as the device file states; axis: widened."""
+    variance = np.maximum(axis.phase_sd**2 - _undescribed_variance(axis), 0.0)
+    return float(np.degrees(np.sqrt(np.mean(variance))))
 
 
 def common_delay(motion: Motion, found: Mapping[str, ReadoutPhase]) -> float | None:

@@ -15,7 +15,7 @@ from scanner.harmonics import capacitance_harmonics, readout_response
 from scanner.integrator.nodes import to_nodes
 from scanner.integrator.trajectories import integrate
 from scanner.laws import capacitance, capacitance_curvature, capacitance_slope, electrostatic_torque
-from scanner.lock_in import block_length, block_phasors, unwrap_phase
+from scanner.lock_in import block_length, block_phasors, phasor_noise, unwrap_phase
 from scanner.lowpass import apply_lowpass, lowpass_response, run_section, section_coefficients
 from scanner.parametric import sine_drive, slow_flow, steady_state, stiffness_modulation, threshold, tongue_edges
 from scanner.stages import Capacitance, Mechanics
@@ -193,6 +193,16 @@ def test_block_phasors_are_exact_for_a_sine(amplitude: float, phase: float, offs
     assert np.allclose(np.abs(z), amplitude, rtol=1e-6, atol=1e-7 * (1 + abs(offset)))
     turned = z * np.exp(-1j * (2 * np.pi * f * tc + phase))
     assert np.abs(np.angle(turned)).max() < 1e-5 * (1 + abs(offset) / amplitude)
+
+
+@pytest.mark.parametrize("cycles", [0.75, 1.0, 4.0])
+def test_the_noise_of_block_phasors_is_stated(cycles: float) -> None:
+    block, blocks = 80, 4000
+    noise = np.random.default_rng(3).normal(size=block * blocks)
+    _, z = block_phasors(noise, 1000.0, 0.0, 1000.0 * cycles / block, block)
+    assert phasor_noise(1000.0, 1000.0 * cycles / block, block) == pytest.approx(
+        max(z.real.std(), z.imag.std()), rel=0.05
+    )
 
 
 def test_unwrapping_follows_a_changing_frequency() -> None:
