@@ -1,4 +1,4 @@
-"""Reader for napari: a recording becomes its picture, its coverage and the path of the beam."""
+"""Reader for napari: recordings become picture, coverage and path of the beam; output folders become their picture."""
 
 from __future__ import annotations
 
@@ -8,21 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lissajous.napari_live import Layer, read_folder
+
 if TYPE_CHECKING:
     from recon.reconstruction import Reconstruction
-
-Layer = tuple[Any, dict[str, Any], str]
-"""Data, arguments and kind of a layer, as napari takes them."""
 
 MAX_PATH_POINTS = 20_000
 """Points of the beam's path that are shown: more cover the picture."""
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[Layer]] | None:
-    """Return the function that reads a recording, None for other files and for several at once.
+    """Return the function that reads a recording or an output folder, None for others and for several at once.
 
     Args:
-        path: of the file.
+        path: of the file or folder.
     """
     import h5py
 
@@ -30,12 +29,28 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
 
     if not isinstance(path, str):
         return None
+    if Path(path).is_dir():
+        return read_output if _is_output(Path(path)) else None
     try:
         with h5py.File(path) as file:
             stated = file.attrs.get("format")
     except OSError:
         return None
     return read_recording if stated in (FORMAT, FORMAT.encode()) else None
+
+
+def read_output(path: str | Sequence[str]) -> list[Layer]:
+    """Return the picture of an output folder; while ``--follow`` runs it is replaced with each new frame.
+
+    Args:
+        path: of the folder.
+    """
+    return read_folder(Path(str(path)))
+
+
+def _is_output(folder: Path) -> bool:
+    """Whether a folder was written by ``reconstruct``: no other folder is taken from napari's own readers."""
+    return all((folder / name).is_file() for name in ("image.tif", "image_sd.tif", "image.png"))
 
 
 def read_recording(path: str | Sequence[str]) -> list[Layer]:

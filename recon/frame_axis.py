@@ -19,13 +19,19 @@ class FrameAxis:
 
     Attributes:
         name: ``"t"`` or ``"z"``.
-        values: beginning of each frame [s], or position of each slice, increasing [m].
-        step: from one frame to the next, the mean for slices [s] or [m]; NaN for a single slice.
+        values: beginning of each frame [s], or position of each slice, increasing [m]; numbers of repeats whose times
+            are unknown.
+        step: from one frame to the next, the mean for slices [s] or [m]; NaN for a single slice and unknown times.
     """
 
     name: Literal["t", "z"]
     values: Sequence[float]
     step: float
+
+    @property
+    def timed(self) -> bool:
+        """Whether the times of frames are known."""
+        return self.name == "t" and not np.isnan(self.step)
 
     @property
     def even(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +14,10 @@ from recon.z_rests import PositionBlocks, cut_to_intensity, find_rests, read_blo
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, LazySamples
 from scanner.errors import BadInput
+
+MIN_BLOCKS_OF_SLICE = 16
+"""Blocks of z from which a variation within a slice is told from noise, and parts of a slice that are compared: for
+white noise the variance of their differences is then 2 ± 0.5 times that of their means."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +67,13 @@ def find_z_slices(position: Channel, intensity: Channel, step: float | None = No
         raise BadInput(f"a step of {step} m", channel="z_step", hint="give a positive thickness in metres")
     position = cut_to_intensity(position, intensity)
     blocks = read_blocks(position)
+    varying: tuple[str, ...] = ()
     if step is not None or blocks.constant:
         positions, label_times = _bins(position, blocks, step or np.inf, intensity.size)
     else:
-        positions, label_times = _levels(position, *find_rests(blocks))
+        used, rests, band = find_rests(blocks)
+        positions, number_of_rest, label_times = _levels(position, used, rests, band)
+        varying = tuple(_describe_variation(blocks, used.edges[rests], number_of_rest, positions, band))
 
     def labels(first: int, stop: int) -> NDArray[np.intp]:
         return label_times(intensity.start + np.arange(first, stop) / intensity.sample_rate)
@@ -85,7 +92,7 @@ def find_z_slices(position: Channel, intensity: Channel, step: float | None = No
         list(zip(first[kept].tolist(), end[kept].tolist(), strict=True)),
         tuple(samples[kept].tolist()),
         lambda begin, stop: number[labels(begin, stop)],
-        tuple(_describe(blocks, kept.size, 1.0 - samples.sum() / intensity.size)),
+        (*_describe(blocks, kept.size, 1.0 - samples.sum() / intensity.size), *varying),
     )
 
 
@@ -103,6 +110,46 @@ def _describe(blocks: PositionBlocks, slices: int, unassigned: float) -> list[st
             "no slice"
         )
     return notes
+
+
+def _describe_variation(
+    blocks: PositionBlocks, rests: NDArray[np.intp], slice_of_rest: NDArray[np.intp], positions: Array, band: float
+) -> Iterator[str]:
+    """A note on the slices within which z varies more than its noise, as where two positions are one slice.
+
+    Args:
+        blocks: as they were read.
+        rests: first sample and end of each rest, shape (rests, 2).
+        slice_of_rest: shape (rests,).
+        positions: of the slices [m].
+        band: width within which positions are one [m].
+    """
+    middle = 0.5 * (blocks.edges[1:] + blocks.edges[:-1])
+    rest = np.searchsorted(rests[:, 0], middle, side="right") - 1
+    inside = (rest >= 0) & (middle < rests[rest, 1])
+    varied: dict[int, float] = {}
+    for number in range(positions.size):
+        own = inside & (slice_of_rest[rest] == number)
+        means, scatter = blocks.mean[own], 0.5 * (blocks.high - blocks.low)[own]
+        if means.size < MIN_BLOCKS_OF_SLICE:
+            continue
+        noise = _white_variance(means) + float(np.mean(scatter**2))
+        parts = np.array([part.mean() for part in np.array_split(means, MIN_BLOCKS_OF_SLICE)])
+        slow = float(np.var(parts)) - _white_variance(parts)
+        if slow > max(_white_variance(parts), 0.25 * noise):
+            varied[number] = 2.0 * slow**0.5  # the distance of two positions
+    if varied:
+        worst = max(varied, key=lambda number: varied[number])
+        yield (
+            f"position_z: z varies within {len(varied)} of {positions.size} slices, most in that at "
+            f"{1e6 * positions[worst]:.6g} µm, by about {1e6 * varied[worst]:.3g} µm: positions closer than "
+            f"{1e6 * band:.3g} µm are one slice; if they are several, give --z-step, their spacing in metres"
+        )
+
+
+def _white_variance(values: Array) -> float:
+    """Variance of the white noise of values, by their differences (von Neumann 1941)."""
+    return 0.5 * float(np.mean(np.diff(values) ** 2))
 
 
 def _bins(
@@ -140,8 +187,8 @@ def _interpolate(position: Channel, times: Array) -> Array:
 
 def _levels(
     position: Channel, blocks: PositionBlocks, rests: NDArray[np.intp], band: float
-) -> tuple[Array, Callable[[Array], NDArray[np.intp]]]:
-    """Positions at which z rests, and the number of the position at any times; -1 while it moves.
+) -> tuple[Array, NDArray[np.intp], Callable[[Array], NDArray[np.intp]]]:
+    """Positions at which z rests, the number of each rest's position, and that at any times; -1 while z moves.
 
     Rests whose positions differ by less than the band are one position.
     """
@@ -161,7 +208,7 @@ def _levels(
         inside = np.searchsorted(starts, times, side="right") - 1
         return np.where((inside >= 0) & (times < stops[inside]), number[inside], -1)
 
-    return positions, label
+    return positions, number, label
 
 
 def _count(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 BY_POSITION = 0
-"""Value of ``--frames`` without a number: the steps of ``position_z`` give the frames."""
+"""Value of ``--frames`` and ``--stack`` without a number: ``position_z`` gives the slices or planes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="several: also what an earlier run has completed")
     several.add_argument(
         "--follow", action="store_true", help="show the frames of a recording that is still being written, then all"
+    )
+    parser.add_argument(
+        "--stack",
+        type=parse_positive,
+        nargs="?",
+        const=BY_POSITION,
+        metavar="M",
+        help="several: write their pictures as one stack, planes M metres apart, else at their position_z",
     )
     frame_options = parser.add_mutually_exclusive_group()
     frame_options.add_argument(
@@ -139,9 +147,12 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         zarr=args.zarr,
         movie=args.movie,
     )
-    if (args.zarr or args.movie) and not options.wants_frames:
+    if (args.zarr or args.movie) and not options.wants_frames and args.stack is None:
         option = "--zarr" if args.zarr else "--movie"
-        raise BadInput("needs frames", channel=option, hint="add --frames, --frame-time or --z-step")
+        raise BadInput("needs frames", channel=option, hint="add --frames, --frame-time, --z-step or --stack")
+    if args.stack is not None and options.wants_stack:
+        hint = "leave out --stack, or --frames and --z-step"
+        raise BadInput("each recording is a plane, and cannot be a stack itself", channel="--stack", hint=hint)
     if args.z_step and (options.frames or options.frame_time):
         raise BadInput("sorts the samples by z, not by time", channel="--z-step", hint="give --frames without a number")
     if args.zarr:
@@ -150,6 +161,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise BadInput(f"a {args.picture} picture has no holes", channel="--fill", hint="leave out --fill or --picture")
     if len(args.recordings) > 1 or args.recordings[0].is_dir() or args.scheduler or args.workers:
         return _run_many(args, options)
+    if args.stack is not None:
+        raise BadInput("needs several recordings", channel="--stack", hint="name them, or their folder")
     live = None
     for option in ("--intensity-drift", "--sample-motion"):
         if args.follow and getattr(args, option[2:].replace("-", "_")):
@@ -163,13 +176,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run_many(args: argparse.Namespace, options: Options) -> dict[str, Any]:
-    from recon.cli.reconstruct_many import reconstruct_files
+    from recon.cli.reconstruct_many import StackOptions, reconstruct_files
     from scanner.errors import BadInput
 
     if args.follow:
         raise BadInput("follows one recording", channel="--follow", hint="start one command for each")
+    stack = None if args.stack is None else StackOptions(args.stack or None)
     where = {"scheduler": args.scheduler, "workers": args.workers}
-    return reconstruct_files(args.recordings, args.output, options, args.mapping, **where, overwrite=args.overwrite)
+    return reconstruct_files(
+        args.recordings, args.output, options, args.mapping, **where, overwrite=args.overwrite, stack=stack
+    )
 
 
 def reconstruct_file(

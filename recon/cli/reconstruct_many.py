@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from recon.cli.reconstruct import reconstruct_file
 
@@ -19,6 +19,13 @@ if TYPE_CHECKING:
 
 TABLE_KEYS = ("estimator", "samples", "fill", "phase_sd_deg", "within_bound", "sign", "trouble", "notes", "seconds")
 """Keys of one recording's summary that the summary of all repeats."""
+
+
+class StackOptions(NamedTuple):
+    """A stack of several recordings, with the distance of one plane from the next [m]; None for that of position_z."""
+
+    spacing: float | None
+
 
 Row = Mapping[str, Any]
 """One recording's entry in the summary of all."""
@@ -32,6 +39,7 @@ def reconstruct_files(
     scheduler: str | None = None,
     workers: int | None = None,
     overwrite: bool = False,
+    stack: StackOptions | None = None,
 ) -> dict[str, Any]:
     """Reconstruct recordings, each into a folder of its name in ``output``; write summary.json and index.html of all.
 
@@ -42,20 +50,26 @@ def reconstruct_files(
         mapping: of all of them, see :func:`recon.io.convert.open_any`.
         scheduler, workers: see :func:`recon.executors.open_executor`; a cluster reads and writes the same paths.
         overwrite: do everything anew.
+        stack: write the pictures as one stack too, unless a recording fails; None for no stack.
 
     Returns:
         The summary. Its ``exit`` is 2 if an input was bad, 1 if another recording failed, else 0.
 
     Raises:
-        BadInput: ``output`` cannot be a folder or holds results of other options, or no scheduler answers.
+        BadInput: ``output`` cannot be a folder or holds results of other options, no scheduler answers, or the pictures
+            are no stack.
         InterruptedError: by the user. The folders of finished recordings remain.
     """
+    from dataclasses import replace
+
     from recon.fleet import find_recordings, plan_fleet, run_fleet
     from recon.io.output import finite, replacing_folder, write_json
+    from recon.recording_stack import read_planes, write_recording_stack
     from recon.report.many import reconstructions_report
 
     started, paths = time.perf_counter(), find_recordings(paths)
-    stated = f"{options} mapping={mapping and mapping.absolute()}"
+    alone = options if options.wants_frames else replace(options, zarr=False, movie=None)  # a stack's own options
+    stated = f"{alone} mapping={mapping and mapping.absolute()}"
     fleet = plan_fleet(paths, output, stated, "summary.json", overwrite)
     work = partial(_reconstruct_one, options, mapping and mapping.absolute())
     failures = run_fleet(fleet, work, "reconstruct", scheduler, workers)
@@ -68,17 +82,21 @@ def reconstruct_files(
             summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
             rows.append(row | {"failed": None} | {key: summary[key] for key in TABLE_KEYS})
     failed = [row for row in rows if row["failed"]]
-    content = finite(
-        {
-            "output": str(output),
-            "recordings": rows,
-            "failed": len(failed),
-            "kept": len(fleet.done),
-            "exit": max((row["exit"] for row in failed), default=0),
-            "seconds": time.perf_counter() - started,
-        }
-    )
     with replacing_folder(output) as folder:
+        made = None
+        if stack is not None and not failed:
+            made = write_recording_stack(folder, read_planes(fleet.folders), stack.spacing, options.zarr, options.movie)
+        content = finite(
+            {
+                "output": str(output),
+                "recordings": rows,
+                "failed": len(failed),
+                "kept": len(fleet.done),
+                "stack": made,
+                "exit": max((row["exit"] for row in failed), default=0),
+                "seconds": time.perf_counter() - started,
+            }
+        )
         write_json(folder / "summary.json", content)
         (folder / "index.html").write_text(reconstructions_report(content), encoding="utf-8")
     return dict(content)
@@ -90,10 +108,15 @@ def _reconstruct_one(options: Options, mapping: Path | None, path: Path, folder:
 
 
 def format_summary(summary: dict[str, Any]) -> str:
+    from recon.report.conclusions import describe_stack
+
     rows = summary["recordings"]
     lines = [f"{summary['output']}: {len(rows) - summary['failed']} of {len(rows)} recordings reconstructed"]
     if summary["kept"]:
         lines.append(f"  {summary['kept']} were kept from an earlier run; --overwrite does them anew")
+    if summary["stack"]:
+        lines.append(f"  {describe_stack(summary['stack'])}: {summary['output']}/stack.ome.tif")
+        lines += [f"  {note}" for note in summary["stack"]["notes"]]
     for row in rows:
         if row["failed"]:
             lines.append(f"  failed: {row['failed']}")

@@ -70,13 +70,14 @@ def _metadata(picture: Picture, detectors: int, axis: FrameAxis) -> dict[str, An
     names = list(picture.detectors) or numbered
     labels = [*names, *(f"{name}, standard deviation" for name in names)]
     time = axis.name == "t"
-    succession = {"type": "time", "unit": "second"} if time else {"type": "space", "unit": "micrometer"}
+    succession = {"type": "time"} if time else {"type": "space", "unit": "micrometer"}
+    succession |= {"unit": "second"} if axis.timed else {}
     axes = [
         *_ordered(axis, {"name": axis.name, **succession}, {"name": "c", "type": "channel"}),
         {"name": "y", "type": "space", **length},
         {"name": "x", "type": "space", **length},
     ]
-    step = axis.step if time else 1e6 * axis.step if len(axis.values) > 1 else 1.0
+    step = 1.0 if np.isnan(axis.step) else axis.step if time else 1e6 * axis.step
     transformations = [{"type": "scale", "scale": [*_ordered(axis, step, 1.0), height, width]}]
     metadata: dict[str, Any] = {"pixel_size_unit": unit, "angle": picture.grid.angle}
     if not time:

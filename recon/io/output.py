@@ -192,7 +192,7 @@ def write_frames(path: Path, frames: Iterable[Picture], axis: FrameAxis) -> None
 def _frame_metadata(axis: FrameAxis, detectors: int = 1) -> dict[str, Any]:
     """What OME states of the frames' times or positions."""
     if axis.name == "t":
-        return {"TimeIncrement": axis.step, "TimeIncrementUnit": "s"}
+        return {} if not axis.timed else {"TimeIncrement": axis.step, "TimeIncrementUnit": "s"}
     positions = [1e6 * z for z in axis.values for _ in range(detectors)]  # of each plane, detectors varying first
     metadata: dict[str, Any] = {"Plane": {"PositionZ": positions, "PositionZUnit": ["µm"] * len(positions)}}
     if axis.even:

@@ -47,6 +47,8 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
 
 def describe_stack(stack: Mapping[str, Any]) -> str:
     """Number of the slices, their spacing and their range; ``stack`` is an entry of the summary."""
+    if stack["z_m"] is None:
+        return f"stack of {len(stack['recordings'])} repeats in the order given"
     z = format_positions(stack["z_m"])
     if len(z) == 1:
         return f"stack of a single slice at z = {z[0]} µm"
@@ -191,6 +193,9 @@ def conclude_many(summary: Mapping[str, Any]) -> str:
         text += f" At least {share:.1%} of every scan lies within the bound p/m" + (
             f"; look at {name} first." if share < SHARP_FRACTION else "."
         )
+    if summary["stack"]:
+        stack = describe_stack(summary["stack"])
+        text += f" {stack[0].upper()}{stack[1:]}: stack.ome.tif."
     if len(done) < len(rows):
         text += " The reasons of the others are listed below."
     return text

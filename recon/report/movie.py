@@ -23,7 +23,7 @@ MAX_RATE_HZ = 30.0
 
 
 SLICE_RATE_HZ = 5.0
-"""Number of slices of a stack per second of a movie: slow enough to compare each with the next."""
+"""Number of slices or repeats of a stack per second of a movie: slow enough to compare each with the next."""
 
 
 def write_movie(path: Path, frames: Iterable[Picture], axis: FrameAxis, limits: tuple[float, float]) -> None:
@@ -38,9 +38,11 @@ def write_movie(path: Path, frames: Iterable[Picture], axis: FrameAxis, limits: 
     Raises:
         BadInput: OpenCV was built without an encoder.
     """
-    if axis.name == "t":
+    if axis.timed:
         rate = min(1.0 / axis.step, MAX_RATE_HZ)
         labels = [f"{1e3 * time:.4g} ms" if time < 1.0 else f"{time:.3f} s" for time in axis.values]
+    elif axis.name == "t":
+        rate, labels = SLICE_RATE_HZ, [f"{number + 1} of {len(axis.values)}" for number in range(len(axis.values))]
     else:
         rate = SLICE_RATE_HZ
         labels = [f"z = {z} um" for z in format_positions(axis.values)]

@@ -15,8 +15,10 @@ from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
 from recon.reconstruction import Reconstruction
+from recon.z_rests import cut_to_intensity, read_blocks
 from recon.z_slices import ZSlices
 from scanner.device import AXES
+from scanner.errors import BadInput
 from scanner.motion import AxisMotion
 
 FILL_FRACTIONS = (0.25, 0.5, 0.75, 0.9, 0.99)
@@ -175,6 +177,8 @@ def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str
         "intensity_drift": intensity_drift_summary(result),
         "sample_motion": sample_motion_summary(result),
         "stack": stack_summary(slices),
+        "grid": asdict(result.picture.grid),
+        "position_z": position_summary(result),
         "trouble": [asdict(each) for each in result.defects],
         "affected": float(np.mean(result.affected)),
         "seconds": result.seconds,
@@ -196,6 +200,20 @@ def stack_summary(slices: ZSlices | None) -> dict[str, Any] | None:
         "step_m": axis.step,
         "even": axis.even,
         "samples": list(slices.samples),
+    }
+
+
+def position_summary(result: Reconstruction) -> dict[str, float] | None:
+    """Mean and range of z during the intensity; None where it was not recorded or is nowhere known."""
+    if result.position_z is None:
+        return None
+    try:
+        blocks = read_blocks(cut_to_intensity(result.position_z, result.intensity))
+    except BadInput:
+        return None
+    return {
+        "mean_m": float(np.nanmean(blocks.mean)),
+        "range_m": 0.0 if blocks.constant else float(blocks.most - blocks.least),
     }
 
 

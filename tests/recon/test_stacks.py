@@ -87,6 +87,26 @@ def test_steps_are_the_centres_of_the_slices_that_are_sorted_by_z() -> None:
     assert sum(slices.samples) == LIGHT.size
 
 
+@pytest.mark.parametrize("rate", [2e3, 20e3, 100e3])
+@pytest.mark.parametrize("gap", [1.5, 2.0])
+def test_positions_closer_than_the_noise_that_become_one_slice_are_noted(gap: float, rate: float) -> None:
+    sd = 50e-9
+    near = gap * sd * np.array([0.0, 1.0])
+    z = staircase(times(rate), (*near, *(2e-6 + near), *(4e-6 + near)), MOVE_S)
+    slices = find_z_slices(z_channel(z + noise(sd, z.size), rate), LIGHT)
+    assert len(slices.positions) == 3
+    (note,) = (each for each in slices.notes if "varies" in each)
+    assert "positions closer than 0.2" in note
+    assert "give --z-step, their spacing in metres" in note
+
+
+def test_noise_alone_is_no_variation_within_a_slice() -> None:
+    z = staircase(times(), POSITIONS, MOVE_S)
+    for seed in range(50):
+        noisy = z + np.random.default_rng(seed).normal(0.0, 50e-9, z.size)
+        assert not any("varies" in note for note in find_z_slices(z_channel(noisy), LIGHT).notes)
+
+
 def test_rests_at_one_position_are_one_slice() -> None:
     slices = find_z_slices(z_channel(staircase(times(), (0.0, 1e-6, 2e-6, 0.0, 1e-6, 2e-6), 1e-3)), LIGHT)
     assert slices.positions == pytest.approx((0.0, 1e-6, 2e-6), abs=1e-12)
