@@ -24,6 +24,9 @@ AXES = ("x", "y")
 DEFAULT_TOLERANCE = 0.02
 """Relative standard uncertainty of a nominal value for which the device states none: typical of a data sheet."""
 
+TERMS_WITH_LISTS = ("measured-law", "driven-modes")
+"""Terms whose tables also hold text and lists; all others hold numbers."""
+
 
 @dataclass(frozen=True)
 class Axis:
@@ -31,8 +34,8 @@ class Axis:
 
     Attributes:
         tolerance: stated relative standard uncertainties, by the name of the value.
-        terms: physics beyond the nominal laws, effect -> parameter -> value [SI]. ``measured-law`` also has text and
-            lists, see ``scanner.terms.measured_law``.
+        terms: physics beyond the nominal laws, effect -> parameter -> value [SI]. Those of ``TERMS_WITH_LISTS``
+            have text and lists, see ``scanner.terms.measured_law`` and ``scanner.terms.driven_modes``.
         extra: unknown keys, nested as in the file.
         name: ``"x"`` or ``"y"``, for messages.
         source: where the axis came from, for messages.
@@ -227,7 +230,7 @@ def _axis(name: str, table: device_toml.Table) -> Axis:
     terms = {}
     if (effects := table.take_table("terms")) is not None:
         terms = {
-            key: effect.take_rest() if key == "measured-law" else effect.take_numbers()
+            key: effect.take_rest() if key in TERMS_WITH_LISTS else effect.take_numbers()
             for key in list(effects.rest)
             if (effect := effects.take_table(key))
         }

@@ -20,7 +20,10 @@ from scanner.laws import amdm_voltage, capacitance, capacitance_slope, motion_vo
 from scanner.lowpass import apply_lowpass
 from scanner.stages import Amdm, MotionSensor, Readout
 from scanner.terms import STAGES, SignalContext, Term, catalogue
-from scanner.terms.measured_law import EFFECT, measured_law
+from scanner.terms.driven_modes import EFFECT as DRIVEN_MODES
+from scanner.terms.driven_modes import driven_modes
+from scanner.terms.measured_law import EFFECT as MEASURED_LAW
+from scanner.terms.measured_law import measured_law
 
 _EMPTY = np.empty(0)
 
@@ -119,17 +122,22 @@ def stated_terms(axis: Axis) -> tuple[ActiveTerm, ...]:
         BadInput: the catalogue has no such effect, or the file lacks one of its parameters.
     """
     known = catalogue()
-    return tuple(_stated_term(axis, effect, dict(values), known) for effect, values in axis.terms.items())
+    return tuple(
+        active for effect, values in axis.terms.items() for active in _stated_term(axis, effect, dict(values), known)
+    )
 
 
-def _stated_term(axis: Axis, effect: str, values: dict[str, Any], known: dict[str, Term]) -> ActiveTerm:
+def _stated_term(axis: Axis, effect: str, values: dict[str, Any], known: dict[str, Term]) -> list[ActiveTerm]:
+    """The term that a table states; once for each channel where it acts on several."""
     key = f"{axis.name}.terms.{effect}"
-    if effect == EFFECT:
+    if effect in (MEASURED_LAW, DRIVEN_MODES):
         try:
+            if effect == DRIVEN_MODES:
+                return [ActiveTerm(*law) for law in driven_modes(values, axis)]
             law, packed = measured_law(values)
         except DeviceInvalid as error:
             raise DeviceInvalid(error.what, file=axis.source, channel=key, hint=error.hint) from None
-        return ActiveTerm(law, packed, law.channels[0])
+        return [ActiveTerm(law, packed, law.channels[0])]
     if effect not in known:
         near = get_close_matches(effect, known) or known
         hint = f"known effects: {', '.join(near)}; a term file of your own is given with --terms"
@@ -142,7 +150,7 @@ def _stated_term(axis: Axis, effect: str, values: dict[str, Any], known: dict[st
     channels = (*term.channels, *term.stated_channels)
     if not 0 <= variant < len(channels):
         raise BadInput(f"variant {variant} is unknown", file=axis.source, channel=key, hint="count from 0")
-    return ActiveTerm(term, tuple(values[p.name] for p in term.parameters), channels[variant])
+    return [ActiveTerm(term, tuple(values[p.name] for p in term.parameters), channels[variant])]
 
 
 def in_stage_order(terms: Iterable[ActiveTerm]) -> list[ActiveTerm]:

@@ -14,14 +14,17 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
 from estimation.diagnosis.fit import Fit, Likelihood
+from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE, may_be_gain_drift
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_parameters
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.localisation import describe_localisation
+from estimation.diagnosis.open_loop import open_loop
 from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.profile_likelihood import profile_interval
 from estimation.diagnosis.selection import Progress, SelectionResult, SelectionStep, select_terms
 from estimation.diagnosis.shares import describe_unexplained, find_remainder, share_of_finding
 from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
+from estimation.diagnosis.structure import describe_modes, with_driven_modes
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -95,6 +98,7 @@ class Diagnosis:
         remainder: share, stage and channel of the largest misfit that no finding explains, None if there is none.
         open_loop: prediction error of the nominal and the improved device, by channel.
         optics: effects on the picture, for every recording with an intensity.
+        further_modes: see :func:`estimation.diagnosis.structure.describe_modes`.
     """
 
     verdict: str
@@ -106,6 +110,7 @@ class Diagnosis:
     remainder: Mapping[str, Any] | None = None
     open_loop: Mapping[str, Any] = field(default_factory=dict)
     optics: tuple[Mapping[str, Any], ...] = ()
+    further_modes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         lines = [f"Diagnosis of {self.device.name!r}: {self.verdict}"]
@@ -128,6 +133,7 @@ class Diagnosis:
             "remainder": None if self.remainder is None else dict(self.remainder),
             "open_loop": dict(self.open_loop),
             "optics": list(self.optics),
+            "further_modes": {name: dict(modes) for name, modes in self.further_modes.items()},
         }
 
 
@@ -146,7 +152,14 @@ def diagnose(
     """
     nominal = nominal_device(recordings, device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
-    return build_diagnosis(select_terms(runs, nominal, catalogue(), progress))
+    extended = with_driven_modes(runs, nominal)
+    diagnosis = build_diagnosis(select_terms(runs, extended, catalogue(), progress))
+    if extended is nominal:
+        return diagnosis
+    nominal_loops = {name: loop.to_json() for name, loop in open_loop(runs, nominal).items()}
+    loops = {name: {**both, "nominal": nominal_loops[name]} for name, both in diagnosis.open_loop.items()}
+    modes = describe_modes(runs, nominal, extended)
+    return replace(diagnosis, verdict="mismatch", open_loop=loops, further_modes=modes)
 
 
 def nominal_device(recordings: Sequence[Recording], device: Device | None) -> Device:
@@ -178,7 +191,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
         unexplained,
         improvement.device,
         result,
-        _nominal(result.final),
+        {f"{axis}.{name}": {"pull": pull} for pull, axis, name in _pulls(result.final)},
         find_remainder(result),
         improvement.to_json(),
     )
@@ -206,6 +219,11 @@ def _finding(result: SelectionResult, step: SelectionStep) -> Finding:
         # a rival that fits as well with more parameters is improbable, but the data do not exclude it
         if name != effect and (weight / total > 1e-4 or name in fits_as_well)
     )
+    advice = _advice(result, step, distance)
+    if may_be_gain_drift(result.likelihood.runs, result.final.model.device, candidate) and "gain-drift" not in {
+        rival.effect for rival in rivals
+    }:
+        rivals, advice = (*rivals, Rival("gain-drift", 0.0)), "; ".join(filter(None, (advice, GAIN_DRIFT_ADVICE)))
     return Finding(
         axis=candidate.axis,
         stage=candidate.term.stage,
@@ -218,7 +236,7 @@ def _finding(result: SelectionResult, step: SelectionStep) -> Finding:
         heldout={"metric": METRIC, "before": step.before.validation_chi2, "after": result.final.validation_chi2},
         channel=candidate.channel,
         source=candidate.term.source,
-        advice=_advice(result, step, distance),
+        advice=advice,
         curve=None if has_law else correction_curve(step.after),
     )
 
@@ -334,7 +352,3 @@ def _prior_tension_finding(fit: Fit) -> Finding | None:
         source="pull on a prior",
         curve={"x": "nominal value", "y": "pull / tolerance", "points": [[n, p] for p, _, n in pulls]},
     )
-
-
-def _nominal(fit: Fit) -> dict[str, Any]:
-    return {f"{axis}.{name}": {"pull": size} for size, axis, name in _pulls(fit)}

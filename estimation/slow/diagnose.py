@@ -10,6 +10,7 @@ import numpy as np
 
 from estimation.diagnosis.data import MIN_SAMPLES_PER_PERIOD
 from estimation.diagnosis.diagnose import Diagnosis, Finding, ParameterEstimate, Rival
+from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE
 from estimation.diagnosis.open_loop import OpenLoop, is_worse
 from estimation.lock_in_channels import lock_in_amplitude
 from estimation.slow.decay import LAWS, Law
@@ -50,8 +51,6 @@ MIN_RIVAL_PROBABILITY = 1e-4
 """Probability below which a law is not listed as a rival."""
 
 METRIC = "error of the amplitude on samples not used in the fit, as a fraction of the amplitude (rms)"
-
-GAIN_DRIFT = "in a free decay, amplitude is a function of time: a gain that drifts may fit; record another amplitude"
 
 
 class SlowDecay(NamedTuple):
@@ -207,7 +206,7 @@ def _finding(
     advice = None
     if fit_curve(decays, common=True).score < best.score + MIN_SCORE_GAIN or len(decays.parts) == 1:
         rivals.append(Rival("gain-drift", 0.0))
-        advice = f"gain-drift: {GAIN_DRIFT}"
+        advice = GAIN_DRIFT_ADVICE
     return Finding(
         axis=axis.name,
         stage="mechanics",

@@ -12,6 +12,7 @@ from estimation.slow.response import AMPLITUDE_LAWS, FEEDTHROUGH, SECOND_MODE, R
 from estimation.slow.response_selection import fit_subsets, prediction_error, select_effects, with_common_modes
 from scanner.device import Axis, Device
 from scanner.terms import catalogue
+from scanner.terms.driven_modes import EFFECT as DRIVEN_MODES
 
 MAX_CONSISTENT_ERROR = 0.05
 """Error on held-out tones, as a fraction of the response, up to which a fit may be called consistent."""
@@ -27,8 +28,8 @@ SECOND_MODE_ADVICE = "cross-axis-coupling: the second mode may be that of the ot
 def diagnose_responses(responses: Sequence[Response], device: Device) -> Diagnosis:
     """Diagnose the frequency responses of one device, one an axis.
 
-    The gain and the phase of the drive are fitted. The device takes resonance and damping, and laws of amplitude where
-    the response is in rad; a second mode is reported, not written, because its direct drive has no term.
+    The gain and the phase of the drive are fitted. The device takes resonance and damping, laws of amplitude where the
+    response is in rad, and, if it states a linear drive, a second mode as ``driven-modes``, relative to the first one.
     """
     tables = [fit_subsets(response) for response in responses]
     selected = [select_effects(response, table) for response, table in zip(responses, tables, strict=True)]
@@ -48,7 +49,7 @@ def diagnose_responses(responses: Sequence[Response], device: Device) -> Diagnos
         if found and share > MIN_REMAINDER:
             remainders.append({"share": share, "stage": "mechanics", "channel": channel})
         improved, improved_error = _with_fit(device, response, best, found), best_error
-        if SECOND_MODE in best.effects:
+        if SECOND_MODE in best.effects and DRIVEN_MODES not in improved.axes[response.name].terms:
             first_mode = (float(best.modes[0, 0]), float(best.modes[0, 1]))
             improved_error = prediction_error(response, fit_response(response, (), first_mode))
         if improved_error.error > nominal_error.error:
@@ -154,6 +155,8 @@ def _with_fit(device: Device, response: Response, fit: ResponseFit, findings: Se
     J, rate, quality = axis.mechanics.J, 2.0 * np.pi * float(fit.modes[0, 0]), float(fit.modes[0, 1])
     mechanics = replace(axis.mechanics, k=J * rate**2, b=J * rate / quality)
     device = replace(device, axes={**device.axes, response.name: replace(axis, mechanics=mechanics)})
+    if SECOND_MODE in fit.effects and axis.drive is not None and axis.drive.torque_per_volt is not None:
+        device = device.with_terms({response.name: {DRIVEN_MODES: _second_mode(fit, axis.drive.torque_per_volt / J)}})
     if not response.in_rad:
         return device
     terms = {}
@@ -163,3 +166,17 @@ def _with_fit(device: Device, response: Response, fit: ResponseFit, findings: Se
             if finding.effect == "coulomb-friction":  # the rate at which friction turns over is far below the motion's
                 terms[finding.effect]["omega_s"] = 1e-3 * response.largest * rate
     return device.with_terms({response.name: terms}) if terms else device
+
+
+def _second_mode(fit: ResponseFit, first_gain: float) -> dict[str, list[float]]:
+    """The second mode as the table of ``driven-modes``.
+
+    The residues of both modes contain the same unknown gain and phase of drive and lock-in amplifier, so that their
+    ratio does not.
+
+    Args:
+        first_gain: acceleration of the first mode by voltage [rad/s^2 / V].
+    """
+    gain = complex(fit.residues[1] / fit.residues[0]) * first_gain
+    frequency, quality = map(float, fit.modes[1])
+    return {"frequency": [frequency], "quality": [quality], "gain": [gain.real], "gain_rate": [gain.imag]}

@@ -109,6 +109,7 @@ class ResponseFit:
     Attributes:
         effects: beside the first mode.
         modes: frequency [Hz] and quality factor of every mode, that of the largest peak first, shape (modes, 2).
+        residues: R of every mode [unit of the response times (rad/s)^2], shape (modes,).
         feedthrough: a constant of the response, 0 where it is not fitted.
         laws: by effect its coefficient c with its standard deviation, for amplitudes relative to the largest.
         mode_sd: standard deviations of ``modes``.
@@ -118,6 +119,7 @@ class ResponseFit:
 
     effects: tuple[str, ...]
     modes: Array
+    residues: Complex
     feedthrough: complex
     laws: Mapping[str, tuple[float, float]]
     mode_sd: Array
@@ -277,7 +279,12 @@ def _fit(
     for i in range(values.shape[1]):
         order = np.argsort(-np.abs(heights[: model.modes, i]))
         feedthrough = complex(heights[-1, i]) if FEEDTHROUGH in effects else 0j
-        fits.append(ResponseFit(effects, modes[order], feedthrough, laws, mode_sd[order], score, predicted[:, i]))
+        residues = heights[: model.modes, i] * (2.0 * np.pi * modes[:, 0]) ** 2 / modes[:, 1]
+        fits.append(
+            ResponseFit(
+                effects, modes[order], residues[order], feedthrough, laws, mode_sd[order], score, predicted[:, i]
+            )
+        )
     return score, fits
 
 

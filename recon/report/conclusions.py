@@ -82,7 +82,15 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
             "The recordings agree with the nominal device within their noise and the tolerances of its values; "
             "no correction is needed."
         )
-    if not findings:
+    modes = "".join(
+        f" The drive also excites further modes of {name} at "
+        f"{', '.join(f'{frequency:.3g}' for frequency in sorted(of['frequency']))} Hz "
+        f"({of['share']:.0%} of the nominal misfit), which device.toml states."
+        for name, of in content.get("further_modes", {}).items()
+    )
+    if modes and not findings:
+        text = "The nominal device lacks no effect beside its own mode."
+    elif not findings:
         text = "The recordings contradict the nominal device, but no single effect explains the difference."
     else:
         text = "The nominal device lacks " + "; and ".join(_describe_finding(finding) for finding in findings) + "."
@@ -91,7 +99,8 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
             f" Predicted from the drive alone, the nominal motion is wrong by {blur_px[0]:.2g} px rms in a picture of "
             f"400 pixels, the corrected one by {blur_px[1]:.1g} px."
         )
-    if findings:
+    text += modes
+    if findings or modes:
         text += " Use the corrected device.toml in place of the nominal one."
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}."

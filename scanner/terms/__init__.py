@@ -50,8 +50,8 @@ def registered() -> tuple[Path, ...]:
     return tuple(_REGISTERED)
 
 
-NOT_IN_CATALOGUE = ("term", "measured_law")
-"""Modules here that hold no effect: the base class, and the law without a name that a diagnosis writes."""
+NOT_IN_CATALOGUE = ("term", "measured_law", "driven_modes")
+"""Modules here that hold no effect of the search: the base class, and what only a device file states."""
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ from recon.io.convert import convert
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis, stated_terms
+from scanner.integrator.nodes import to_nodes
 from scanner.recording import Recording
-from scanner.stages import Mechanics, Position
+from scanner.stages import Drive, Mechanics, Position
 
 F0, Q = 800.0, 300.0
 W0 = 2 * np.pi * F0
@@ -63,6 +66,35 @@ def test_two_modes_are_found_with_their_frequencies() -> None:
     assert "drive each axis alone" in str(found.findings[0].advice)
 
 
+def played(device: Device, tone: float) -> complex:
+    """Steady response of a device's sense signal to a tone of 1 V."""
+    rate, duration = 64.0 * F0, 1.5
+    time = np.arange(int(rate * duration)) / rate
+    halves = np.cos(2 * np.pi * tone * np.arange(2 * time.size - 1) / (2 * rate))
+    axis = device.axes["x"]
+    motion = simulate_axis(axis, stated_terms(axis), DriveInput(to_nodes(halves), 1 / rate), (0.0, 0.0))
+    assert axis.readout is not None
+    late = time > 1.0
+    window = np.hanning(int(late.sum()))
+    tone_wave = np.exp(-2j * np.pi * tone * time)
+    return complex(2 * np.sum(window * tone_wave[late] * sense_signal(axis.readout, [motion])[late]) / window.sum())
+
+
+def test_a_device_with_a_linear_drive_takes_the_second_mode_relative_to_the_first() -> None:
+    response = mode(F0, Q, 0.1) + mode(801.5, 400.0, 0.03j)
+    made = recording(response * np.exp(0.7j))
+    driven = {"x": replace(AXIS, drive=Drive("linear", 5e3))}
+    found = diagnose_with_optics([made], Device("lever", driven))
+    terms = found.device.axes["x"].terms["driven-modes"]
+    assert terms["frequency"] == [pytest.approx(801.5, abs=0.05)]
+    assert Device.from_toml(found.device.to_toml()).axes["x"].terms == found.device.axes["x"].terms
+    tones = [4, 12, 15, 18]
+    ratio = np.array([played(found.device, FREQUENCY[i]) for i in tones]) / response[tones]
+    assert ratio / ratio[0] == pytest.approx(np.ones(4), abs=0.03)
+    loop = found.open_loop["amplitude_x"]
+    assert loop["improved"]["fraction"] < 0.02 < 0.1 < loop["nominal"]["fraction"]
+
+
 @pytest.mark.parametrize("k3", [1e7, -1e7])
 def test_a_cubic_spring_is_found_with_its_size(k3: float) -> None:
     amplitude = np.full(FREQUENCY.size, 1e-3)
@@ -102,8 +134,11 @@ def test_the_fibre_scanner_has_two_modes(measured_data: Path) -> None:
         channels[f"amplitude_{axis}"] = {"variable": parts, "unit": "V", **lock_in}
         channels[f"phase_{axis}"] = {"variable": parts, "unit": "rad", **lock_in}
     w = 2 * np.pi * 805.0
-    mechanics = {"mechanics": {"J": 1.0, "b": w / 300.0, "k": w**2}}
-    with convert(source, {"channels": channels, "device": {"x": mechanics, "y": mechanics}}) as made:
+    axis_table = {
+        "mechanics": {"J": 1.0, "b": w / 300.0, "k": w**2},
+        "drive": {"kind": "linear", "torque_per_volt": 4e5},
+    }
+    with convert(source, {"channels": channels, "device": {"x": axis_table, "y": axis_table}}) as made:
         assert made["amplitude_x"].read()[0] == pytest.approx(np.hypot(0.12990, 0.06241))
         found = diagnose_with_optics([made])
     seconds = [finding for finding in found.findings if finding.effect == "second-mode"]
@@ -112,3 +147,7 @@ def test_the_fibre_scanner_has_two_modes(measured_data: Path) -> None:
         values = {each.name: each.value for each in finding.parameters}
         assert 0.7 < abs(values["f1"] - values["f2"]) < 2.2
         assert finding.rivals[0].effect == "cross-axis-coupling"
+        stated = found.device.axes[finding.axis].terms["driven-modes"]
+        assert stated["frequency"] == [values["f2"]]
+        loop = found.open_loop[f"amplitude_{finding.axis}"]
+        assert loop["improved"]["rmse"] < 0.5 * loop["nominal"]["rmse"]

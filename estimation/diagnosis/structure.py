@@ -1,0 +1,275 @@
+"""Further modes of the structure in an acceleration signal, which the drive excites beside the mirror's own mode.
+
+An accelerometer weighs a mode with the square of its frequency, so it shows every mode in the band of the drive, and
+all modes below the band as a part of the drive itself. Their sum is linear and is fitted before the selection: no
+single effect of the catalogue is several modes, and effects of the mirror's own mode would only be seen beside them.
+
+Source: Ewins, Modal Testing, Research Studies Press (2000), section 4.3 (modes and residual terms).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.diagnosis.data import Output, Run, sense_channel
+from estimation.diagnosis.open_loop import is_worse, open_loop
+from scanner.arrays import Array
+from scanner.device import Axis, Device
+from scanner.integrator.nodes import nodes_to_samples
+from scanner.stages import Acceleration
+from scanner.terms.driven_modes import EFFECT, mode_response
+
+MIN_FURTHER_MODES = 2
+"""Further modes from which they are stated together. One is left to ``second-mode``, and a direct part of the drive to
+``feedthrough``."""
+
+MAX_FURTHER_MODES = 8
+"""Bound on the search. A band with more modes has a residual that the diagnosis then reports."""
+
+MIN_GAIN = 0.05
+"""Share of the remaining power in the band that a mode has to take. Less is what a nonlinear mode leaves."""
+
+MAX_RESIDUAL_RATIO = 0.3
+"""Residual over signal in the band, as standard deviations, up to which linear modes describe a structure."""
+
+DRIVEN_POWER = 0.01
+"""Power of the drive relative to its median in the driven band above which a frequency belongs to that band."""
+
+MIN_BAND_OCTAVES = 1.0
+"""Width of the drive's band that further modes need to be told from a single one."""
+
+OWN_WIDTHS = 2.0
+"""Distance of a further mode from the mirror's own one in half-power widths of that. A nonlinear mode seems split."""
+
+QUALITIES = (15.0, 50.0, 150.0)
+"""Quality factors with which the band is searched for a mode."""
+
+GRID = 60
+"""Frequencies at which it is searched."""
+
+MAX_QUALITY = 1e3
+"""Largest quality factor of a further mode. A larger one is a line, not a mode."""
+
+FIT_STEPS = 6
+"""Steps of every fit of all modes; more change the misfit by less than a thousandth."""
+
+CACHE_SIZE = 400
+"""Responses that are kept. A Jacobian changes one mode at a time and needs those of the others again."""
+
+
+@dataclass(frozen=True)
+class _Band:
+    """One channel in the band of its drive.
+
+    Attributes:
+        output: the channel.
+        voltage: of the drive at the integration grid, shape (n,) [V].
+        step: of the grid [s].
+        bins: of the Hann-windowed Fourier transform of the channel.
+        data: the channel in them, shape (bins,).
+        low, high: ends of the band [Hz].
+    """
+
+    output: Output
+    voltage: Array
+    step: float
+    bins: NDArray[np.intp]
+    data: Array
+    low: float
+    high: float
+
+    def transform(self, signal: Array) -> Array:
+        """A signal on the integration grid, in the band."""
+        return _transform(self.output.sampled(signal))[self.bins]
+
+    def driven(self, frequency: float, quality: float) -> Array:
+        """Acceleration of a mode of unit gain, and of one driven by the voltage's rate, shape (bins, 2)."""
+        response = mode_response(self.voltage, frequency, quality, self.step)
+        return np.array([self.transform(response[2]), self.transform(response[3] / (2.0 * np.pi * frequency))]).T
+
+    def decay(self, frequency: float, quality: float) -> Array:
+        """Free decay of a mode in two phases, shape (bins, 2)."""
+        time = 2.0 * np.pi * frequency * self.step * np.arange(self.voltage.size)
+        decay = np.exp((-0.5 / quality + 1j * np.sqrt(max(1.0 - 0.25 / quality**2, 0.0))) * time)
+        return np.array([self.transform(decay.real), self.transform(decay.imag)]).T
+
+
+def _transform(values: Array) -> Array:
+    return np.asarray(np.fft.rfft(np.hanning(values.size) * (values - values.mean())))
+
+
+def with_driven_modes(runs: Sequence[Run], device: Device) -> Device:
+    """The device with the further modes that its acceleration signals show, as ``[x.terms.driven-modes]``.
+
+    It is the same one if there are none, or if it would predict worse with them.
+    """
+    for name, axis in device.axes.items():
+        if _may_show_modes(axis) and (table := find_modes(runs, axis)) is not None:
+            extended = device.with_terms({name: {EFFECT: table}})
+            if not is_worse(open_loop(runs, device), open_loop(runs, extended)):
+                device = extended
+    return device
+
+
+def describe_modes(runs: Sequence[Run], nominal: Device, device: Device) -> dict[str, dict[str, Any]]:
+    """Frequencies, quality factors and share of the further modes that ``device`` states beyond ``nominal``, by axis.
+
+    The share is the fraction of the nominal device's misfit that they take, open loop, in the axis's sense signal.
+    """
+    described = {}
+    for name, axis in device.axes.items():
+        if EFFECT in axis.terms and EFFECT not in nominal.axes[name].terms:
+            before, after = (open_loop(runs, each)[sense_channel(nominal, name)].error for each in (nominal, device))
+            table, share = axis.terms[EFFECT], float(max(0.0, 1.0 - (after / before) ** 2))
+            described[name] = {"frequency": table["frequency"], "quality": table["quality"], "share": share}
+    return described
+
+
+def _may_show_modes(axis: Axis) -> bool:
+    linear = axis.drive is not None and axis.drive.kind == "linear" and axis.mechanics is not None
+    return linear and isinstance(axis.readout, Acceleration) and EFFECT not in axis.terms
+
+
+def find_modes(runs: Sequence[Run], axis: Axis) -> dict[str, float | list[float]] | None:
+    """Further modes of one axis as the table of their term, None where the recordings show fewer than two.
+
+    Modes are added to the mirror's own one where they take the most of the remaining power, and all are then fitted
+    together, until none takes ``MIN_GAIN``.
+    """
+    bands = [band for run in runs if (band := _band(run, axis)) is not None]
+    if len(bands) < len(runs):
+        return None
+    columns = _Columns(bands)
+    modes, residual = _fit(columns, np.array([[axis.resonance, axis.require_mechanics().quality]]))
+    while len(modes) <= MAX_FURTHER_MODES:
+        more, left = _fit(columns, np.vstack([modes, _next_mode(columns, modes, residual)]))
+        if _power(left) > (1.0 - MIN_GAIN) * _power(residual) or not _is_further(more):
+            break
+        modes, residual = more, left
+    if len(modes) - 1 < MIN_FURTHER_MODES or _power(residual) > MAX_RESIDUAL_RATIO**2 * columns.power:
+        return None
+    heights, readout = _heights(columns, modes)[0], axis.readout
+    assert isinstance(readout, Acceleration)
+    return {
+        "frequency": modes[1:, 0].tolist(),
+        "quality": modes[1:, 1].tolist(),
+        "gain": (heights[2:-1:2] / readout.gain).tolist(),
+        "gain_rate": (heights[3:-1:2] / readout.gain).tolist(),
+        "direct": float(heights[-1]),
+    }
+
+
+def _is_further(modes: Array) -> bool:
+    """Whether no mode lies within the width of the mirror's own one, which is the first."""
+    (own, quality), others = modes[0], modes[1:, 0]
+    return bool(np.all(np.abs(others - own) > OWN_WIDTHS * own / quality))
+
+
+def _band(run: Run, axis: Axis) -> _Band | None:
+    """The sense signal of an axis in the band of its drive, None where the drive is no broad band."""
+    outputs = [output for output in run.outputs if output.kind == "sense" and axis.name in output.axes]
+    if not outputs or axis.name not in run.inputs:
+        return None
+    (output,), inputs = outputs, run.inputs[axis.name]
+    voltage = nodes_to_samples(inputs.voltage)
+    power = np.abs(_transform(output.sampled(voltage))) ** 2
+    frequency = np.arange(power.size) / (output.data.size * output.step)
+    smooth = np.convolve(power, np.ones(9) / 9, "same")
+    total = np.cumsum(power) / power.sum()
+    middle = np.median(smooth[(total > 0.05) & (total < 0.95)]) if power.sum() else 0.0
+    driven = (smooth > DRIVEN_POWER * middle) & (frequency > 0.0) & (total > 0.005) & (total < 0.995)
+    if np.count_nonzero(driven) < 64:
+        return None
+    low, high = frequency[driven].min(), frequency[driven].max()
+    if np.log2(high / low) < MIN_BAND_OCTAVES or driven.sum() < 0.5 * ((frequency >= low) & (frequency <= high)).sum():
+        return None
+    bins = np.flatnonzero(driven)
+    return _Band(output, voltage, inputs.step, bins, _transform(output.data)[bins], float(low), float(high))
+
+
+class _Columns:
+    """Responses of modes in all bands, real and imaginary parts below each other."""
+
+    def __init__(self, bands: Sequence[_Band]):
+        self.bands = tuple(bands)
+        data = np.concatenate([band.data for band in bands])
+        self.data = _real(data)
+        self.power = float(self.data @ self.data)
+        self._drive = np.concatenate([band.transform(band.voltage) for band in bands])[:, None]
+        self._known: dict[tuple[float, float], Array] = {}
+
+    def driven(self, frequency: float, quality: float) -> Array:
+        """Of one mode, shape (rows, 2)."""
+        return _real(np.concatenate([band.driven(frequency, quality) for band in self.bands]))
+
+    def table(self, modes: Array) -> Array:
+        """Of all modes, two a mode, then of the drive, then their decays in each recording, shape (rows, columns)."""
+        decays = [self._mode(*map(float, mode)) for mode in modes]
+        return np.hstack([*(each[:, :2] for each in decays), _real(self._drive), *(each[:, 2:] for each in decays)])
+
+    def _mode(self, frequency: float, quality: float) -> Array:
+        key = (frequency, quality)
+        if key not in self._known:
+            if len(self._known) >= CACHE_SIZE:
+                self._known.clear()
+            size = [band.bins.size for band in self.bands]
+            decays = np.zeros((sum(size), 2 * len(size)), complex)
+            for i, (band, last) in enumerate(zip(self.bands, np.cumsum(size), strict=True)):
+                decays[last - size[i] : last, 2 * i : 2 * i + 2] = band.decay(frequency, quality)
+            self._known[key] = np.hstack([self.driven(frequency, quality), _real(decays)])
+        return self._known[key]
+
+
+def _real(values: Array) -> Array:
+    return np.concatenate([values.real, values.imag])
+
+
+def _heights(columns: _Columns, modes: Array) -> tuple[Array, Array]:
+    """Heights of the modes' responses and of the drive by linear least squares, and the residual."""
+    table = columns.table(modes)
+    size = np.linalg.norm(table, axis=0)
+    heights = np.linalg.lstsq(table / size, columns.data, rcond=None)[0] / size
+    return heights[: 2 * len(modes) + 1], columns.data - table @ heights
+
+
+def _power(residual: Array) -> float:
+    return float(residual @ residual)
+
+
+def _fit(columns: _Columns, modes: Array) -> tuple[Array, Array]:
+    """Modes of the least misfit from a start, shape (modes, 2), and the residual."""
+    from scipy.optimize import least_squares
+
+    def residual(x: Array) -> Array:
+        return _heights(columns, np.exp(x.reshape(-1, 2)))[1]
+
+    start = np.log(modes).ravel()
+    reach = np.tile([0.2, 3.0], len(modes))
+    high = start + reach
+    high[1::2] = np.maximum(np.log(MAX_QUALITY), start[1::2] + 1e-6)
+    best = least_squares(
+        residual, start, bounds=(start - reach, high), x_scale=0.1 * reach, diff_step=1e-4, max_nfev=FIT_STEPS
+    )
+    return np.exp(best.x.reshape(-1, 2)), best.fun
+
+
+def _next_mode(columns: _Columns, modes: Array, residual: Array) -> Array:
+    """The mode that takes the most of the residual beside the others, over a grid in the band; shape (2,)."""
+    basis = np.linalg.qr(columns.table(modes))[0]
+    low, high = columns.bands[0].low, columns.bands[0].high
+    best, gain = modes[0], -1.0
+    for frequency in np.geomspace(low, 1.2 * high, GRID):
+        trials = [
+            (frequency, quality) for quality in QUALITIES if _is_further(np.vstack([modes[:1], [frequency, 1.0]]))
+        ]
+        for trial in trials:
+            new = columns.driven(*trial)
+            taken = np.linalg.qr(new - basis @ (basis.T @ new))[0].T @ residual
+            if taken @ taken > gain:
+                best, gain = np.array(trial), float(taken @ taken)
+    return best

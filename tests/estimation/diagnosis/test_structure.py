@@ -1,0 +1,116 @@
+"""Further modes in an acceleration signal: found where there are several, never in place of an effect of one mode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from estimation.diagnosis import diagnose as diagnosing
+from estimation.diagnosis.data import Run, prepare_run
+from estimation.diagnosis.structure import find_modes, with_driven_modes
+from recon.report.conclusions import conclude_diagnosis
+from scanner.arrays import Array
+from scanner.device import Axis, Device
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis, stated_terms
+from scanner.integrator.nodes import to_nodes
+from scanner.recording import Recording
+from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position
+from scanner.terms import catalogue
+
+RATE, DURATION, RESONANCE = 400.0, 60.0, 2 * np.pi * 7.3
+MODES: dict[str, Any] = {
+    "frequency": [3.4, 5.1, 9.0], "quality": [25.0, 40.0, 45.0], "gain": [0.006, 0.004, 0.003],
+    "gain_rate": [0.0, 0.0, 0.001], "direct": 0.1,
+}  # fmt: skip
+
+
+def axis(readout: MotionSensor, quality: float = 60.0) -> Axis:
+    mechanics = Mechanics(1.0, RESONANCE / quality, RESONANCE**2)
+    tolerance = {"J": 1e-9, "gain": 1e-9, "k": 0.05, "b": 0.5, "torque_per_volt": 0.5}
+    return Axis(mechanics, drive=Drive("linear", 0.015), readout=readout, tolerance=tolerance, name="x")
+
+
+def multisine(rng: np.random.Generator) -> Array:
+    """Tones of 2 to 15 Hz with random phases, of 1 V rms, at the samples and between them."""
+    time = np.arange(2 * int(DURATION * RATE) + 1) / (2 * RATE)
+    tones = np.arange(2.0, 15.0, 1 / DURATION)
+    waves = sum(
+        np.cos(2 * np.pi * f * time + phase) for f, phase in zip(tones, rng.uniform(0, 7, tones.size), strict=True)
+    )
+    return np.asarray(waves / np.std(waves))
+
+
+def prepared(
+    terms: dict[str, dict[str, Any]], readout: MotionSensor, seed: int = 5
+) -> tuple[list[Run], Axis, Recording]:
+    """A simulated recording of a device with ``terms`` that the nominal axis omits."""
+    rng = np.random.default_rng(seed)
+    halves, nominal = multisine(rng), axis(readout)
+    true = Device("wing", {"x": nominal}).with_terms({"x": terms}).axes["x"]
+    motion = simulate_axis(true, stated_terms(true), DriveInput(to_nodes(halves), 1 / RATE), (0.0, 0.0))
+    sensed = sense_signal(readout, [motion]) + readout.noise_sd * rng.standard_normal(motion.angle.size)
+    channels = {"drive_x": (halves[::2], "V", RATE, 0.0), "sense_x": (sensed, "V", RATE, 0.0)}
+    recording = Recording.from_arrays(channels, Device("wing", {"x": nominal}))
+    return [prepare_run(recording, recording.device)], nominal, recording  # type: ignore[arg-type]
+
+
+def test_the_further_modes_of_a_structure_are_found_beside_a_softening_one() -> None:
+    softening = {"k3": -0.15 * RESONANCE**2 / 1.2e-3**2}
+    runs, nominal, _ = prepared({"driven-modes": MODES, "cubic-stiffness": softening}, Acceleration(1.0, 0.02))
+    found = find_modes(runs, nominal)
+    assert found is not None
+    for frequency, gain in zip(MODES["frequency"], MODES["gain"], strict=True):
+        nearest = int(np.argmin(np.abs(np.array(found["frequency"]) - frequency)))
+        assert found["frequency"][nearest] == pytest.approx(frequency, rel=0.01)  # type: ignore[index]
+        assert found["gain"][nearest] == pytest.approx(gain, rel=0.25)  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        {},
+        {"cubic-stiffness": {"k3": -0.15 * RESONANCE**2 / 1.2e-3**2}},
+        {"coulomb-friction": {"tau_c": 4e-3, "omega_s": 1e-4}},
+        {"feedthrough": {"g": 0.05, "h": 0.0, "omega_d": RESONANCE}},
+        {"second-mode": {"c": 0.02, "f2": 9.0, "Q2": 40.0}},
+    ],
+)
+def test_one_mode_and_effects_of_the_catalogue_are_no_further_modes(terms: dict[str, dict[str, float]]) -> None:
+    runs, nominal, _ = prepared(terms, Acceleration(1.0, 0.02))
+    assert find_modes(runs, nominal) is None
+
+
+def test_only_acceleration_signals_are_searched_for_modes() -> None:
+    runs, _, recording = prepared({"driven-modes": MODES}, Position(300.0, 1e-4))
+    device = recording.device
+    assert device is not None
+    assert with_driven_modes(runs, device) is device
+
+
+def test_a_diagnosis_states_further_modes_and_the_law_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = {effect: catalogue()[effect] for effect in ("cubic-stiffness", "cubic-damping", "feedthrough")}
+    monkeypatch.setattr(diagnosing, "catalogue", lambda: known)
+    softening = {"k3": -0.15 * RESONANCE**2 / 1.2e-3**2}
+    *_, recording = prepared({"driven-modes": MODES, "cubic-stiffness": softening}, Acceleration(1.0, 0.02), seed=6)
+    diagnosis = diagnosing.diagnose([recording])
+    assert [finding.effect for finding in diagnosis.findings][:1] == ["cubic-stiffness"]
+    assert diagnosis.findings[0].parameters[0].value == pytest.approx(softening["k3"], rel=0.1)
+    modes = diagnosis.further_modes["x"]
+    assert modes["share"] > 0.5
+    assert {round(f, 1) for f in modes["frequency"]} >= {3.4, 5.1, 9.0}
+    errors = diagnosis.open_loop["sense_x"]
+    assert errors["improved"]["rmse"] < 0.2 * errors["nominal"]["rmse"]
+    assert "further modes of x at 3.4" in conclude_diagnosis(diagnosis.to_json())
+
+
+def test_the_aircraft_has_six_further_modes(measured_data: Path) -> None:
+    from benchmarks.measured import ROWS
+
+    diagnosed, _, device = ROWS["f16"](measured_data)
+    found = find_modes([prepare_run(part.slice(20.0, 60.0), device) for part in diagnosed], device.axes["x"])
+    assert found is not None
+    assert {3.4, 5.1, 6.4, 9.0} <= {round(f, 1) for f in found["frequency"]}  # type: ignore[union-attr]
+    assert found["direct"] == pytest.approx(0.011, abs=0.003)
