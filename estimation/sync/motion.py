@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimation.reference import absolute_reference
 from estimation.signals import phase_reference
+from estimation.sync.harmonics import MotionHarmonics, motion_harmonics
 from estimation.sync.numbering import NumberedEdges, number_edges
 from estimation.sync.smoother import SmoothedPhase, smooth_phase
 from scanner.arrays import Array
@@ -30,6 +31,13 @@ KNOT_PERIODS = 4.0
 
 SIGNIFICANT_SD = 6.0
 """Asymmetry in standard deviations from which it determines sign and amplitude; by chance once in 1e8."""
+
+HARMONICS_SD_BY_FIELD = 0.2
+"""Relative standard deviation of the harmonics where the amplitude is taken from the field: a mirror with combs that
+exceeds its field by 8 % has a third harmonic that is 13 % off."""
+
+CHUNK_SAMPLES = 1 << 18
+"""Samples whose angle is computed at a time: their harmonics take 25 MB."""
 
 MAX_BEYOND_PERIODS = 2.0
 """Periods before the first and after the last edge to which the angle is extrapolated."""
@@ -120,6 +128,23 @@ def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[Array, Array] 
     return amplitude, np.abs(amplitude / np.tan(found.asymmetry)) * found.asymmetry_sd
 
 
+def _without_harmonics(
+    edges: Edges, found: EdgePhase, amplitude: Array | None, harmonics: MotionHarmonics
+) -> tuple[EdgePhase, Array | None]:
+    """Phase and amplitude of the fundamental, from those of a sine through the same edges; no amplitude stays none."""
+    nominal = NOMINAL_PHASE[edges.event]
+    asymmetry = found.asymmetry if edges.event == "both-edges" else np.zeros(found.time.size)
+    places = [phase + side * asymmetry for phase, side in zip(nominal, (1.0, -1.0), strict=False)]
+    shift = harmonics.turn_shift if edges.event == "turn" else harmonics.edge_shift
+    late = np.mean([shift(place) for place in places], axis=0)
+    relative_sd = np.hypot(harmonics.relative_sd, HARMONICS_SD_BY_FIELD if amplitude is None else 0.0)
+    sd = np.hypot(found.phase_sd, relative_sd * late)
+    if amplitude is not None and edges.angle is not None:
+        place = asymmetry + late
+        amplitude = edges.angle / (np.sin(place) + harmonics.deviation(place))
+    return replace(found, phase=found.phase + late, phase_sd=sd), amplitude
+
+
 def axis_motion_from_edges(
     recording: Recording, device: Device, edges: Edges, clock: tuple[float, float, int]
 ) -> tuple[AxisMotion, list[str], dict[str, object]]:
@@ -148,6 +173,18 @@ def axis_motion_from_edges(
         notes.append(f"{edges.name}: the edges do not determine the amplitude; the motion is taken to fill the field")
     else:
         amplitude = measured[0]
+    step = max(1, round(KNOT_PERIODS * found.time.size * found.numbered.length / np.ptp(found.time)))
+    if f"drive_{name}" in recording and device.axis(name).drive is not None:
+        reference = phase_reference(recording, device, name)
+    else:
+        reference = absolute_reference(float(np.median(found.frequency)), *map(float, found.time[[0, -1]]))
+    knots = found.time[::step]
+    slow_phase = found.phase[::step] - reference.phase(knots)
+    harmonics = motion_harmonics(recording, device, name, reference, knots, slow_phase, amplitude[::step])
+    if harmonics is not None:
+        by_edges = None if measured is None else amplitude
+        found, by_edges = _without_harmonics(edges, found, by_edges, harmonics.at(knots, found.time))
+        amplitude = amplitude if by_edges is None else by_edges
     if edges.hysteresis:
         lag = np.arcsin(np.clip(edges.hysteresis / (amplitude * np.cos(found.asymmetry)), -1.0, 1.0))
     else:
@@ -156,15 +193,14 @@ def axis_motion_from_edges(
     spline = CubicHermiteSpline(found.time, phase, 2 * np.pi * found.frequency)
     rate, start, n = clock
     time = start + np.arange(n) / rate
-    angle = np.interp(time, found.time, amplitude) * np.sin(spline(time))
+    angle = np.empty(n)
+    for first in range(0, n, CHUNK_SAMPLES):
+        part = slice(first, first + CHUNK_SAMPLES)
+        u = spline(time[part])
+        relative = 0.0 if harmonics is None else harmonics.at(knots, time[part]).deviation(u)
+        angle[part] = np.interp(time[part], found.time, amplitude) * (np.sin(u) + relative)
     beyond = MAX_BEYOND_PERIODS / float(np.median(found.frequency))
     angle[(time < found.time[0] - beyond) | (time > found.time[-1] + beyond)] = np.nan
-    step = max(1, round(KNOT_PERIODS * found.time.size * found.numbered.length / np.ptp(found.time)))
-    if f"drive_{name}" in recording and device.axis(name).drive is not None:
-        reference = phase_reference(recording, device, name)
-    else:
-        reference = absolute_reference(float(np.median(found.frequency)), *map(float, found.time[[0, -1]]))
-    knots = found.time[::step]
     motion = AxisMotion(
         time=knots,
         phase=phase[::step] - reference.phase(knots),
