@@ -81,12 +81,17 @@ def axis_motion_from_filter(
     variance = _phase_variance(filtered.theta[i, track_sample], filtered.track[i], 2 * np.pi * f)
     block_of = np.minimum(track_sample // block, time.size - 1)
     count = np.maximum(np.bincount(block_of, minlength=time.size), 1)
+    by_state, by_angle = (
+        np.bincount(block_of, part, time.size) / count for part in (variance, filtered.track[i, :, 1])
+    )
+    # The phase of a block is that of the angles in it. Far below the resonance the filter hardly knows the velocity.
+    variance = np.minimum(by_state, by_angle / np.square(np.abs(phasors)))
     return AxisMotion(
         time=time,
         phase=phase,
         amplitude=np.abs(phasors),
         frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
-        phase_sd=np.sqrt(np.bincount(block_of, variance, time.size) / count),
+        phase_sd=np.sqrt(variance),
         angle=synthesize_angle(filtered.theta[i], channel, reference, time, phase, np.abs(phasors), clock),
         reference=reference.kind,
         sign=problem.start.axes[name].sign,

@@ -86,7 +86,7 @@ def search_lines(
 
     Returns:
         The result of the piece with the line, else of the first piece; None if the channel is too short or too slow to
-        determine a noise level, or constant.
+        determine a noise level, holds too few cycles of one of the bands, or is constant.
     """
     first: LineSearch | None = None
     lengths = _averaging_lengths(channel, bands)
@@ -105,8 +105,8 @@ def search_lines(
 def _search_piece(
     values: Array, rate: float, bands: Sequence[tuple[float, float]], driven: Sequence[float], false_alarm: float
 ) -> LineSearch | None:
-    """Search one piece of samples; None if it does not determine a noise level."""
-    in_bands, at_lines = _Search(), _Search()
+    """Search one piece of samples; None if it determines no noise level, or is too short for one of the bands."""
+    in_bands, at_lines, skipped = _Search(), _Search(), False
     if not np.ptp(values) > 0.0:
         return None
     for segments in SEGMENTS:
@@ -120,8 +120,10 @@ def _search_piece(
         frequency = np.arange(windowed.shape[1], dtype=np.float64) * (rate / length)
         for low, high in bands:
             around = _rows(frequency, low / SURROUNDING, high * SURROUNDING)
+            around = slice(around.start, min(max(around.stop, around.start + MIN_LEVEL_ORDINATES), frequency.size - 1))
             near, inside = frequency[around], slice(*np.searchsorted(frequency[around], (low, high)))
             if near.size < MIN_LEVEL_ORDINATES or inside.stop <= inside.start:
+                skipped |= segments == 1 and low < frequency[-1]
                 continue
             lines = np.array([line for line in driven if low <= line <= high])
             at = np.clip(np.searchsorted(near, lines), 0, near.size - 1)
@@ -138,8 +140,11 @@ def _search_piece(
     searches = [search for search in (in_bands, at_lines) if search.number]
     each = false_alarm / len(searches)
     strongest, line, equivalent = in_bands.steady
+    found = any(search.lowest * search.number < each for search in searches)
+    if skipped and not found:
+        return None
     return LineSearch(
-        found=any(search.lowest * search.number < each for search in searches),
+        found=found,
         frequency=line,
         ratio=strongest,
         needed=equivalent * ((each / in_bands.number) ** (-1.0 / equivalent) - 1.0),

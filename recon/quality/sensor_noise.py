@@ -10,7 +10,7 @@ from math import isclose
 
 from estimation.estimate import default_estimator
 from estimation.filters.baselines import find_position_signal
-from estimation.reference import dominant_frequency
+from estimation.reference import tone_frequency
 from estimation.signals import is_capacitive, sense_channels
 from recon.quality.drive_check import SAME_FREQUENCY
 from recon.quality.hum_check import describe_hum
@@ -129,7 +129,7 @@ def _drive_frequencies(recording: Recording, device: Device, name: str) -> list[
     for low in (0.0, 0.1 * axis.resonance) if axis.mechanics else (0.0,):
         with suppress(BadInput):
             check_signal(drive, gaps_ok=True)
-            frequency = dominant_frequency(drive, low) * ratio
+            frequency = tone_frequency(drive, low) * ratio
             if not any(isclose(frequency, other, rel_tol=SAME_FREQUENCY) for other in found):
                 found.append(frequency)
     return found

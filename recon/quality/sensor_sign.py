@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from estimation.filters.baselines import sign_from_edges
-from estimation.reference import dominant_frequency
+from estimation.reference import tone_frequency
 from scanner.channel import Channel, check_signal
 from scanner.device import AXES, Axis, Device
 from scanner.errors import BadInput
@@ -123,7 +123,7 @@ def _lead_of_torque(
     try:
         check_signal(channel, gaps_ok=True)
         check_signal(drive, gaps_ok=True)
-        frequency = dominant_frequency(drive)
+        frequency = tone_frequency(drive)
     except BadInput:
         return None
     phasors = _common_phasors(channel, drive, frequency)
@@ -158,7 +158,7 @@ def _sign_by_angle(recording: Recording, axis: Axis, name: str) -> int:
     try:
         check_signal(channel, gaps_ok=True)
         check_signal(angle, gaps_ok=True)
-        phasors = _common_phasors(channel, angle, dominant_frequency(angle))
+        phasors = _common_phasors(channel, angle, tone_frequency(angle))
     except BadInput:
         return 0
     if phasors is None or 0.5 * abs(phasors[0]) ** 2 <= MIN_DRIVEN_FRACTION * phasors[2]:

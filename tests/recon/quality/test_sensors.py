@@ -286,3 +286,15 @@ def test_far_from_the_resonance_the_device_predicts_the_sign(ratio: float, sign:
     notes = prepare(recording).unknown_entries
     assert len(notes) == (sign < 0.0)
     assert unconfirmed(recording) == []
+
+
+@pytest.mark.parametrize("cycles", [2, 3, 5])
+def test_a_slow_drive_of_few_cycles_is_not_refused(cycles: int) -> None:
+    """A stage at 0.5 Hz: the band of its motion holds fewer frequencies than a noise level needs."""
+    rate, frequency = 1000.0, 0.5
+    time = np.arange(round(cycles / frequency * rate)) / rate
+    drive = (10.0 * np.sin(2 * np.pi * frequency * time), "V", rate)
+    moved = (0.05 * np.sin(2 * np.pi * frequency * time) + noise(6, time.size) * 1e-2, "V", rate)
+    recording = scan(drive_x=drive, sense_x=moved)
+    assert check_sensor_noise(recording, DEVICE, "sensor") == []
+    assert check_sensor_noise(recording, DEVICE, "ukf") == []
