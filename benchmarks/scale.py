@@ -57,6 +57,9 @@ PICTURE_WIDTHS_PX = (100, 400, 1600)
 HALF_ANGLE_RAD = 0.18
 """Half the field of the pictures, that of the imaging scanner."""
 
+LIVE_PICTURES = (("mean", 400), ("mean", 256), ("kernel", 256))
+"""Kind and width of the live pictures."""
+
 LIVE_S, FRAME_S, WRITE_INTERVAL_S = 6.0, 0.1, 0.01
 """Lengths of the live recording and of a frame (the period of the scan), and interval between two writes [s]."""
 
@@ -209,25 +212,37 @@ def reconstruct_from_disk(folder: Path, seconds: float) -> Results:
 
 
 def measure_live(folder: Path) -> Results:
-    """Frames and latency while another process writes LIVE_S seconds at the rate of the recording."""
+    """Frames and latency while another process writes LIVE_S seconds at the rate of the recording, by LIVE_PICTURES.
+
+    The latency is counted from the writer's flush of a frame's last sample until its image.tif is in place.
+    ``cpu_per_frame`` is the processor time of the follower over the number of frames.
+    """
     from recon.follow import follow_recording
 
-    period_path, path = write_period(simulate_period(), folder), folder / "growing.h5"
+    period_path, results = write_period(simulate_period(), folder), Results()
     with Recording.open(period_path) as period:
         short = folder / "short.h5"
         repeat_period(period, PERIOD_SAMPLES).write(short)
-    follow_recording(short, folder / "warm", Options(), frame_time=FRAME_S / 2, quiet_time=0.1)  # compiles
-    writer = multiprocessing.get_context("spawn").Process(target=record_live, args=(period_path, path))
-    writer.start()
-    summary = follow_recording(path, folder / "out", Options(), frame_time=FRAME_S, quiet_time=30.0)
-    writer.join()
-    latency = summary.summary()["latency_s"]
-    counts = {"live.frames": summary.frames, "live.dropped": summary.dropped, "live.frame_s": summary.frame_s}
-    return counts | {f"live.latency_{key}_s": latency[key] for key in ("median", "max")}
+    for kind, width in LIVE_PICTURES:
+        options, path = Options(picture=kind, pixels=(width, width)), folder / f"growing-{kind}-{width}.h5"
+        follow_recording(short, folder / "warm", options, frame_time=FRAME_S / 2, quiet_time=0.1)  # compiles
+        writer = multiprocessing.get_context("spawn").Process(target=record_live, args=(period_path, path))
+        writer.start()
+        busy = time.process_time()
+        summary = follow_recording(path, folder / "out", options, frame_time=FRAME_S, quiet_time=30.0)
+        busy = time.process_time() - busy
+        writer.join()
+        flushed, end = np.load(path.with_suffix(".npy")).T
+        late = [shown - flushed[np.searchsorted(end, stop - 1e-9)] for stop, shown in summary.shown]
+        name = f"live.{kind}.{width}"
+        results |= {f"{name}.frames": summary.frames, f"{name}.dropped": summary.dropped}
+        results |= {f"{name}.latency_median_s": float(np.median(late)), f"{name}.latency_max_s": max(late)}
+        results |= {f"{name}.cpu_per_frame_s": busy / max(summary.frames, 1)}
+    return results
 
 
 def record_live(period_path: Path, path: Path) -> None:
-    """Write LIVE_S seconds of the scan (HDF5, SWMR) in real time."""
+    """Write LIVE_S seconds of the scan (HDF5, SWMR) in real time, and beside it when each part was flushed."""
     size = round(LIVE_S * SAMPLE_RATE_HZ)
     with Recording.open(period_path) as period, h5py.File(path, "w", libver="latest") as file:
         recording = repeat_period(period, size)
@@ -238,7 +253,7 @@ def record_live(period_path: Path, path: Path) -> None:
             dataset = group.create_dataset(channel.name, (0,), np.int16, maxshape=(None,), chunks=(1 << 16,))
             dataset.attrs.update({"unit": "V", "sample_rate": SAMPLE_RATE_HZ, "gain": channel.gain})
         file.swmr_mode = True
-        start, written = time.perf_counter(), 0
+        start, written, log = time.perf_counter(), 0, []
         while written < size:
             stop = min(round((time.perf_counter() - start) * SAMPLE_RATE_HZ), size)
             for channel in recording.channels.values():
@@ -246,7 +261,9 @@ def record_live(period_path: Path, path: Path) -> None:
                 group[channel.name][written:stop] = channel.stored(written, stop)
                 group[channel.name].flush()
             written = stop
+            log.append((time.monotonic(), stop / SAMPLE_RATE_HZ))
             time.sleep(WRITE_INTERVAL_S)
+    np.save(path.with_suffix(".npy"), np.array(log))
 
 
 def write_period(recording: Recording, folder: Path) -> Path:

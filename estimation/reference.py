@@ -81,18 +81,19 @@ def absolute_reference(frequency: float, start: float, end: float) -> PhaseRefer
     return PhaseReference("absolute", frequency, np.array([start, end]), np.zeros(2))
 
 
-def drive_reference(drive: Channel, kind: str, low: float = 0.0) -> PhaseReference:
+def drive_reference(drive: Channel, kind: str, low: float = 0.0, frequency: float | None = None) -> PhaseReference:
     """The reference from a recorded drive voltage; the phase is interpolated linearly through gaps (NaN).
 
     Args:
         drive: its channel.
         kind: ``"half-drive"`` for a parametric drive, ``"drive"`` for a linear one.
         low: lower bound of the drive's frequency [Hz]; lines below come from switching it on and off.
+        frequency: of the drive in an earlier segment [Hz], near which it is still; searched for where None.
 
     Raises:
         BadInput: the drive holds no oscillation.
     """
-    f = tone_frequency(drive, low)
+    f = frequency or tone_frequency(drive, low)
     block = slow_clock_block(f, drive.sample_rate, BLOCK_CYCLES, drive.size)
     if drive.size < 2 * block:
         raise BadInput(

@@ -114,7 +114,12 @@ def drive_channel(recording: Recording, axis: str, gaps_ok: bool = False) -> Cha
 
 
 def phase_reference(
-    recording: Recording, device: Device, axis: str, sense: Channel | None = None, even: bool = False
+    recording: Recording,
+    device: Device,
+    axis: str,
+    sense: Channel | None = None,
+    even: bool = False,
+    frequency: float | None = None,
 ) -> PhaseReference:
     """The phase reference of one axis (see ``estimation.reference``).
 
@@ -122,6 +127,7 @@ def phase_reference(
         sense: a signal of the motion, for its frequency where no drive was recorded, and to confirm that a linear drive
             moves the axis far below its resonance.
         even: the signal carries the motion's frequency twice (a capacitance).
+        frequency: of the reference in an earlier segment of the same scan [Hz]; searched for where None.
 
     Raises:
         BadInput: neither the drive nor the signal holds an oscillation.
@@ -132,11 +138,13 @@ def phase_reference(
         check_signal(drive, gaps_ok=True)
         low = 0.1 * stated.resonance if stated.mechanics else 0.0
         if stated.require_drive().kind == "linear":
-            quasistatic = low > 0.0 and all(
-                has_slow_oscillation(signal, 2.0 * low) for signal in (drive, sense) if signal is not None
+            quasistatic = (
+                low > 0.0
+                and frequency is None
+                and all(has_slow_oscillation(signal, 2.0 * low) for signal in (drive, sense) if signal is not None)
             )
-            return drive_reference(drive, "drive", 0.0 if quasistatic else low)
-        reference = drive_reference(drive, "half-drive", low)
+            return drive_reference(drive, "drive", 0.0 if quasistatic else low, frequency)
+        reference = drive_reference(drive, "half-drive", low, frequency and 2.0 * frequency)
         if stated.mechanics and not 0.75 < reference.frequency / stated.resonance < 1.33:
             raise BadInput(
                 f"oscillates at {2 * reference.frequency:.6g} Hz, and axis {axis} moves at half of that near its "

@@ -152,19 +152,25 @@ def _reconstruct_prepared(
     return result
 
 
-def estimate_motion(prepared: PreparedRecording, options: Options, before: Motion | None = None) -> EstimatedMotion:
+def estimate_motion(
+    prepared: PreparedRecording, options: Options, before: Motion | None = None, grid: Grid | None = None
+) -> EstimatedMotion:
     """Estimate the motion, and refine it by the phase errors that the picture shows where that helps.
 
     Args:
         prepared: the recording.
         options: estimator, flips and pixels.
-        before: motion of an earlier segment of the same scan, which shortens the tracker's tuning.
+        before: motion of an earlier segment of the same scan, from which the tracker continues.
+        grid: the pixels of that segment, against which its motion was checked.
 
     Raises:
         BadInput: no such estimator, or the recording lacks what it needs, or a half angle is stated in another unit.
     """
     recording, device = prepared.recording, prepared.device
     motion = estimate(recording, device, options.estimator, options.flips, before)
+    if grid is not None:
+        motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)
+        return EstimatedMotion(prepared, motion, grid, [], notes)
     grid, _ = _picture_grid(device, motion, options)
     check_units(grid, motion)
     motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)

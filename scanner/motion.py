@@ -180,12 +180,14 @@ class Motion:
         estimator: name of the estimator that made it.
         info: further facts worth reporting (tuned noise, log-likelihood, ...), JSON-serialisable.
         notes: what a reader has to know, a line each.
+        ends: from which the estimator continues in the next segment of the recording, by sense channel.
     """
 
     axes: Mapping[str, AxisMotion]
     estimator: str
     info: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    ends: Mapping[str, object] = field(default_factory=dict)
 
     def to_xarray(self) -> xarray.Dataset:
         """Return phase, amplitude, frequency and their clocks as an xarray dataset: ``phase_x`` over ``time_x``, ….

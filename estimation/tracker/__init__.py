@@ -19,13 +19,14 @@ Estimation
     ``process_noise`` tunes the drift's spectral densities; ``initial_state`` provides the first estimate and the signs;
     ``phase_measurements`` adds phases from the picture. ``block_tracking`` joins them to tracks.
 Result
-    ``track`` runs everything over a recording, section by section; ``to_motion`` and ``angle_synthesis`` make the angle
+    ``track`` runs everything over a recording, section by section, and ``continuation`` continues it in the next
+    segment; ``to_motion`` and ``angle_synthesis`` make the angle
     at any sample. ``drive_only`` is the same for an axis without a sense signal.
 Reference
     ``cramer_rao`` computes the bound of an ideal estimator.
 """
 
 from estimation.tracker.phase_measurements import PhaseMeasurement
-from estimation.tracker.track import track
+from estimation.tracker.track import track, track_end
 
-__all__ = ["PhaseMeasurement", "track"]
+__all__ = ["PhaseMeasurement", "track", "track_end"]

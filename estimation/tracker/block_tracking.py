@@ -39,7 +39,7 @@ class StateTrack:
         log_likelihood: of the projections, up to a constant.
         mean_nis: mean normalised innovation squared; 1 where model and noise are right.
         acquired: whether the motion of each axis was detected, shape (axes,).
-        next_prior: estimate before the block after the last one, if there is one.
+        next_prior: estimate before the block after the last one, if there is one; else before the last block.
     """
 
     states: Array
@@ -80,10 +80,10 @@ def track_blocks(
             history = run.history
             acquired[i] |= run.acquired
             totals[i] += run.log_likelihood, run.nis, run.measurements
-            if done < blocks:
-                x, P = history.predicted_states[size, :n], history.predicted_covariances[size, :n, :n]
-                floor = np.log([2.0 * MIN_AMPLITUDE_THETA0 * law.theta0 for law in observations.parameters])
-                priors[i] = StateEstimate(x.copy(), P.copy(), x[LOG_AMPLITUDE::AXIS_STATES][: floor.size] > floor)
+            following = size if done < blocks else size - 1
+            x, P = history.predicted_states[following, :n], history.predicted_covariances[following, :n, :n]
+            floor = np.log([2.0 * MIN_AMPLITUDE_THETA0 * law.theta0 for law in observations.parameters])
+            priors[i] = StateEstimate(x.copy(), P.copy(), x[LOG_AMPLITUDE::AXIS_STATES][: floor.size] > floor)
             if not causal:
                 rts_smoother.run_smoother(part.step, history)
             variances = np.diagonal(history.covariances[:size], axis1=1, axis2=2)[:, :n]

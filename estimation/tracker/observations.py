@@ -161,9 +161,16 @@ class BlockLayout:
 
 
 def lay_out_blocks(
-    recording: Recording, device: Device, sense: SenseChannel, references: Mapping[str, PhaseReference]
+    recording: Recording,
+    device: Device,
+    sense: SenseChannel,
+    references: Mapping[str, PhaseReference],
+    first: tuple[float, int] | None = None,
 ) -> BlockLayout:
     """Place the blocks of one sense channel and demodulate the drives of its axes in them.
+
+    Args:
+        first: time of the first sample [s] and length [samples] of the first block; by default the channel's start.
 
     Raises:
         BadInput: the channel is too short, or a drive does not cover it.
@@ -173,16 +180,19 @@ def lay_out_blocks(
     slowest = min(references[name].frequency for name in sense.axes)
     length = _block_length(axes, slowest, channel.sample_rate)
     least = max(MIN_BLOCKS * MIN_BLOCK_SAMPLES, ceil(MIN_CYCLES_OF_RECORDING / slowest * channel.sample_rate))
+    skipped = 0
+    if first is not None:
+        skipped, length = round((first[0] - channel.start) * channel.sample_rate), first[1]
     length = min(length, channel.size // MIN_BLOCKS)
-    count = channel.size // max(length, 1)
-    if channel.size < least:
+    count = (channel.size - skipped) // max(length, 1)
+    if channel.size < least or count < 1:
         raise BadInput(
             f"is {channel.size} samples long; {least} are needed to track a motion",
             file=channel.file,
             channel=channel.name,
             hint="record for longer",
         )
-    starts = np.arange(count) * length
+    starts = skipped + np.arange(count) * length
     time: Array = channel.start + (starts + 0.5 * (length - 1)) / np.float64(channel.sample_rate)
     parameters = tuple(axis_parameters(axis, sense.readout) for axis in axes)
     width = length / channel.sample_rate

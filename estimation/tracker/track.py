@@ -11,13 +11,13 @@ import numpy as np
 from estimation.reference import PhaseReference
 from estimation.signals import SenseChannel, intensity_clock, is_capacitive, phase_reference, sense_channels
 from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noise, expand_clipped_blocks
+from estimation.tracker.continuation import TrackEnd, Tuning, continued_prior, end_of_track, find_end
 from estimation.tracker.initial_state import initial_estimate, resolve_signs
 from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.observations import BlockLayout, BlockObservations, demodulate_blocks, lay_out_blocks
 from estimation.tracker.phase_measurements import PhaseMeasurement, with_phase_measurements
 from estimation.tracker.process_noise import (
     INITIAL_DENSITIES,
-    NoisePosterior,
     mean_nis,
     noise_posterior,
     tune_process_noise,
@@ -57,7 +57,8 @@ def track(
         causal: estimate each block from the samples up to its end only (filter); the latency is half a block. By
             default each block is estimated from the whole recording (smoother).
         phases: further measurements of an axis's phase, for instance from the picture, by axis.
-        previous: motion of an earlier segment of the same scan, from whose process noise the tuning starts.
+        previous: motion of an earlier segment of the same scan, from whose process noise the tuning starts. Where the
+            recording begins at ``track_end`` of it, the state is continued as well.
 
     Returns:
         The motion. ``info`` has an entry for each sense channel, see ``_summarise``.
@@ -68,22 +69,33 @@ def track(
     """
     axes: dict[str, AxisMotion] = {}
     info: dict[str, object] = {}
+    ends: dict[str, object] = {}
     for sense in sense_channels(recording, device, gaps_ok=True):
         even = is_capacitive(sense.readout)
-        references = {name: phase_reference(recording, device, name, sense.channel, even) for name in sense.axes}
+        end = find_end(previous, sense.channel)
+        frequencies = end.w / (2 * np.pi) if end else [None] * len(sense.axes)
+        references = {
+            name: phase_reference(recording, device, name, sense.channel, even, frequency)
+            for name, frequency in zip(sense.axes, frequencies, strict=True)
+        }
         _check_resonant(sense, device, references)
-        layout = lay_out_blocks(recording, device, sense, references)
-        signs, prior, densities = [""] * len(sense.axes), None, _previous_densities(previous, sense)
+        layout = lay_out_blocks(recording, device, sense, references, end and (end.start, end.length))
+        signs, prior = (list(end.signs), continued_prior(end, layout)) if end else ([], None)
+        densities = _previous_densities(previous, sense)
         knots: list[list[AxisKnots]] = [[] for _ in sense.axes]
         acquired = np.zeros(len(sense.axes), bool)
         results: list[SectionResult] = []
         for first, stop in section_ranges(layout.drive_share):
             observations = demodulate_blocks(layout, first, stop + LOOKAHEAD_BLOCKS)
-            section = tune_section(observations, device, prior, densities, causal)
-            observations, densities = section.observations, section.densities
-            signs = signs if results else section.signs
+            inherited = end and end.inherited_tuning(layout.starts.size)
+            if inherited and prior:
+                section = inherit_tuning(observations, prior, signs, inherited, causal)
+            else:
+                section = tune_section(observations, device, prior, densities, causal)
+            observations, densities = section.observations, section.tuning.densities
+            signs = signs or section.signs
             measured = with_phase_measurements(observations, phases or {})
-            states = average_over_noise(measured, section.prior, section.posterior, causal, stop - first)
+            states = average_over_noise(measured, section.prior, section.tuning.posterior, causal, stop - first)
             for a, axis_parts in enumerate(knots):
                 axis_parts.append(axis_knots(observations, states.states, states.sds, a))
             prior, acquired = states.next_prior, acquired | states.acquired
@@ -102,7 +114,14 @@ def track(
                 )
             axes[name] = motion_of_knots(layout.references[name], join_knots(knots[a]), clock, signs[a])
         info[sense.channel.name] = _summarise(layout, results, densities)
-    return Motion(axes, "tracker-causal" if causal else "tracker", info)
+        ends[sense.channel.name] = end_of_track(layout, states.next_prior, signs, section.tuning)
+    return Motion(axes, "tracker-causal" if causal else "tracker", info, ends=ends)
+
+
+def track_end(motion: Motion) -> float | None:
+    """Time from which the next segment continues the track of a motion [s]; None if it cannot be continued."""
+    starts = [end.start for end in motion.ends.values() if isinstance(end, TrackEnd)]
+    return min(starts) if len(starts) == len(motion.ends) and starts else None
 
 
 class SectionResult(NamedTuple):
@@ -149,15 +168,13 @@ class TunedSection(NamedTuple):
 
     Attributes:
         observations: with clipped samples expanded. prior: before its first block.
-        signs: see ``resolve_signs``. densities: most probable process noise, shape (axes, 4).
-        posterior: of the process noise.
+        signs: see ``resolve_signs``. tuning: most probable process noise, its posterior, and the noise level.
     """
 
     observations: BlockObservations
     prior: StateEstimate
     signs: list[str]
-    densities: Array
-    posterior: NoisePosterior
+    tuning: Tuning
 
 
 def tune_section(
@@ -181,15 +198,26 @@ def tune_section(
         observations = expand_clipped_blocks(observations, prior or start, densities, causal)
         parts = tuning_parts(observations.signal)
         densities = tune_process_noise(observations, start, parts, densities)
-        previous, scale = scale, max(1.0, scale * mean_nis(observations, start, parts, densities))
-        if abs(np.log(scale / previous)) < LOG_NOISE_TOLERANCE:
+        found = max(1.0, scale * mean_nis(observations, start, parts, densities))
+        if abs(np.log(found / scale)) < LOG_NOISE_TOLERANCE:
             break
+        scale = found
         observations = replace(observations, signal=observations.signal._replace(noise_var=scale * residual_var))
     if observations.clipped.block.size:
         observations = expand_clipped_blocks(observations, prior or start, densities, causal)
         parts = tuning_parts(observations.signal)
     posterior = noise_posterior(observations, start, parts, densities)
-    return TunedSection(observations, prior or start, signs, densities, posterior)
+    return TunedSection(observations, prior or start, signs, Tuning(densities, posterior, scale))
+
+
+def inherit_tuning(
+    observations: BlockObservations, prior: StateEstimate, signs: list[str], tuning: Tuning, causal: bool
+) -> TunedSection:
+    """A section with the process noise and the noise level of an earlier one."""
+    noise_var = tuning.noise_scale * observations.signal.noise_var
+    observations = replace(observations, signal=observations.signal._replace(noise_var=noise_var))
+    observations = expand_clipped_blocks(observations, prior, tuning.densities, causal)
+    return TunedSection(observations, prior, signs, tuning)
 
 
 def _previous_densities(motion: Motion | None, sense: SenseChannel) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from recon.imaging.gridding import accumulate_samples, mean_picture
 from recon.imaging.phasor_gridding import accumulate_phasors
 from recon.imaging.picture import Grid, Picture
-from recon.sample_ranges import SampleRanges, subtract_ranges
+from recon.sample_ranges import SampleRanges, merge_ranges, subtract_ranges
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.lock_in import contiguous_samples
@@ -18,6 +19,9 @@ from scanner.motion import Motion
 
 CHUNK_SAMPLES = 1 << 22
 """Samples gridded at a time. It bounds the memory (some 100 MB) for recordings of any length."""
+
+MAX_GAP_SAMPLES = 1 << 12
+"""Samples between two ranges up to which they are read together."""
 
 
 def grid_intensity(
@@ -57,6 +61,42 @@ def grid_intensity(
     counts_of_sums = counts if sums.ndim == 2 else counts[..., None]
     picture = mean_picture(intensity.gain * sums + intensity.offset * counts_of_sums, counts, grid)
     return replace(picture, outside=samples - int(counts.sum()), detectors=intensity.detectors)
+
+
+def grid_scattered(beam: Motion, intensity: Channel, grid: Grid, ranges: SampleRanges) -> Picture:
+    """Return the picture of many short ranges of samples; arguments as for :func:`grid_intensity`.
+
+    Neighbouring ranges are read together, because a call costs as much as thousands of samples.
+    """
+    x, y = (beam.axes[axis].angle for axis in AXES)
+    sums = np.zeros((grid.height, grid.width, *intensity.shape[1:]))
+    counts = np.zeros((grid.height, grid.width), np.uint32)
+    samples = 0
+    for first, stop in merge_ranges(ranges, MAX_GAP_SAMPLES):
+        chosen = np.zeros(stop - first, np.bool_)
+        for begin, end in ranges[bisect_left(ranges, (first, first)) : bisect_left(ranges, (stop, stop))]:
+            chosen[begin - first : end - first] = True
+        values = contiguous_samples(intensity.stored(first, stop)[chosen])
+        if values.dtype.kind == "f":
+            values = np.where(np.isfinite(values), values, np.nan)
+            samples += int(np.isfinite(values).reshape(len(values), -1).all(axis=1).sum())
+        else:
+            samples += len(values)
+        accumulate_samples(x.read(first, stop)[chosen], y.read(first, stop)[chosen], values, grid, sums, counts)
+    counts_of_sums = counts if sums.ndim == 2 else counts[..., None]
+    picture = mean_picture(intensity.gain * sums + intensity.offset * counts_of_sums, counts, grid)
+    return replace(picture, outside=samples - int(counts.sum()), detectors=intensity.detectors)
+
+
+def add_pictures(first: Picture, second: Picture) -> Picture:
+    """Return the picture of the samples of two pictures of means on the same pixels."""
+    coverage = first.coverage + second.coverage
+    sums = np.zeros(first.image.shape)
+    for picture in (first, second):
+        counts = picture.coverage if sums.ndim == 2 else picture.coverage[..., None]
+        sums += np.where(counts > 0, picture.image, 0.0) * counts
+    summed = mean_picture(sums, coverage, first.grid)
+    return replace(summed, outside=first.outside + second.outside, detectors=first.detectors)
 
 
 def find_visited_pixels(beam: Motion, ranges: SampleRanges, grid: Grid) -> NDArray[np.bool_]:

@@ -97,7 +97,7 @@ def visited_density(samples: SplitSums) -> Array:
     return np.maximum(smooth(samples.counts > 0, DENSITY_RADIUS_PX), 0.02)
 
 
-def kernel_picture(samples: SplitSums, noise: SampleNoise) -> PictureEstimate:
+def kernel_picture(samples: SplitSums, noise: SampleNoise, width: float | None = None) -> PictureEstimate:
     """Return the picture under the kernel that predicts the held-out samples best.
 
     Its variance is that of the weighted noise, and that of the detail that the kernel removes. The latter is taken as
@@ -106,8 +106,9 @@ def kernel_picture(samples: SplitSums, noise: SampleNoise) -> PictureEstimate:
     Args:
         samples: of one detector by pixel.
         noise: of a sample.
+        width: of the kernel [px]; by default that of ``choose_width``.
     """
-    width = choose_width(samples, noise)
+    width = choose_width(samples, noise) if width is None else width
     image = kernel_mean(samples.sums, samples.counts, width)
     centre, weight, squares = _weights(samples.counts, width)
     reached = weight > MIN_WEIGHT * centre
@@ -127,6 +128,12 @@ def kernel_picture(samples: SplitSums, noise: SampleNoise) -> PictureEstimate:
     sd = np.sqrt(variance + TAIL_FACTOR * scale * _slope_energy(image, width))
     share = np.divide(samples.counts * centre, weight, out=np.zeros(image.shape), where=reached)
     return PictureEstimate(np.where(reached, image, np.nan), np.where(reached, sd, np.nan), share, width)
+
+
+def kernel_image(samples: SplitSums, width: float) -> Array:
+    """Return the image of ``kernel_picture`` alone, with the kernel's width [px]."""
+    image = kernel_mean(samples.sums, samples.counts, width)
+    return np.where(find_reached(samples.counts, width), image, np.nan)
 
 
 def _slope_energy(image: Array, width: float) -> Array:

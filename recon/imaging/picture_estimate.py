@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.held_out import SplitSums, held_out_ranges
-from recon.imaging.intensity_gridding import grid_intensity
-from recon.imaging.kernel_picture import PictureEstimate, kernel_picture
-from recon.imaging.picture import Picture
+from recon.imaging.intensity_gridding import grid_scattered
+from recon.imaging.kernel_picture import PictureEstimate, choose_width, kernel_image, kernel_picture
+from recon.imaging.picture import Grid, Picture
 from recon.imaging.pixel_noise import SampleNoise, pixel_sd
 from recon.imaging.recursive_frames import CarriedFrames, recursive_picture
 from recon.sample_ranges import SampleRanges, subtract_ranges
@@ -93,22 +93,49 @@ def estimate_picture(
     Raises:
         BadInput: no such kind, or the samples determine no picture of this kind.
     """
+    held = None if kind == "mean" else grid_held_out(beam, intensity, means.grid, unlocated, first, stop)
+    return picture_of_sums(kind, means, held, noise, before)
+
+
+def grid_held_out(
+    beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges, first: int = 0, stop: int | None = None
+) -> Picture:
+    """Return the picture of the samples ``first`` up to ``stop`` that are held out; arguments as ``grid_intensity``."""
+    stop = intensity.size if stop is None else stop
+    left_out = subtract_ranges(held_out_ranges(first, stop), unlocated)
+    return grid_scattered(beam, intensity, grid, left_out)
+
+
+def picture_of_sums(
+    kind: str,
+    means: Picture,
+    held: Picture | None,
+    noise: Sequence[SampleNoise | None],
+    before: EstimatedPicture | None = None,
+    widths: Sequence[float] | None = None,
+) -> EstimatedPicture:
+    """Return the picture of gridded samples in the wanted kind.
+
+    Args:
+        kind, means, noise, before: as for :func:`estimate_picture`.
+        held: picture of the means of the samples held out; None for ``mean``, which holds out none.
+        widths: of the kernel by detector [px], see :func:`kernel_widths`; None to choose them by these samples.
+
+    Raises:
+        BadInput: as :func:`estimate_picture`.
+    """
     if kind not in PICTURE_KINDS:
         raise BadInput(f"no picture is called {kind!r}", channel="picture", hint=f"give {', '.join(PICTURE_KINDS)}")
-    limits, line = _describe_flat(means, noise), _lies_on_one_line(means)
-    if kind == "mean":
-        limits += [f"intensity: {ONE_LINE}; check the motion of both axes"] if line else []
+    limits = _describe_flat(means, noise)
+    if kind == "mean" or held is None:
+        limits += [f"intensity: {ONE_LINE}; check the motion of both axes"] if _lies_on_one_line(means) else []
         return EstimatedPicture(means, pixel_sd(means, noise), limits=limits)
-    if line:
-        hint = "check the motion of both axes or use --picture mean"
-        raise BadInput(f"{ONE_LINE}, which determines no picture", channel="intensity", hint=hint)
-    stop = intensity.size if stop is None else stop
-    kept = subtract_ranges([(first, stop)], subtract_ranges(held_out_ranges(first, stop), unlocated))
-    held = grid_intensity(beam, intensity, means.grid, kept, first, stop)
     detectors = _split_sums(means, held)
+    _check_determined(kind, means, detectors, noise)
     carried: Sequence[CarriedFrames | None] = (before.carried if before else ()) or [None] * len(detectors)
+    chosen: Sequence[float | None] = widths or [None] * len(detectors)
     estimates, carry = zip(
-        *(_estimate_detector(kind, *each) for each in zip(detectors, noise, carried, strict=True)), strict=True
+        *(_estimate_detector(kind, *each) for each in zip(detectors, noise, carried, chosen, strict=True)), strict=True
     )
     image, sd, share = (
         np.stack([getattr(each, name) for each in estimates], -1).astype(np.float32).reshape(means.image.shape)
@@ -125,20 +152,68 @@ def estimate_picture(
     return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes, limits, following)
 
 
+def picture_without_sd(
+    kind: str,
+    means: Picture,
+    held: Picture | None,
+    noise: Sequence[SampleNoise | None],
+    widths: Sequence[float] | None,
+) -> Picture | None:
+    """Return the image of :func:`picture_of_sums`, with the same arguments, in less time; None where it takes as long.
+
+    Raises:
+        BadInput: as :func:`picture_of_sums`.
+    """
+    if kind == "mean":
+        return means
+    if kind != "kernel" or held is None or widths is None:
+        return None
+    detectors = _split_sums(means, held)
+    _check_determined(kind, means, detectors, noise)
+    images = [kernel_image(*each) for each in zip(detectors, widths, strict=True)]
+    return replace(means, image=np.stack(images, -1).astype(np.float32).reshape(means.image.shape))
+
+
+def kernel_widths(means: Picture, held: Picture, noise: Sequence[SampleNoise | None]) -> list[float] | None:
+    """Return the widths [px] of the kernels that the samples held out choose, by detector; None without noise."""
+    detectors = _split_sums(means, held)
+    if not held.coverage.any():
+        return None
+    pairs = zip(detectors, noise, strict=True)
+    widths = [choose_width(samples, sample) for samples, sample in pairs if sample is not None]
+    return widths if len(widths) == len(detectors) else None
+
+
 def _estimate_detector(
-    kind: str, samples: SplitSums, noise: SampleNoise | None, before: CarriedFrames | None
+    kind: str, samples: SplitSums, noise: SampleNoise | None, before: CarriedFrames | None, width: float | None
 ) -> tuple[PictureEstimate, CarriedFrames | None]:
     """Estimate of one detector, and what the next frame takes over."""
-    means = samples.sums[samples.counts > 0] / samples.counts[samples.counts > 0]
-    hint = "use --picture mean"
-    if np.ptp(means) == 0.0:
-        raise BadInput(f"every sample is {means[0]:g}: there is nothing to estimate", channel="intensity", hint=hint)
-    if noise is None or not samples.held_counts.any():
-        what = f"the scan is too short for --picture {kind}: too few pixels were visited twice to measure the noise"
-        raise BadInput(what, channel="intensity", hint=f"record longer, ask for fewer pixels or {hint}")
+    assert noise is not None
     if kind == "kernel":
-        return kernel_picture(samples, noise), None
+        return kernel_picture(samples, noise, width), None
     return recursive_picture(samples, noise, before)
+
+
+def _check_determined(
+    kind: str, means: Picture, detectors: Sequence[SplitSums], noise: Sequence[SampleNoise | None]
+) -> None:
+    """Check that the samples determine a picture of a kind other than ``mean``.
+
+    Raises:
+        BadInput: they do not.
+    """
+    if _lies_on_one_line(means):
+        hint = "check the motion of both axes or use --picture mean"
+        raise BadInput(f"{ONE_LINE}, which determines no picture", channel="intensity", hint=hint)
+    hint = "use --picture mean"
+    for samples, sample in zip(detectors, noise, strict=True):
+        values = samples.sums[samples.counts > 0] / samples.counts[samples.counts > 0]
+        if np.ptp(values) == 0.0:
+            what = f"every sample is {values[0]:g}: there is nothing to estimate"
+            raise BadInput(what, channel="intensity", hint=hint)
+        if sample is None or not samples.held_counts.any():
+            what = f"the scan is too short for --picture {kind}: too few pixels were visited twice to measure the noise"
+            raise BadInput(what, channel="intensity", hint=f"record longer, ask for fewer pixels or {hint}")
 
 
 def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:
@@ -154,9 +229,16 @@ def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:
 
 def _lies_on_one_line(means: Picture) -> bool:
     """Whether the visited pixels, of which there is at least one, spread in one direction at most."""
-    places = np.argwhere(means.coverage > 0).astype(float)
-    spread = np.linalg.eigvalsh(np.cov(places.T))[0] if len(places) > 2 else 0.0
-    return len(places) > 0 and not spread > MIN_SPREAD_PX**2
+    visited = (means.coverage > 0).astype(np.float64)
+    total = visited.sum()
+    if not total:
+        return False
+    row, column = (np.arange(size) - 0.5 * size for size in visited.shape)
+    by_row, by_column = visited.sum(axis=1), visited.sum(axis=0)
+    centre = np.array([row @ by_row, column @ by_column]) / total
+    cross = row @ visited @ column
+    squares = np.array([[row**2 @ by_row, cross], [cross, column**2 @ by_column]]) / total
+    return not np.linalg.eigvalsh(squares - np.outer(centre, centre))[0] > MIN_SPREAD_PX**2
 
 
 def _describe_flat(means: Picture, noise: Sequence[SampleNoise | None]) -> list[str]:

@@ -99,9 +99,10 @@ def pixel_sd(picture: Picture, noise: Sequence[SampleNoise | None]) -> NDArray[n
     """
     means = picture.image.reshape(*picture.coverage.shape, -1)
     sd = np.full(means.shape, np.nan, np.float32)
-    visited = picture.coverage > 0
+    counts = picture.coverage.astype(np.float32)
+    visited = counts > 0
     for detector, sample in enumerate(noise):
         if sample is not None:
-            variance = sample.variance(means[visited, detector]) / picture.coverage[visited]
-            sd[visited, detector] = np.sqrt(variance)
+            variance = sample.variance(means[..., detector].astype(np.float64))
+            np.sqrt(np.divide(variance, counts, where=visited, out=variance), where=visited, out=sd[..., detector])
     return sd.reshape(picture.image.shape)

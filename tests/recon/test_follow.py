@@ -1,5 +1,6 @@
 """Following a recording that another process writes: frames appear, and the final result equals the offline one."""
 
+import itertools
 import json
 import os
 import re
@@ -15,10 +16,21 @@ import numpy as np
 import pytest
 import tifffile
 
+from estimation.estimate import estimate
+from estimation.tracker import track_end
 from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
-from recon.follow import follow_recording, match_signs, measures_readout_phase, reconstruct_frame, repeat_time
+from recon.follow import follow_recording, repeat_time
 from recon.imaging.readout_phase import apply_readout_phase
+from recon.live_frames import (
+    add_part,
+    finish_frame,
+    first_picture,
+    match_signs,
+    measures_readout_phase,
+    part_edges,
+    update_readout,
+)
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
 from scanner.errors import BadInput
@@ -236,23 +248,69 @@ def test_a_growing_instrument_file_is_followed_with_its_mapping(tmp_path: Path) 
     assert_same_result(tmp_path / "live", tmp_path / "offline")
 
 
-def test_a_frame_uses_the_readout_error_that_earlier_frames_showed(tmp_path: Path) -> None:
+def test_a_frame_uses_the_readout_error_that_earlier_frames_showed() -> None:
     recording, truth = imaging()
     late = with_sense(recording, lambda sense: np.interp(np.arange(sense.size) - 2.5, np.arange(sense.size), sense))
-    options, previous, errors = Options(pixels=(200, 200)), None, []
+    options, scan, errors = Options(pixels=(200, 200)), None, []
     for start in (0.0, 0.01):
-        known = previous.readout_phase if previous else {}
-        previous = reconstruct_frame(late, start, start + 0.01, previous, tmp_path, options)
-        motion = apply_readout_phase(previous.motion, known)
+        known = scan.readout_phase if scan else {}
+        scan, frame = add_part(late, start, start + 0.01, scan, None, options)
+        scan = update_readout(late, start, start + 0.01, finish_frame(scan, frame, options), options)
+        motion = apply_readout_phase(scan.motion, known)
         angle = truth_from_simulation(truth).angles["x"]
         errors.append(np.degrees(evaluate_axis(motion.axes["x"], *angle).phase_rmse))
     assert errors[0] > 2.0  # half a microsecond late at 13.8 kHz
     assert errors[1] < 0.1
 
 
-def test_a_sensor_of_noise_gives_no_frame(tmp_path: Path) -> None:
+def test_a_long_frame_has_a_short_last_part() -> None:
+    assert part_edges(0.0, 0.004, 1 / 3270) == [0.0, 0.004]
+    assert part_edges(0.0, 0.02, 1 / 3270) == [0.0, 0.02]
+    assert part_edges(0.0, 0.04, 1 / 3270) == pytest.approx([0.0, 0.04 - 50 / 3270, 0.04])
+    assert part_edges(1.0, 1.1, 1 / 3270) == pytest.approx([1.0, 1.1 - 100 / 3270, 1.1 - 50 / 3270, 1.1])
+
+
+@pytest.mark.parametrize("kind", ["mean", "kernel"])
+def test_a_frame_in_parts_is_the_frame(kind: str) -> None:
+    recording, truth = imaging(0.06)
+    options, angles = Options(pixels=(128, 128), picture=kind, sense_only=True), truth_from_simulation(truth).angles
+    scan, first = add_part(recording, 0.0, 0.01, None, None, options)
+    scan = finish_frame(scan, first, options)
+    edges, frame = [0.01, 0.03, 0.05, 0.06], None
+    for begin, end in itertools.pairwise(edges):
+        scan, frame = add_part(recording, begin, end, scan, frame, options)
+        for name in "xy":
+            assert np.degrees(evaluate_axis(scan.motion.axes[name], *angles[name]).phase_rmse) < 0.05
+    quick = first_picture(scan, frame, options)
+    scan = finish_frame(scan, frame, options)
+    np.testing.assert_array_equal(quick.image, scan.estimate.picture.image)
+    whole = reconstruct(recording.slice(0.01, 0.06), options, quiet=True)
+    assert int(quick.coverage.sum()) + quick.outside == recording.slice(0.01, 0.06)["intensity"].size
+    difference, sd = quick.image - whole.picture.image, np.hypot(whole.picture_sd, scan.estimate.sd)
+    assert np.nanmean(np.abs(difference) < sd) > 0.95  # the same samples, and nearly the same motion
+    assert np.nanmedian(scan.estimate.sd / whole.picture_sd) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_continued_track_is_as_good_as_a_long_one() -> None:
+    recording, truth = imaging(0.06)
+    angles, previous, errors = truth_from_simulation(truth).angles, None, {"x": [], "y": []}
+    for k in range(6):
+        begin = 0.0 if previous is None else track_end(previous)
+        previous = estimate(recording.slice(begin, 0.01 * (k + 1)), before=previous)
+        for name, axis in previous.axes.items():
+            errors[name].append(np.degrees(evaluate_axis(axis, *angles[name]).phase_rmse))
+    assert all(np.max(error[1:]) < 0.04 for error in errors.values())  # 0.1 from a new start every 10 ms
+
+
+def test_a_segment_elsewhere_does_not_continue_a_track() -> None:
+    recording, _ = imaging(0.06)
+    first = estimate(recording.slice(0.0, 0.01))
+    later = estimate(recording.slice(0.03, 0.04), before=first)
+    np.testing.assert_allclose(later.axes["x"].phase, estimate(recording.slice(0.03, 0.04)).axes["x"].phase, atol=2e-3)
+
+
+def test_a_sensor_of_noise_gives_no_frame() -> None:
     recording, _ = imaging()
     dead = with_sense(recording, lambda sense: np.random.default_rng(4).normal(0.0, 0.01, sense.size))
     with pytest.raises(BadInput, match="sense: shows no motion, only noise"):
-        reconstruct_frame(dead, 0.0, 0.01, None, tmp_path, Options(pixels=(100, 100)))
-    assert not list(tmp_path.iterdir())
+        add_part(dead, 0.0, 0.01, None, None, Options(pixels=(100, 100)))
