@@ -62,7 +62,7 @@ def estimate(
     Raises:
         BadInput: no such estimator, or it cannot use the recording or the device.
     """
-    from estimation.filters.baselines import resolve_signs
+    from estimation.signs import resolve_signs
     from estimation.term_compensation import estimate_with_terms
 
     device = require_device(recording, device)

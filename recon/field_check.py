@@ -19,6 +19,10 @@ samples at the turning points only."""
 MAX_OUTSIDE_FRACTION_ALLOWED = 0.5
 """Fraction from which the picture is refused: most of what was recorded would be missing."""
 
+MAX_CENTRE_FRACTION = 0.2
+"""Distance of a motion's centre from that of the field, over its amplitude, above which a note says so: a fifth of the
+field is then empty on one side. Scans that are centred on purpose are within a tenth."""
+
 MIN_AMPLITUDE_FRACTION = 0.2
 """Amplitude over half angle below which a note says that the motion covers little of the field."""
 
@@ -74,10 +78,31 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[s
             )
             raise DeviceInvalid(what, channel="scan", hint=hint)
         notes.append(f"{what}; check [scan] of the device")
+    notes += _describe_centres(grid, motion)
     if any(a < MIN_AMPLITUDE_FRACTION * h for a, h in zip(amplitude, half, strict=True)):
         notes.append(
             f"the motion covers little of the field of view ({sizes}; {grid.angle} angles); check [scan] of the device"
         )
+    return notes
+
+
+def own_half_angle(axis: AxisMotion) -> float:
+    """Half angle of the field that a motion covers [rad]: its amplitude, or the largest angle where it is no sine."""
+    amplitude, largest = float(np.max(axis.amplitude)), float(np.max(np.abs(_angle_range(axis))))
+    return largest if largest > amplitude / (1.0 - MAX_OUTSIDE_FRACTION) else amplitude
+
+
+def _describe_centres(grid: Grid, motion: Motion) -> list[str]:
+    """A note on each axis whose motion is not centred in the field."""
+    notes = []
+    for name in AXES:
+        low, high = _angle_range(motion.axes[name])
+        centre, swing = 0.5 * (low + high), 0.5 * (high - low)
+        if abs(centre) > MAX_CENTRE_FRACTION * swing:
+            notes.append(
+                f"{name} is centred at {grid.angle_scale * centre:+.4g} rad, and moves by ±"
+                f"{grid.angle_scale * swing:.4g} rad around it: check offset in [{name}.readout] of the device"
+            )
     return notes
 
 
@@ -93,11 +118,14 @@ def _amplitudes(grid: Grid, motion: Motion) -> list[float]:
 
     The amplitude itself is that of a sine, which a spiral or a slow scan is not.
     """
-    return [grid.angle_scale * _largest_angle(motion.axes[name]) for name in AXES]
+    return [grid.angle_scale * max(map(abs, _angle_range(motion.axes[name]))) for name in AXES]
 
 
-def _largest_angle(axis: AxisMotion) -> float:
+def _angle_range(axis: AxisMotion) -> tuple[float, float]:
+    """Smallest and largest angle of an axis [rad]."""
     firsts = np.linspace(0, max(axis.angle.size - INSPECTED_SAMPLES, 0), INSPECTED_PARTS).astype(int)
     parts = [axis.angle.read(first, first + INSPECTED_SAMPLES) for first in np.unique(firsts).tolist()]
-    angles = np.abs(np.concatenate(parts))
-    return float(np.nanmax(angles)) if np.isfinite(angles).any() else float(np.max(axis.amplitude))
+    angles = np.concatenate(parts)
+    if not np.isfinite(angles).any():
+        return -float(np.max(axis.amplitude)), float(np.max(axis.amplitude))
+    return float(np.nanmin(angles)), float(np.nanmax(angles))

@@ -18,7 +18,7 @@ from estimation.amplitude_calibration import motion_calibration_sd
 from estimation.estimate import default_estimator, estimate
 from estimation.optics.correction import beam_motion
 from recon.evaluation import Truth, evaluate_axis
-from recon.field_check import check_field, check_units
+from recon.field_check import check_field, check_units, own_half_angle
 from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors
 from recon.imaging.image_phase import refine_motion
 from recon.imaging.intensity_correction import correct_drift, describe_drift, measure_intensity_drift
@@ -342,7 +342,7 @@ def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Gri
     """The pixels over the device's field of view, else over the range of the motion, with a note that says so."""
     if device.scan is not None:
         return grid_of_scan(*options.pixels, device.scan), []
-    half = {axis: float(np.max(motion.axes[axis].amplitude)) for axis in AXES}
+    half = {axis: own_half_angle(motion.axes[axis]) for axis in AXES}
     note = (
         f"the device states no [scan]: the field is the motion's own, {half['x']:.4g} x {half['y']:.4g} rad half angles"
     )

@@ -9,7 +9,7 @@ from scanner.recording import Recording
 
 
 def run(recording: Recording, device: Device) -> Motion:
-    from estimation.filters.edges import estimate_from_edges
+    from estimation.sync.edge_estimator import estimate_from_edges
 
     return estimate_from_edges(recording, device)
 

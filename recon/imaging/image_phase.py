@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimation.filters.baselines import resolve_signs
 from estimation.frequency_motion import is_motion_computable
 from estimation.optics.correction import beam_motion
 from estimation.signals import drive_phase_change
+from estimation.signs import resolve_signs
 from estimation.term_compensation import estimate_with_terms
 from estimation.tracker import PhaseMeasurement, track
 from estimation.tracker.drive_only import track_drive_only

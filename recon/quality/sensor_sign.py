@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from estimation.filters.baselines import sign_from_edges
 from estimation.reference import tone_frequency
+from estimation.signs import sign_from_edges
 from scanner.channel import Channel, check_signal
 from scanner.device import AXES, Axis, Device
 from scanner.errors import BadInput

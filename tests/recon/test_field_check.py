@@ -11,7 +11,9 @@ from recon.cli import main
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import UNVISITED
+from scanner.device import Device
 from scanner.errors import DeviceInvalid
+from scanner.recording import Recording
 from scanner.stages import Scan
 from tests.support.simulated import imaging
 
@@ -51,6 +53,24 @@ def test_a_missing_field_is_that_of_the_motion() -> None:
     result = with_field(None)
     assert any("states no [scan]: the field is the motion's own" in note for note in result.notes)
     assert result.picture.outside < 0.05 * result.intensity.size
+
+
+def test_a_sensor_with_an_offset_is_noted_and_its_whole_motion_shown() -> None:
+    """A position sensor whose offset the device file leaves out, and no field."""
+    rate, turns = 10_000.0, 2 * np.pi * np.arange(20_000) / 10_000.0
+    device = Device.from_toml("".join(f'[{a}.readout]\nkind = "position"\ngain = 1.0\nnoise_sd = 1e-3\n' for a in "xy"))
+    noise = np.random.default_rng(2).normal(0.0, 1e-3, (2, turns.size))
+    channels = {
+        "sense_x": (0.5 + 0.1 * np.sin(40.0 * turns) + noise[0], "V", rate),
+        "sense_y": (0.1 * np.sin(31.0 * turns) + noise[1], "V", rate),
+        "intensity": (np.random.default_rng(3).poisson(20.0, turns.size).astype(float), "", rate),
+    }
+    result = reconstruct(Recording.from_arrays(channels, device), Options(pixels=(60, 60)), quiet=True)
+    (note,) = (note for note in result.notes if "centred" in note)
+    assert note.startswith("x is centred at +0.5 rad, and moves by ±0.1")
+    assert "check offset in [x.readout]" in note
+    assert result.picture.outside < 0.05 * turns.size
+    assert not any("centred" in note for note in with_field(Scan(0.18, 0.18)).notes)
 
 
 @pytest.mark.parametrize("fill", [[], ["--fill", "2"]])
