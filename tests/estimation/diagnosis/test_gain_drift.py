@@ -1,0 +1,64 @@
+"""A gain that drifts is listed where damping is seen in one free decay only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimation.diagnosis import diagnose as diagnosing
+from estimation.diagnosis.data import prepare_run
+from estimation.diagnosis.gain_drift import may_be_gain_drift
+from estimation.diagnosis.parameters import Candidate
+from scanner.device import Axis, Device
+from scanner.forward_model import DriveInput, simulate_axis, stated_terms
+from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
+from scanner.terms import catalogue
+
+RATE, SAMPLE_RATE = 2 * np.pi * 40.0, 2000.0
+NOMINAL = Axis(Mechanics(1.0, 2.0, RATE**2), readout=Position(1.0, 2e-4), tolerance={"J": 1e-9, "gain": 1e-9}, name="x")
+DEVICE = Device("lever", {"x": NOMINAL})
+
+
+def decay(amplitude: float, angle: bool = False) -> Recording:
+    true = DEVICE.with_terms({"x": {"cubic-damping": {"b3": 60.0}}}).axes["x"]
+    motion = simulate_axis(true, stated_terms(true), DriveInput(np.zeros((4000, 3)), 1 / SAMPLE_RATE), (amplitude, 0.0))
+    noise = 2e-4 * np.random.default_rng(3).standard_normal(motion.angle.size)
+    channels = {"sense_x": (motion.angle + noise, "V", SAMPLE_RATE, 0.0)}
+    if angle:
+        channels["angle_x"] = (motion.angle, "rad", SAMPLE_RATE, 0.0)
+    return Recording.from_arrays(channels, DEVICE)
+
+
+def is_listed(*recordings: Recording, effect: str = "cubic-damping", device: Device = DEVICE) -> bool:
+    runs = [prepare_run(recording, device) for recording in recordings]
+    return may_be_gain_drift(runs, device, Candidate(catalogue()[effect], "x", "sense"))
+
+
+def test_one_decay_of_a_sensor_of_motion_does_not_exclude_a_drift_of_its_gain() -> None:
+    assert is_listed(decay(0.2))
+    assert not is_listed(decay(0.2), effect="cubic-stiffness")
+
+
+def test_another_amplitude_an_angle_channel_or_a_drive_excludes_it() -> None:
+    assert not is_listed(decay(0.2), decay(0.1))
+    assert not is_listed(decay(0.2, angle=True))
+    driven = Device(
+        "lever", {"x": Axis(NOMINAL.mechanics, drive=Drive("linear", 1.0), readout=NOMINAL.readout, name="x")}
+    )
+    time = np.arange(4001) / SAMPLE_RATE
+    channels = {
+        "drive_x": (np.cos(RATE * time), "V", SAMPLE_RATE),
+        "sense_x": (decay(0.2)["sense_x"].read(), "V", SAMPLE_RATE),
+    }
+    with_drive = Recording.from_arrays({k: (*v, 0.0) for k, v in channels.items()}, driven)
+    assert not is_listed(with_drive, device=driven)
+
+
+def test_the_diagnosis_lists_it_with_the_measurement_that_separates_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = {effect: catalogue()[effect] for effect in ("cubic-damping", "damping-drift")}
+    monkeypatch.setattr(diagnosing, "catalogue", lambda: known)
+    (finding,) = diagnosing.diagnose([decay(0.2)]).findings
+    assert finding.effect == "cubic-damping"
+    assert finding.rivals[-1].effect == "gain-drift"
+    assert "record another amplitude" in str(finding.advice)
