@@ -201,3 +201,16 @@ def drive_phase_change(
     if key not in effective or effective[key] is recording[key]:
         return 0.0
     return phase_reference(effective, device, axis).phase(time) - phase_reference(recording, device, axis).phase(time)
+
+
+def drive_motion_frequency(recording: Recording, device: Device, axis: str) -> float | None:
+    """Frequency at which the drive of an axis moves it [Hz], as recorded or stated; None where neither is known."""
+    drive = device.axis(axis).drive
+    if drive is None:
+        return None
+    if f"drive_{axis}" in recording:
+        try:
+            return phase_reference(recording, device, axis).frequency
+        except BadInput:
+            return None
+    return None if drive.frequency is None else drive.frequency * drive.motion_per_drive

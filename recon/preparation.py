@@ -16,6 +16,7 @@ from recon.quality.sensor_sign import describe_inverted_sensors
 from scanner import devices
 from scanner.channel import CHANNEL_UNITS, Channel, check_signal, suggest_name
 from scanner.device import AXES, Device
+from scanner.errors import BadInput
 from scanner.recording import Recording
 
 DeviceSource = str | Path | Device
@@ -71,6 +72,7 @@ def prepare(recording: Recording, device: DeviceSource | None = None, undo_lag: 
             x or a y axis, or drives that do not fit it.
     """
     check_signal(recording.require("intensity", "a picture needs it"), gaps_ok=True)
+    _check_shape(recording["intensity"])
     device = select_device(recording, device)
     clock_jumps = detect_clock_jumps(recording)
     if clock_jumps:
@@ -138,6 +140,18 @@ def select_device(recording: Recording, device: DeviceSource | None) -> Device:
         BadInput: the file is not a valid device, or none is given and the recording has none.
     """
     return require_device(recording, None if device is None else devices.find(device))
+
+
+def _check_shape(intensity: Channel) -> None:
+    """Check that an intensity has more samples than detectors.
+
+    Raises:
+        BadInput: it has not.
+    """
+    if len(intensity.shape) == 2 and intensity.shape[1] > intensity.shape[0]:
+        what = f"has {intensity.shape[0]} samples of {intensity.shape[1]} detectors: its axes are swapped"
+        hint = "store it as (samples, detectors)"
+        raise BadInput(what, file=intensity.file, channel=intensity.name, hint=hint)
 
 
 def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:

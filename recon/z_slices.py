@@ -15,6 +15,9 @@ from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, LazySamples
 from scanner.errors import BadInput
 
+MAX_TRAVEL_M = 0.1
+"""Travel of z above which a note asks for its unit: stages of microscopes travel some centimetres at most [m]."""
+
 MIN_BLOCKS_OF_SLICE = 16
 """Blocks of z from which a variation within a slice is told from noise, and parts of a slice that are compared: for
 white noise the variance of their differences is then 2 ± 0.5 times that of their means."""
@@ -101,6 +104,9 @@ def _describe(blocks: PositionBlocks, slices: int, unassigned: float) -> list[st
     notes = []
     if blocks.missing:
         notes.append(f"position_z: {blocks.missing} samples are not finite; the intensity there belongs to no slice")
+    if blocks.most - blocks.least > MAX_TRAVEL_M:
+        travel = blocks.most - blocks.least
+        notes.append(f"position_z: moves by {travel:.4g} m; no objective does: check its unit")
     if slices == 1:
         why = "does not change beyond its noise" if blocks.constant else "has one position only"
         notes.append(f"position_z: {why}: the stack has a single slice")

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.reference import absolute_reference
-from estimation.signals import phase_reference
+from estimation.signals import drive_motion_frequency, phase_reference
 from estimation.sync.harmonics import MotionHarmonics, motion_harmonics
-from estimation.sync.numbering import NumberedEdges, number_edges
+from estimation.sync.numbering import MIN_EDGES, NumberedEdges, number_edges
 from estimation.sync.smoother import SmoothedPhase, smooth_phase
 from scanner.arrays import Array
 from scanner.device import AXES, Device
@@ -38,6 +38,10 @@ exceeds its field by 8 % has a third harmonic that is 13 % off."""
 
 CHUNK_SAMPLES = 1 << 18
 """Samples whose angle is computed at a time: their harmonics take 25 MB."""
+
+MAX_FREQUENCY_DIFFERENCE = 0.05
+"""Relative difference of the frequencies of edges and drive above which they are not of one motion. A decay moves at
+the resonance, which a drive that excites it is nearer to."""
 
 MAX_BEYOND_PERIODS = 2.0
 """Periods before the first and after the last edge to which the angle is extrapolated."""
@@ -145,6 +149,23 @@ def _without_harmonics(
     return replace(found, phase=found.phase + late, phase_sd=sd), amplitude
 
 
+def _check_frequency(recording: Recording, device: Device, edges: Edges, name: str, frequency: float) -> None:
+    """Check that an axis moves at the frequency at which its drive moves it.
+
+    Raises:
+        BadInput: it does not.
+    """
+    driven = {axis: drive_motion_frequency(recording, device, axis) for axis in device.axes}
+    expected = driven.get(name)
+    if expected is None or abs(frequency / expected - 1.0) < MAX_FREQUENCY_DIFFERENCE:
+        return
+    others = [axis for axis, other in driven.items()
+              if axis != name and other and abs(frequency / other - 1.0) < MAX_FREQUENCY_DIFFERENCE]  # fmt: skip
+    what = f"has edges of a motion at {frequency:.6g} Hz, and the drive moves {name} at {expected:.6g} Hz"
+    hint = f"they fit {others[0]}: sync_x and sync_y are swapped" if others else "check event, unit and drive frequency"
+    raise BadInput(what, file=edges.file, channel=edges.name, hint=hint)
+
+
 def axis_motion_from_edges(
     recording: Recording, device: Device, edges: Edges, clock: tuple[float, float, int]
 ) -> tuple[AxisMotion, list[str], dict[str, object]]:
@@ -161,7 +182,14 @@ def axis_motion_from_edges(
     """
     from scipy.interpolate import CubicHermiteSpline
 
+    rate, start, n = clock
+    inside = edges.between(start, start + n / rate).times.size
+    if min(inside, edges.times.size) < min(MIN_EDGES, edges.times.size):
+        what = f"{inside} of its {edges.times.size} edges lie between {start:.6g} s and {start + n / rate:.6g} s, when "
+        what += f"the intensity was recorded; they last from {edges.times[0]:.6g} s to {edges.times[-1]:.6g} s"
+        raise BadInput(what, file=edges.file, channel=edges.name, hint="check their unit and the channels' start")
     name, found = edges.name.partition("_")[2], phase_from_edges(edges)
+    _check_frequency(recording, device, edges, name, float(np.median(found.frequency)))
     measured = amplitude_from_edges(edges, found)
     notes = [line for line in [found.describe(edges.name)] if line]
     if measured is None:
@@ -171,6 +199,11 @@ def axis_motion_from_edges(
             raise BadInput(what, file=edges.file, channel=edges.name, hint=hint)
         amplitude = np.full(found.time.size, device.scan.mechanical_half_angles[AXES.index(name)])
         notes.append(f"{edges.name}: the edges do not determine the amplitude; the motion is taken to fill the field")
+        if edges.angle and edges.event == "both-edges":
+            notes.append(
+                f"{edges.name}: states a detector at {edges.angle:.4g} rad, and its edges are evenly spaced, as those "
+                "of a detector in the centre: check angle, in rad"
+            )
     else:
         amplitude = measured[0]
     step = max(1, round(KNOT_PERIODS * found.time.size * found.numbered.length / np.ptp(found.time)))
@@ -191,7 +224,6 @@ def axis_motion_from_edges(
         lag = np.zeros(found.time.size)
     phase = found.phase + lag
     spline = CubicHermiteSpline(found.time, phase, 2 * np.pi * found.frequency)
-    rate, start, n = clock
     time = start + np.arange(n) / rate
     angle = np.empty(n)
     for first in range(0, n, CHUNK_SAMPLES):

@@ -26,6 +26,9 @@ from numpy.typing import NDArray
 
 from scanner.arrays import Array
 
+MIN_VARIANCE = 1e-24
+"""Least variance of the jitter [rad2]: of times that repeat exactly, whose rounding is about 1e-12 rad."""
+
 LOG10_WALK_RANGE = (-16.0, 2.0)
 """Range of the ratio that is searched: variance of the frequency's change in a period over that of the jitter, both as
 phases. From a motion that does not drift within a million periods to one whose edges are independent."""
@@ -107,7 +110,7 @@ def _most_likely(
 
     def deviance(ratio: float, asymmetry_ratio: float) -> float:
         count, chi2, log_det = _likelihood(periods, measured, side, used, ratio, asymmetry_ratio, DIFFUSE)
-        return float(count * np.log(chi2 / count) + log_det)
+        return float(count * np.log(max(chi2 / count, MIN_VARIANCE)) + log_det)
 
     ratio, least = _search(partial(deviance, asymmetry_ratio=0.0))
     walks = (ratio, 0.0)

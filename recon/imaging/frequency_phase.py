@@ -73,6 +73,12 @@ def phases_from_picture(
     """
     references = {name: phase_reference(recording, device, name) for name in AXES}
     slices = _cut(intensity, slow_period(motion) * PERIODS_PER_SEARCH)
+    for name, reference in references.items():
+        periods = reference.frequency * intensity.size / intensity.sample_rate
+        if periods < 1.0:
+            what = f"holds {periods:.2g} periods of a motion at {reference.frequency:.6g} Hz in {name}"
+            hint = f"check frequency in [{name}.drive] of the device, in Hz, and the sample rate"
+            raise BadInput(what, file=intensity.file, channel=intensity.name, hint=hint)
     found = _search_slices(references, intensity, slices)
     phases, notes = _phases_of_slices(references, intensity, slices, found)
     field = {name: float(np.log(motion.axes[name].amplitude[0])) for name in AXES}
@@ -189,7 +195,7 @@ def _describe_failure(
     length = (slices[0][1] - slices[0][0]) / intensity.sample_rate
     return (
         f"forward and backward half-periods agree for no phase, with motions at {at} (best correlation "
-        f"{best:.2f}; frequencies have to be right within {0.1 / length:.2g} Hz)"
+        f"{min(best, 1.0):.2f}; frequencies have to be right within {0.1 / length:.2g} Hz)"
     )
 
 

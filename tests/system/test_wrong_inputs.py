@@ -108,6 +108,34 @@ def field(x: float, y: float) -> str:
     )
 
 
+FIELD = "[x]\n[y]\n[scan]\nhalf_angle_x = 0.11\nhalf_angle_y = 0.11\n"
+DRIVEN = '[x.drive]\nkind = "linear"\nfrequency = {}\n[y.drive]\nkind = "linear"\nfrequency = {}\n' + FIELD[8:]
+SENSES = ("sense_x", "sense_y")
+
+
+def edges(scale: float = 1.0, swapped: bool = False, frequency: float = 2000.0, **stated: float | str) -> Change:
+    """Edges of both axes at each zero crossing upward, or at both crossings of a detector with an ``angle``."""
+
+    def change(file: h5py.File) -> None:
+        for name, f in (("x", frequency), ("y", 800.0)):
+            period = 0.5 / f if "angle" in stated else 1.0 / f
+            times = np.arange(0.0, SAMPLES / RATE, period) * scale
+            dataset = file.create_dataset(f"channels/sync_{'xy'['yx'.index(name)] if swapped else name}", data=times)
+            dataset.attrs.update({"unit": "s", **(stated or {"event": "zero-crossing-up"})})
+
+    return change
+
+
+def z_in_micrometres(file: h5py.File) -> None:
+    z = file.create_dataset("channels/position_z", data=np.repeat([10.0, 12.0, 14.0], 100))
+    z.attrs.update({"unit": "m", "sample_rate": 15e3})
+
+
+def left_out(device: str) -> tuple[str, ...]:
+    """Channels that a recording with this device lacks: sensors need a readout."""
+    return DRIVES if "readout" in device else (*DRIVES, *SENSES)
+
+
 def swapped_drives(file: h5py.File) -> None:
     x, y = (file[f"channels/drive_{axis}"][:] for axis in "xy")
     file["channels/drive_x"][:], file["channels/drive_y"][:] = y, x
@@ -140,6 +168,15 @@ REFUSED_RECORDINGS: dict[str, tuple[str, Change | None, str]] = {
     "unit missing": (DEVICE, attribute("sense_x", "unit", None), "sense_x: unit is missing"),
     "unit unknown": (DEVICE, attribute("sense_x", "unit", "Volts DC"), "sense_x: unit 'Volts DC' is unknown"),
     "channels that do not overlap": (DEVICE, attribute("intensity", "start", 5.0), "intensity"),
+    "edges in ms stated as s": (FIELD, edges(1e3), "of its 40 edges lie between 0 s and 0.02 s"),
+    "edges swapped": (DRIVEN.format(2000.0, 800.0), edges(swapped=True), "they fit y: sync_x and sync_y are swapped"),
+    "every second edge missing": (DRIVEN.format(2000.0, 800.0), edges(frequency=1000.0), "the drive moves x at 2000"),
+    "edges of an unknown event": (FIELD, edges(event="rising"), "sync_x: event 'rising' is unknown"),
+    "drive frequency in kHz": (DRIVEN.format(2.0, 0.8), None, "0.04 periods of a motion at 2 Hz in x; check frequency"),
+    "intensity transposed": (DEVICE, values("intensity", lambda v: np.stack([v, v])), "2 samples of 20000 detectors"),
+    "counts of a converter as V": (DEVICE, values("sense_x", lambda v: (1e5 * v).astype(np.int16)), "amplitude 1e+04"),
+    "a sensor used twice": (DEVICE, lambda file: file["channels/sense_y"].write_direct(
+        file["channels/sense_x"][:]), "hold the same samples"),
     "newer format": (DEVICE, lambda file: file.attrs.update({"version": 99}), "version"),
 }  # fmt: skip
 
@@ -149,7 +186,7 @@ def test_a_wrong_recording_or_device_is_refused_in_one_line(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     device, change, words = REFUSED_RECORDINGS[case]
-    write(tmp_path / "scan.h5", device, change, DRIVES)
+    write(tmp_path / "scan.h5", device, change, left_out(device))
     refused(["reconstruct", str(tmp_path / "scan.h5"), "--pixels", "40x40"], tmp_path, words, capsys)
 
 
@@ -197,6 +234,8 @@ WARNED: dict[str, tuple[str, Change | None, str]] = {
     "no field": (DEVICE.partition("[scan]")[0], None, "the field is the motion's own"),
     "misspelt key": (DEVICE.replace("noise_sd = 1e-4", "noise_sd = 1e-4\noffest = 1.0", 1), None, "x.readout.offest"),
     "misspelt channel": (DEVICE, lambda file: file.copy("channels/sense_x", "channels/sense_z"), "sense_z"),
+    "detector's angle in degrees": (FIELD, edges(angle=1.1), "a detector at 1.1 rad, and its edges are evenly spaced"),
+    "half of a sensor's swing": (DEVICE, values("sense_x", lambda v: np.maximum(v, 0.0)), "x is centred at +0.05 rad"),
     "millivolts stated as volts": (DEVICE.replace("gain = 1.0", "gain = 1000.0"), None, "covers little of the field"),
 }  # fmt: skip
 
@@ -206,7 +245,7 @@ def test_a_doubtful_input_makes_a_picture_with_a_warning(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     device, change, words = WARNED[case]
-    write(tmp_path / "scan.h5", device, change, DRIVES)
+    write(tmp_path / "scan.h5", device, change, left_out(device))
     arguments = [str(tmp_path / "scan.h5"), "--pixels", "40x40", "-o", str(tmp_path / "out"), "--json"]
     assert main(["reconstruct", *arguments]) == 0
     notes = json.loads(capsys.readouterr().out)["notes"]
@@ -257,3 +296,11 @@ def test_a_wrong_table_is_refused_in_one_line(case: str, tmp_path: Path, capsys:
 
 def test_there_are_forty_wrong_inputs() -> None:
     assert len(REFUSED_RECORDINGS) + len(WARNED) + len(FILES) + len(TABLES) >= 40
+
+
+def test_a_position_in_another_unit_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write(tmp_path / "scan.h5", DEVICE, z_in_micrometres, DRIVES)
+    arguments = ["--pixels", "40x40", "--frames", "-o", str(tmp_path / "out"), "--json"]
+    assert main(["reconstruct", str(tmp_path / "scan.h5"), *arguments]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert any("position_z: moves by 4 m; no objective does: check its unit" in note for note in notes), notes
