@@ -145,6 +145,8 @@ def reconstruct(
     from recon.pipeline import reconstruct as reconstruct_recording
     from recon.reconstruction import Options
 
+    if not isinstance(pixels, Sequence) or len(pixels) != 2:
+        raise BadInput(f"is {pixels!r}", channel="pixels", hint="give width and height, as (400, 400)")
     options = Options(
         estimator=estimator,
         pixels=pixels,

@@ -28,6 +28,10 @@ ANGLE_STEP_RAD = 1e-5
 """Step of the central difference of a point by an angle: its square is far below the step, and rounding below 1e-11."""
 
 
+MAX_RANGE_M = 2000.0
+"""Range above which a note asks for the unit: small mirrors collect too little light from further away [m]."""
+
+
 @dataclass(frozen=True)
 class PointCloud:
     """Points with time, intensity and covariance.
@@ -186,6 +190,8 @@ def _notes(geometry: Geometry, assumed: bool, distance: Array, estimated: Estima
         notes.append("the device states no [geometry]: one mirror, the beam along its normal, no lens")
     if not geometry.range_sd:
         notes.append("[geometry] states no range_sd: the covariance holds the part of the angles alone")
+    if (farthest := float(np.nanmax(distance))) > MAX_RANGE_M:
+        notes.append(f"range: reaches {farthest:.4g} m; if these are millimetres, state the unit mm")
     if zero := int(np.count_nonzero(distance <= 0.0)):
         notes.append(f"range: {zero} values of 0 or less were taken as no return")
     for axis in AXES:

@@ -282,9 +282,9 @@ def _open_edges(group: h5py.Group, name: str, path: Path) -> Edges:
 
 
 def _as_numbers(values: ArrayLike, name: str) -> NDArray[Any]:
-    """The values as an array; BadInput where rows differ in length, so that they form none."""
+    """The values as an array, masked ones as NaN; BadInput where rows differ in length, so that they form none."""
     try:
-        return np.asarray(values)
+        return np.ma.filled(np.ma.array(values, float), np.nan) if np.ma.is_masked(values) else np.asarray(values)
     except ValueError:
         raise BadInput("is no array: its rows differ in length", channel=name, hint="give shape (n,)") from None
 

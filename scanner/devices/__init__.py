@@ -35,6 +35,9 @@ def find(source: Device | str | Path) -> Device:
     """
     if isinstance(source, Device):
         return source
+    if not isinstance(source, str | Path):
+        hint = "give a Device (Device.from_toml makes one of text), the path of a TOML file, or a name"
+        raise BadInput(f"is a {type(source).__name__}, no device", channel="device", hint=hint)
     if str(source) in names():
         return load(str(source))
     if not Path(source).exists():

@@ -10,7 +10,10 @@ import h5py
 import numpy as np
 import pytest
 
+import lissajous
 from recon.cli import main
+from scanner.device import Device
+from scanner.errors import BadInput
 
 RATE = 1e6
 SAMPLES = 20_000
@@ -304,3 +307,41 @@ def test_a_position_in_another_unit_is_noted(tmp_path: Path, capsys: pytest.Capt
     assert main(["reconstruct", str(tmp_path / "scan.h5"), *arguments]) == 0
     notes = json.loads(capsys.readouterr().out)["notes"]
     assert any("position_z: moves by 4 m; no objective does: check its unit" in note for note in notes), notes
+
+
+def test_a_range_in_millimetres_stated_in_metres_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    def change(file: h5py.File) -> None:
+        shots = file.create_dataset("channels/range", data=np.full(SAMPLES, 8000.0))
+        shots.attrs.update({"unit": "m", "sample_rate": RATE})
+
+    write(tmp_path / "scan.h5", DEVICE, change, DRIVES)
+    assert main(["point-cloud", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out")]) == 0
+    assert "range: reaches 8000 m; if these are millimetres, state the unit mm" in capsys.readouterr().out
+
+
+def arrays() -> dict[str, tuple]:
+    names = ("sense_x", "sense_y", "intensity")
+    return {name: (values, "V", RATE) for name, values in signals().items() if name in names}
+
+
+def test_masked_samples_are_missing_samples() -> None:
+    light = signals()["intensity"]
+    masked = {**arrays(), "intensity": (np.ma.masked_less(light, 100.0), "V", RATE)}
+    result = lissajous.reconstruct(masked, device=Device.from_toml(DEVICE), pixels=(20, 20))
+    assert result.picture.coverage.sum() == np.sum(light >= 100.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [({"device": {"x": 1}}, "is a dict, no device"), ({"pixels": 400}, "pixels: is 400; give width and height")],
+)
+def test_arguments_of_a_wrong_type_are_named(arguments: dict, words: str) -> None:
+    with pytest.raises(BadInput, match=words):
+        lissajous.reconstruct(arrays(), **({"device": Device.from_toml(DEVICE)} | arguments))
+
+
+@pytest.mark.parametrize("arguments", [{"count": 0}, {"count": -2}, {"frame_time": float("nan")}, {"z_step": -1e-6}])
+def test_numbers_of_frames_are_positive(arguments: dict) -> None:
+    result = lissajous.reconstruct(arrays(), device=Device.from_toml(DEVICE), pixels=(20, 20))
+    with pytest.raises(BadInput, match="give a positive number"):
+        lissajous.frames(result, **arguments)
