@@ -19,6 +19,12 @@ them are as large as in pixels that the scan did not visit."""
 MAX_HELD_OUT_SEGMENTS = 512
 """Segments that are held out at most: 32 768 samples judge a picture to 1 %, and the cost remains bounded."""
 
+MAX_DISTANCE_PX = 16
+"""Distances to the nearest sample from here on are counted as one: gaps of a scan are seldom wider [px]."""
+
+MAX_WEIGHT = 10.0
+"""Bound on the weight of a held-out pixel and its inverse, so that a few of them never judge a picture alone."""
+
 GOLDEN_RATIO = 0.618
 """Step of the segments' position within their part of the scan, which no period of the scan is in step with."""
 
@@ -64,6 +70,33 @@ def pixel_means(sums: Array, counts: Array) -> Array:
     return np.divide(sums, counts, out=np.zeros(sums.shape), where=counts > 0)
 
 
+def representative_weights(samples: SplitSums) -> Array:
+    """Return the weight of each held-out pixel in judging a picture, shape (height, width), 0 in other pixels.
+
+    A held-out segment leaves a gap that is wider than those of the scan, and dense parts of the scan hold most of the
+    held-out samples. The weights make the distances of held-out pixels to the nearest sample distributed as those of
+    all pixels of the picture. Their mean over the held-out pixels is 1.
+    """
+    held = samples.held_counts > 0
+    if not held.any():
+        return np.zeros(held.shape)
+    distance, remaining = _sample_distance(samples.counts), _sample_distance(samples.kept_counts)
+    wanted, found = (
+        np.bincount(each.ravel(), minlength=MAX_DISTANCE_PX + 1) / each.size for each in (distance, remaining[held])
+    )
+    ratio = np.divide(wanted, found, out=np.zeros_like(wanted), where=found > 0)
+    weight = np.where(held, np.clip(ratio, 1.0 / MAX_WEIGHT, MAX_WEIGHT)[remaining], 0.0)
+    return np.asarray(weight / weight[held].mean())
+
+
+def _sample_distance(counts: Array) -> NDArray[np.intp]:
+    """Distance to the nearest visited pixel, rounded and at most ``MAX_DISTANCE_PX`` [px]."""
+    import cv2
+
+    distance = cv2.distanceTransform((counts <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.minimum(np.rint(distance), MAX_DISTANCE_PX).astype(np.intp)
+
+
 def log_average(values: Array, misfits: Array) -> tuple[float, Array]:
     """Return the average of a positive setting under its likelihood, and the weights of its values.
 
@@ -78,20 +111,15 @@ def log_average(values: Array, misfits: Array) -> tuple[float, Array]:
     return float(np.exp(weights @ np.log(values))), weights
 
 
-def excess_variance(
-    residual: Array, noise: Array, predicted: Array, density: NDArray[np.floating]
-) -> tuple[float, float]:
+def excess_variance(residual: Array, noise: Array, predicted: Array, weight: Array) -> tuple[float, float]:
     """Return the error variance of held-out pixels as a multiple of the predicted one, and its standard deviation.
-
-    Pixels where samples are dense count less, so that all parts of the picture count alike, dark and bright ones too.
 
     Args:
         residual: mean of the held-out samples less the picture without them, shape (n,).
         noise: variance of that mean, shape (n,).
         predicted: variance of the picture, shape (n,).
-        density: fraction of visited pixels around, shape (n,).
+        weight: of each pixel, from :func:`representative_weights`, shape (n,).
     """
-    weight = 1.0 / density
     total = weight @ predicted
     ratio = float(weight @ (residual**2 - noise) / total)
     scatter = 2.0 * weight * (noise + max(ratio, 0.5) * predicted)  # twice: neighbours in a segment err together

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.held_out import SplitSums, excess_variance, log_average, pixel_means
+from recon.imaging.held_out import SplitSums, excess_variance, log_average, pixel_means, representative_weights
 from recon.imaging.pixel_noise import SampleNoise
 from scanner.arrays import Array
 
@@ -19,6 +19,13 @@ WIDTHS_PX = np.geomspace(0.5, 16.0, 11)
 
 REACH = 4.0
 """Reach of the kernel in standard deviations. A pixel without a sample within it has no value."""
+
+MIN_WIDTH_BLOCKS = 3.0
+"""Least standard deviation of a Gaussian on blocks of pixels, in blocks: linear interpolation between them errs by 1 %
+of its peak."""
+
+BLOCK_VARIANCE = 0.25
+"""Variance that the mean over a block, 1/12, and the interpolation between blocks, 1/6, add [square of a block]."""
 
 MIN_WEIGHT = 1e-6
 """Weight, relative to that of a sample at the pixel itself, below which a pixel has no value."""
@@ -34,9 +41,6 @@ GLOBAL_FRACTION = 0.2
 
 TAIL_FACTOR = 1.3
 """Factor on the variance of the removed detail, which has heavier tails than a normal distribution."""
-
-DENSITY_RADIUS_PX = 4.0
-"""Standard deviation of the window in which the density of visited pixels is measured [px]."""
 
 
 class PictureEstimate(NamedTuple):
@@ -63,11 +67,23 @@ class PictureEstimate(NamedTuple):
 
 
 def smooth(image: NDArray[Any], width: float) -> Array:
-    """Return the image, shape (height, width) or (height, width, n), under a Gaussian; its edges are mirrored."""
+    """Return the image, shape (height, width) or (height, width, n), under a Gaussian; its edges are mirrored.
+
+    A wide Gaussian acts on means over blocks of pixels, and the result is interpolated linearly between them.
+    """
     import cv2
 
+    values: Any = image.astype(np.float32)
+    height, across = image.shape[:2]
+    block = 2 ** int(max(np.log2(max(width, MIN_WIDTH_BLOCKS) / MIN_WIDTH_BLOCKS), 0.0))
+    if block > 1:
+        blocks = -(-across // block), -(-height // block)
+        values = cv2.resize(values, blocks, interpolation=cv2.INTER_AREA)
+        width = float(np.sqrt((width / block) ** 2 - BLOCK_VARIANCE))
     size = 2 * max(int(REACH * width + 0.5), 1) + 1
-    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (size, size), width, borderType=cv2.BORDER_REFLECT))
+    values = cv2.GaussianBlur(values, (size, size), width, borderType=cv2.BORDER_REFLECT)
+    values = cv2.resize(values, (across, height)) if block > 1 else values
+    return np.asarray(values).reshape(image.shape)
 
 
 def kernel_mean(sums: Array, counts: Array, width: float) -> Array:
@@ -87,14 +103,11 @@ def choose_width(samples: SplitSums, noise: SampleNoise) -> float:
 
 
 def find_reached(counts: Array, width: float) -> NDArray[np.bool_]:
-    """Return the pixels with samples within the kernel's reach, shape (height, width)."""
-    centre, weight, _ = _weights(counts, width)
-    return weight > MIN_WEIGHT * centre
+    """Return the pixels with a sample within the kernel's reach, shape (height, width)."""
+    import cv2
 
-
-def visited_density(samples: SplitSums) -> Array:
-    """Return the fraction of visited pixels around each pixel, at least 0.02."""
-    return np.maximum(smooth(samples.counts > 0, DENSITY_RADIUS_PX), 0.02)
+    distance = cv2.distanceTransform((counts <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.asarray(distance <= REACH * width)
 
 
 def kernel_picture(samples: SplitSums, noise: SampleNoise, width: float | None = None) -> PictureEstimate:
@@ -123,7 +136,7 @@ def kernel_picture(samples: SplitSums, noise: SampleNoise, width: float | None =
         spread = of_samples / samples.held_counts[held] + of_samples * kept_squares[held] / kept_weight[held] ** 2
         residual = pixel_means(samples.held_sums, samples.held_counts)[held] - kept[held]
         removed = _slope_energy(kept, width)[held]
-        ratio, _ = excess_variance(residual, spread, removed, visited_density(samples)[held])
+        ratio, _ = excess_variance(residual, spread, removed, representative_weights(samples)[held])
         scale = max(ratio, MIN_SCALE)
     sd = np.sqrt(variance + TAIL_FACTOR * scale * _slope_energy(image, width))
     share = np.divide(samples.counts * centre, weight, out=np.zeros(image.shape), where=reached)

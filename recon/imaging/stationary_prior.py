@@ -1,0 +1,151 @@
+"""The picture as posterior mean of a stationary Gaussian random field whose covariance is measured from the samples.
+
+This is simple kriging. The prior of :mod:`recon.imaging.posterior_picture` knows the gradients of the scene; this one
+knows over which distances the scene is correlated, differently across and down. It serves textures, and scenes as
+smooth as the spot of a microscope.
+
+1. The covariance at each lag is the mean product of the pixels' deviations from the mean, over all pairs of visited
+   pixels at that lag. The noise of different pixels is independent, so it adds nothing.
+2. It is fitted by a sum of Gaussian covariances with non-negative variances, which is a valid covariance.
+3. The field has the type-2 cosine transform as modes, with the power spectrum of that sum. Conjugate gradients solve
+   for its posterior mean.
+
+Source: Cressie 1993, "Statistics for spatial data", chapters 2 and 3 (variograms and kriging).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.optimize import nnls
+
+from recon.imaging.held_out import pixel_means
+from scanner.arrays import Array
+
+MAX_LAG_PX = 24
+"""Largest lag at which the covariance is measured: gaps of a sparse frame are narrower [px]."""
+
+LENGTHS_PX = 2.0 ** np.arange(-0.5, 6.1, 0.75)
+"""Correlation lengths of the Gaussian covariances, for each direction [px]: from less than a pixel to the width of a
+frame. Neighbours differ by a factor of 1.7, which their sums interpolate to a few percent."""
+
+MIN_PAIRS = 8.0
+"""Pairs of pixels below which a lag is left out."""
+
+RELATIVE_SPECTRUM_FLOOR = 1e-9
+"""Least power of a mode, relative to the scene's variance: keeps the preconditioner finite."""
+
+TOLERANCE = 0.01
+"""Relative residual of the solution, in the norm of the preconditioner. With 0.001 errors change by less than 2 %."""
+
+MAX_ITERATIONS = 40
+"""Iterations after which the solution is used as it is."""
+
+
+def measure_spectrum(sums: Array, counts: Array) -> Array:
+    """Return the power spectrum of the scene by cosine mode, shape (height, width), in the square of its unit.
+
+    Args:
+        sums, counts: of the samples by pixel, shape (height, width), at least one sample.
+    """
+    variances = _fit_covariance(*_measure_covariance(sums, counts))
+    down, across = (_mode_powers(size) for size in sums.shape)
+    return np.asarray(down @ variances @ across.T + RELATIVE_SPECTRUM_FLOOR * variances.sum() + np.finfo(float).tiny)
+
+
+def stationary_mean(
+    means: Array, precision: Array, spectrum: Array, scene_mean: float, start: Array | None = None
+) -> Array:
+    """Return the posterior mean of the scene, shape (height, width).
+
+    The preconditioner is the inverse that the matrix would have if all pixels had the mean precision.
+
+    Args:
+        means: of the samples by pixel; not used where ``precision`` is 0.
+        precision: of ``means``.
+        spectrum: from :func:`measure_spectrum`.
+        scene_mean: prior mean.
+        start: a similar solution of the same spectrum, with which the iteration begins.
+    """
+    root, data = np.sqrt(spectrum).astype(np.float32), precision.astype(np.float32)
+    inverse = (1.0 / (1.0 + spectrum * precision.mean())).astype(np.float32)
+
+    def to_modes(image: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(root * fft.dctn(image, norm="ortho", overwrite_x=True))
+
+    def to_image(modes: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(fft.idctn(root * modes, norm="ortho", overwrite_x=True))
+
+    residual = to_modes(data * (means - scene_mean).astype(np.float32))
+    target = TOLERANCE**2 * float(np.vdot(residual, inverse * residual))
+    solution = np.zeros_like(residual)
+    if start is not None:
+        solution = fft.dctn((start - scene_mean).astype(np.float32), norm="ortho") / root
+        residual -= solution + to_modes(data * to_image(solution))
+    conditioned = inverse * residual
+    direction, energy = conditioned, float(np.vdot(residual, conditioned))
+    for _ in range(MAX_ITERATIONS):
+        if energy <= target:
+            break
+        product = direction + to_modes(data * to_image(direction))
+        step = energy / float(np.vdot(direction, product))
+        solution += np.float32(step) * direction
+        residual -= np.float32(step) * product
+        conditioned = inverse * residual
+        previous, energy = energy, float(np.vdot(residual, conditioned))
+        direction = conditioned + np.float32(energy / previous) * direction
+    return scene_mean + to_image(solution)
+
+
+def centre_variance_ratio(spectrum: Array, precision: float) -> float:
+    """Return the variance of unresolved detail at the pixels' centres over that of the samples' mean in the pixels.
+
+    Samples lie anywhere in a pixel. For a scene that is linear between the centres, their mean has the response
+    3/4 + cos(k)/4 at wave number k in each direction: detail as fine as the pixels is larger at the centres.
+
+    Args:
+        spectrum: from :func:`measure_spectrum`.
+        precision: mean of that of the pixels; modes of more power than its inverse are resolved.
+    """
+    down, across = (0.75 + 0.25 * np.cos(np.pi * np.arange(size) / size) for size in spectrum.shape)
+    unresolved = spectrum / (1.0 + spectrum * precision)
+    return float((unresolved / np.outer(down, across) ** 2).sum() / unresolved.sum())
+
+
+def _measure_covariance(sums: Array, counts: Array) -> tuple[Array, Array]:
+    """Covariance of the scene and number of pairs by lag, shape (lags down, lags across); lags of both signs as one."""
+    visited = counts > 0
+    deviation = np.where(visited, pixel_means(sums, counts) - sums.sum() / counts.sum(), 0.0)
+    lags = [min(MAX_LAG_PX, size - 1) + 1 for size in counts.shape]
+    shape = [fft.next_fast_len(size + lag, real=True) for size, lag in zip(counts.shape, lags, strict=True)]
+
+    def correlate(image: Array) -> Array:
+        full = fft.irfft2(np.abs(fft.rfft2(image, shape)) ** 2, shape)
+        return np.asarray((full + np.roll(full[::-1], 1, 0))[: lags[0], : lags[1]])
+
+    products, pairs = correlate(deviation), np.maximum(np.rint(correlate(visited.astype(float))), 0.0)
+    return np.divide(products, pairs, out=np.zeros_like(products), where=pairs > 0), pairs
+
+
+def _fit_covariance(covariance: Array, pairs: Array) -> Array:
+    """Variances of the Gaussian covariances, shape (lengths down, lengths across); lag 0, which has noise, is not used.
+
+    A lag counts by its number of pairs and the inverse square of its distance: the values near a pixel determine it.
+    """
+    down, across = (np.arange(size)[:, None] for size in covariance.shape)
+    distance = np.hypot(down, across.T)
+    used = (pairs >= MIN_PAIRS) & (distance > 0) & (distance <= MAX_LAG_PX)
+    shapes = [np.exp(-0.5 * (lag / LENGTHS_PX) ** 2) for lag in (down, across)]
+    basis = np.einsum("ip,jq->ijpq", *shapes)[used].reshape(np.count_nonzero(used), -1)
+    weight = np.sqrt(pairs[used]) / (1.0 + distance[used])
+    variances, _ = nnls(basis * weight[:, None], covariance[used] * weight, maxiter=30 * LENGTHS_PX.size**2)
+    return np.asarray(variances.reshape(LENGTHS_PX.size, -1))
+
+
+def _mode_powers(size: int) -> Array:
+    """Power of each cosine mode under a Gaussian covariance of unit variance, shape (size, lengths)."""
+    wave_number = np.pi * np.arange(size)[:, None] / size
+    return np.asarray(np.sqrt(2.0 * np.pi) * LENGTHS_PX * np.exp(-0.5 * (wave_number * LENGTHS_PX) ** 2))
