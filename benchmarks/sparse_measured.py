@@ -1,13 +1,15 @@
 """Measured scans with a part left out: how well pictures of the rest predict it.
 
 An AFM spiral of which every fourth turn is used, and the rows of one direction of a two-photon frame of which every
-second one is used. The error is that in the pixels left out, against their measured values.
+second one is used. The error is that in the pixels left out, against their measured values. Pitch and profile of the
+grating in the pictures of the spiral are compared with those in the raster scan of the same grating.
 Run: python -m benchmarks.sparse_measured DATA
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,17 +19,20 @@ from estimation.estimate import estimate
 from recon.imaging.held_out import SplitSums
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.kernel_picture import kernel_picture
-from recon.imaging.picture import Grid
+from recon.imaging.picture import Grid, Picture
 from recon.imaging.picture_estimate import estimate_picture
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
 from recon.imaging.posterior_picture import posterior_picture
 from recon.io.convert import convert
 from scanner.arrays import Array
 
-MAPPING = Path(__file__).parent.parent / "examples" / "afm_spiral.toml"
+EXAMPLES = Path(__file__).parent.parent / "examples"
+MAPPING = EXAMPLES / "afm_spiral.toml"
 ESTIMATORS = {"kernel": kernel_picture, "posterior": posterior_picture}
 TURN_SAMPLES = 1000
 PIXELS = 128
+PHASE_BINS = 16
+"""Parts of a period of the grating in which its profile is averaged."""
 
 ROW_NOISE = SampleNoise(0.0, 1.2, 0.0)
 """Noise of the two-photon frame, which has no repeated visits: from the differences of a row to the mean of its two
@@ -44,8 +49,31 @@ def nearest(image: Array, visited: Array) -> Array:
     return np.asarray(image[rows, columns])
 
 
+def grating_profile(picture: Picture) -> tuple[str, Array]:
+    """Pitch of the grating with its standard deviation, and height by phase [nm], shape (``PHASE_BINS``,)."""
+    sys.path.insert(0, str(EXAMPLES))
+    from grating import _pixels, _profile, _solve, _surface, fit_grating
+
+    grating = fit_grating(picture)
+    x, y, height = _pixels(picture)
+    phase, surface = 2 * np.pi * (grating.wave @ [x, y]), _surface(x, y)
+    both = np.concatenate([surface, _profile(phase)], axis=1)
+    flat = height - surface @ _solve(both, height)[: surface.shape[1]]
+    clean = np.abs(flat) < 4 * 1.4826 * np.median(np.abs(flat))  # dust
+    cosine, sine = _solve(_profile(phase), flat)[:2]
+    bins = ((phase - np.arctan2(sine, cosine)) / (2 * np.pi) % 1.0 * PHASE_BINS).astype(int)
+    heights = np.array([flat[clean & (bins == k)].mean() for k in range(PHASE_BINS)])
+    return f"{grating.pitch:.3f} ± {grating.pitch_sd:.3f} µm", heights
+
+
 def afm_spiral(file: Path) -> None:
-    """Print the error in the pixels of the turns left out [nm], and the fraction of intervals that hold them."""
+    """Print the error in the pixels of the turns left out [nm], the fraction of intervals that hold them, and the
+    grating."""
+    sys.path.insert(0, str(EXAMPLES))
+    from afm_spiral import raster_picture
+
+    pitch, raster = grating_profile(raster_picture(file.with_name("raster_20hz.mat")))
+    print(f"AFM raster: pitch {pitch}")
     with convert(file, MAPPING) as recording:
         assert recording.device is not None
         scan, motion, height = recording.device.require_scan(), estimate(recording), recording["intensity"]
@@ -62,6 +90,12 @@ def afm_spiral(file: Path) -> None:
             error = (estimated.picture.image - whole.image)[valid]
             held = np.mean(np.abs(error) < 1.96 * estimated.sd[valid])
             print(f"AFM spiral, {kind}: {rms(error):.2f} nm, {held:.1%} within 95 % intervals")
+            inside = (whole.coverage > 0) & np.isfinite(estimated.picture.image)
+            pitch, profile = grating_profile(replace(estimated.picture, coverage=inside.astype(np.uint32)))
+            away, sd = profile - raster, float(np.median(estimated.sd[inside]))
+            print(f"  pitch {pitch}, profile {rms(away):.1f} nm rms and {np.abs(away).max():.1f} nm at most from the")
+            print(f"  raster's; sd of a pixel {sd:.1f} nm")
+        print(f"AFM spiral, mean of all turns: pitch {grating_profile(whole)[0]}")
 
 
 def two_photon(file: Path) -> None:
