@@ -7,7 +7,7 @@ the samples of some of the blocks, because the samples of a long recording do no
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ from estimation.tracker.block_signal import BlockSignal
 from estimation.tracker.change_points import block_pieces, project_block, project_cut_blocks
 from estimation.tracker.demodulation import Projections, project_blocks, residual_variance, whiten_projections
 from estimation.tracker.drive_blocks import MAX_LINE_RATE_RATIO, demodulate_drive
+from estimation.tracker.line_noise import initial_offset_density, line_noise_variance, noise_spectrum
 from scanner.arrays import Array, Complex, Index
 from scanner.channel import Channel
 from scanner.device import Axis, Device
@@ -131,6 +132,10 @@ class BlockObservations:
         """The parameters as numbers, one axis a row, for compiled code, shape (axes, 11)."""
         return np.array(self.parameters, dtype=np.float64)
 
+    def with_offset_density(self, density: float) -> BlockObservations:
+        """The observations with another spectral density of the readout's offset [V^2/s]."""
+        return replace(self, signal=self.signal._replace(offset_density=density))
+
 
 @dataclass(frozen=True)
 class BlockLayout:
@@ -234,8 +239,15 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
     if layout.switches.size:
         projections = project_cut_blocks(projections, channel, starts, pieces, lines, w)
     response, response_slope = _line_response(sense, lines, w)
-    whitened, moments, whiteners = whiten_projections(projections.sums, projections.grams, projections.geometry)
-    noise, median_noise = _noise_variance(projections, channel, starts, pieces, lines, w, sense.readout.noise_sd)
+    model_error = _model_error_variance(projections)
+    noise, median_noise = _noise_variance(
+        projections, channel, starts, pieces, lines, w, sense.readout.noise_sd, model_error
+    )
+    line_noise = np.fmax(line_noise_variance(projections, channel, starts, length, lines), model_error)
+    spectrum = noise_spectrum(line_noise, median_noise, length)
+    whitened, moments, _, solvers = whiten_projections(
+        projections.sums, projections.grams, projections.geometry, spectrum
+    )
     signal = BlockSignal(
         psi=layout.psi[part],
         w=w,
@@ -248,11 +260,13 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
         mean_gain=float(readout_response(sense.readout, 0.0).real),
         mean_delay=float(readout_response(sense.readout, DELAY_FREQUENCY_HZ).imag / (2 * np.pi * DELAY_FREQUENCY_HZ)),
         table_w=np.ascontiguousarray(projections.table_w),
+        spectrum=spectrum,
         whitened=whitened,
         whitened_moments=np.ascontiguousarray(moments),
-        whiteners=whiteners,
+        solvers=solvers,
         geometry=projections.geometry,
         noise_var=noise,
+        offset_density=initial_offset_density(projections, line_noise[0], length / channel.sample_rate),
         external_phase=np.zeros(w.shape),
         external_var=np.full(w.shape, np.inf),
         amplitude_table=np.stack([_amplitude_table(axis, sense) for axis in layout.axes]),
@@ -305,7 +319,14 @@ def _line_response(sense: SenseChannel, lines: Index, w: Array) -> tuple[Complex
 
 
 def _noise_variance(
-    projections: Projections, channel: Channel, starts: Index, pieces: Index, lines: Index, w: Array, noise_sd: float
+    projections: Projections,
+    channel: Channel,
+    starts: Index,
+    pieces: Index,
+    lines: Index,
+    w: Array,
+    noise_sd: float,
+    model_error: float,
 ) -> tuple[Array, float]:
     """Variance of each block's samples, shape (blocks,), and the typical one [V^2].
 
@@ -317,9 +338,7 @@ def _noise_variance(
         return np.ones(starts.size), np.nan
     variance = residual_variance(projections)
     variance[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator has no residuals
-    samples = np.maximum(projections.counts, 1)
-    signal_var = float(np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2))
-    typical = max(float(np.nanmedian(variance)), MODEL_ERROR_RATIO**2 * signal_var)
+    typical = max(float(np.nanmedian(variance)), model_error)
     length = int(pieces[:, 1].max())
     sideband = channel.sample_rate / length  # [rad/s]: a slip of 1 rad over the block
     axes = w.shape[1]
@@ -329,6 +348,13 @@ def _noise_variance(
         block = project_block(channel, int(starts[k]), pieces[k], length, extended, omega)
         variance[k] = residual_variance(block)[0]
     return np.where(variance > DISTURBED_VARIANCE_RATIO * typical, variance, typical), typical
+
+
+def _model_error_variance(projections: Projections) -> float:
+    """Variance of the model error within a block [V^2]."""
+    samples = np.maximum(projections.counts, 1)
+    signal_var = np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2)
+    return MODEL_ERROR_RATIO**2 * float(signal_var)
 
 
 def _amplitude_table(axis: Axis, sense: SenseChannel) -> Array:
