@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.signals import SenseChannel, drive_channel, intensity_clock, phase_reference
+from estimation.tracker.amplitude_table import MAX_AMPLITUDE_THETA0
 from estimation.tracker.averaged_dynamics import average_cycle, axis_parameters, unpack_parameters
 from estimation.tracker.block_signal import MIN_OFFSET_DENSITY_V2_PER_S, BlockSignal
 from estimation.tracker.block_tracking import track_blocks
@@ -19,7 +20,7 @@ from estimation.tracker.demodulation import NoiseSpectrum
 from estimation.tracker.drive_blocks import BlockDrive, demodulate_drive
 from estimation.tracker.initial_state import RELATIVE_STIFFNESS_SD, STIFFNESS_RATE_SD_PER_S
 from estimation.tracker.kalman_filter import StateEstimate
-from estimation.tracker.observations import MAX_AMPLITUDE_THETA0, MIN_BLOCKS, NO_CLIPPED_BLOCKS, BlockObservations
+from estimation.tracker.observations import MIN_BLOCKS, NO_CLIPPED_BLOCKS, BlockObservations
 from estimation.tracker.phase_measurements import PhaseMeasurement, with_phase_measurements
 from estimation.tracker.process_noise import MIN_DENSITIES
 from estimation.tracker.state_space import AXIS_STATES, DAMPING, LOG_AMPLITUDE, PHASE, STIFFNESS, STIFFNESS_RATE

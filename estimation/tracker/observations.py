@@ -15,14 +15,8 @@ import numpy as np
 
 from estimation.reference import PhaseReference
 from estimation.signals import SenseChannel, drive_channel, is_capacitive
-from estimation.tracker.averaged_dynamics import (
-    COS,
-    MAX_READOUT_HARMONIC,
-    POINTS_PER_CYCLE,
-    SIN,
-    AxisParameters,
-    axis_parameters,
-)
+from estimation.tracker.amplitude_table import amplitude_table
+from estimation.tracker.averaged_dynamics import MAX_READOUT_HARMONIC, AxisParameters, axis_parameters
 from estimation.tracker.block_signal import BlockSignal
 from estimation.tracker.change_points import block_pieces, project_block, project_cut_blocks
 from estimation.tracker.demodulation import Projections, project_blocks, residual_variance, whiten_projections
@@ -33,7 +27,6 @@ from scanner.channel import Channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.harmonics import readout_response
-from scanner.laws import capacitance
 from scanner.recording import Recording
 from scanner.stages import Amdm
 
@@ -67,12 +60,6 @@ SETTLING_TIME_CONSTANTS = 15.0
 
 DELAY_FREQUENCY_HZ = 1.0
 """Frequency at which the readout's delay of slow changes is evaluated [Hz]; far below every scan frequency."""
-
-AMPLITUDE_TABLE_SIZE = 400
-"""Entries of the table from line magnitude to amplitude. It gives start values only."""
-
-MAX_AMPLITUDE_THETA0 = 1.6
-"""Largest amplitude of the table in units of theta0; the second line of a Gaussian comb has its maximum before it."""
 
 MOTION_SENSOR_HARMONICS = 3
 """Harmonics used of a sensor of the motion: the fundamental, and the next two, which a nonlinear suspension adds."""
@@ -269,7 +256,7 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
         offset_density=initial_offset_density(projections, line_noise[0], length / channel.sample_rate),
         external_phase=np.zeros(w.shape),
         external_var=np.full(w.shape, np.inf),
-        amplitude_table=np.stack([_amplitude_table(axis, sense) for axis in layout.axes]),
+        amplitude_table=np.stack([amplitude_table(axis, sense.readout) for axis in layout.axes]),
         main_order=2 if is_capacitive(sense.readout) else 1,
     )
     used = float((projections.counts - projections.clipped_counts).sum()) / (starts.size * length)
@@ -355,19 +342,3 @@ def _model_error_variance(projections: Projections) -> float:
     samples = np.maximum(projections.counts, 1)
     signal_var = np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2)
     return MODEL_ERROR_RATIO**2 * float(signal_var)
-
-
-def _amplitude_table(axis: Axis, sense: SenseChannel) -> Array:
-    """Amplitudes [rad] and magnitudes of their main line, shape (2, AMPLITUDE_TABLE_SIZE).
-
-    Beyond the largest magnitude, where a larger motion has a smaller line, the table is constant.
-    """
-    if not is_capacitive(sense.readout):
-        amplitudes = np.linspace(0.0, 2.0, AMPLITUDE_TABLE_SIZE)
-        return np.stack([amplitudes, amplitudes])
-    comb = axis.require_capacitance()
-    amplitudes = np.linspace(1e-4, MAX_AMPLITUDE_THETA0, AMPLITUDE_TABLE_SIZE) * comb.theta0
-    values = capacitance(amplitudes[:, None] * SIN[1], comb.C0, comb.Cb, comb.theta0, comb.theta_th)
-    sizes = np.abs(values @ COS[2]) * (2.0 / POINTS_PER_CYCLE)
-    top = int(sizes.argmax())
-    return np.stack([np.minimum(amplitudes, amplitudes[top]), np.maximum.accumulate(sizes)])
