@@ -19,6 +19,7 @@ from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, fill_holes
 from recon.imaging.picture_estimate import EstimatedPicture, estimate_picture
 from recon.imaging.pixel_noise import MAX_NOISE_SAMPLES, measure_noise
+from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
 from recon.quality.defects import unrecoverable_intervals
@@ -67,6 +68,7 @@ class ScanFrames:
         """
         result, before = self.result, None
         grid, noise, intensity = result.picture.grid, result.sample_noise, result.intensity
+        rails = detector_rails(intensity)
         for number, (begin, end) in enumerate(self.spans):
             if self.slices is not None:
                 intensity = self.slices.intensity_of(number, result.intensity)
@@ -79,7 +81,8 @@ class ScanFrames:
                 nothing = np.full(means.image.shape, np.nan, np.float32)
                 yield EstimatedPicture(replace(means, image=nothing), nothing)
                 continue
-            yield frame
+            place = result.beam, intensity, grid, self.unlocated
+            yield replace(frame, sd=sd_without_saturated(frame.sd, *place, rails, begin, end))
             before = None if self.independent or self.slices else frame
 
     @property

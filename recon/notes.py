@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.rail import upper_rail
+from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
 from scanner.channel import Channel
@@ -14,10 +14,6 @@ from scanner.recording import Recording
 
 MAX_FRAME_EXCESS = 1e-3
 """Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""
-
-MAX_CHECKED_SAMPLES = 1_000_000
-"""Samples from the start of the intensity in which saturation and negative counts are searched: 0.2 s at 5 MS/s.
-Sorting takes 0.1 s."""
 
 COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative."""
@@ -29,20 +25,17 @@ def describe_saturation(intensity: Channel) -> list[str]:
     Args:
         intensity: shape (n,) or (n, detectors).
     """
-    count = min(intensity.size, MAX_CHECKED_SAMPLES)
-    columns = intensity.read(0, count).reshape(count, -1).T
-    several = intensity.detectors or [f"detector {number}" for number in range(len(columns))]
-    names = [f"intensity, {name}" for name in several] if len(columns) > 1 else ["intensity"]
-    notes = []
-    for name, detector in zip(names, columns, strict=True):
-        finite = detector[np.isfinite(detector)]
-        if finite.size and (rail := upper_rail(finite)):
-            notes.append(
-                f"{name}: {rail[1] / finite.size:.2%} of the samples stand at the largest value, {rail[0]:.4g} "
-                f"{intensity.unit}: the detector is saturated there, and the picture shows no detail; "
-                "lower its gain or the light"
-            )
-    return notes
+    rails = detector_rails(intensity)
+    several = intensity.detectors or [f"detector {number}" for number in range(len(rails))]
+    names = [f"intensity, {name}" for name in several] if len(rails) > 1 else ["intensity"]
+    checked = min(intensity.size, MAX_CHECKED_SAMPLES)
+    return [
+        f"{name}: {rail[1] / checked:.2%} of the samples stand at the largest value, {rail[0]:.4g} {intensity.unit}: "
+        "the detector is saturated there, the picture shows no detail, and its standard deviation is not known; "
+        "lower its gain or the light"
+        for name, rail in zip(names, rails, strict=True)
+        if rail is not None
+    ]
 
 
 def describe_negative_counts(intensity: Channel) -> list[str]:

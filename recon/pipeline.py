@@ -30,6 +30,7 @@ from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
 from recon.imaging.sample_motion import SampleMotion
 from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion, relative_to_sample
+from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.notes import (
     describe_ambiguous_signs,
     describe_clock_jumps,
@@ -40,6 +41,7 @@ from recon.notes import (
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
+from recon.quality.detector_gaps import describe_detector_gaps
 from recon.quality.dropped_samples import find_timing_break, first_late_slice, restore_timing, slices_aligned
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
@@ -215,7 +217,7 @@ def correct_sample_motion(estimated: EstimatedMotion, options: Options) -> Estim
         return estimated
     intensity = estimated.prepared.intensity
     found = measure_sample_motion(estimated.beam, intensity, estimated.grid, _unlocated(estimated))
-    notes = [*estimated.motion_notes, describe_sample_motion(found, intensity.sample_rate)]
+    notes = [*estimated.motion_notes, describe_sample_motion(found)]
     return replace(estimated, sample_motion=found, motion_notes=notes)
 
 
@@ -255,15 +257,16 @@ def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
 def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Reconstruction:
     """Compare the motion with the truth if there is one, and collect the notes."""
     estimated, prepared = gridded.estimated, gridded.estimated.prepared
-    motion, intensity = estimated.motion, prepared.intensity
-    noise = measure_noise(estimated.beam, intensity, estimated.grid)
-    estimate = estimate_picture(options.picture, gridded.picture, noise, estimated.beam, intensity, gridded.unlocated)
+    motion, beam, intensity = estimated.motion, estimated.beam, prepared.intensity
+    noise = measure_noise(beam, intensity, estimated.grid)
+    estimate = estimate_picture(options.picture, gridded.picture, noise, beam, intensity, gridded.unlocated)
+    samples, angles = (beam, intensity, estimated.grid, gridded.unlocated), truth.angles if truth else {}
     return Reconstruction(
         motion=motion,
-        beam=estimated.beam,
+        beam=beam,
         picture=estimate.picture,
         picture_kind=options.picture,
-        picture_sd=estimate.sd,
+        picture_sd=sd_without_saturated(estimate.sd, *samples, detector_rails(intensity)),
         data_share=estimate.data_share,
         resolution_px=estimate.resolution_px,
         sample_noise=noise,
@@ -276,14 +279,12 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         readout_phase=estimated.readout_phase,
         intensity_drift=estimated.intensity_drift,
         sample_motion=estimated.sample_motion,
-        evaluation={axis: evaluate_axis(motion.axes[axis], *truth.angles[axis]) for axis in truth.angles}
-        if truth
-        else {},
+        evaluation={axis: evaluate_axis(motion.axes[axis], *angle) for axis, angle in angles.items()},
         truth=truth,
         defects=list(prepared.defects),
         unlocated_samples=sum(stop - first for first, stop in gridded.unlocated),
         affected=gridded.affected,
-        limits=[*describe_saturation(intensity), *estimate.limits],
+        limits=[*describe_saturation(intensity), *describe_detector_gaps(*samples), *estimate.limits],
         notes=[
             *estimated.field_notes,
             *gridded.field_notes,

@@ -110,7 +110,7 @@ def relative_to_sample(beam: Motion, motion: SampleMotion | None, grid: Grid) ->
     return replace(beam, axes=axes)
 
 
-def describe_sample_motion(motion: SampleMotion | None, sample_rate: float) -> str:
+def describe_sample_motion(motion: SampleMotion | None) -> str:
     """What a reader has to know of the motion that was removed, in a line."""
     if motion is None:
         return "sample motion: the scan crosses itself too rarely to determine one; nothing was removed"
@@ -127,5 +127,5 @@ def describe_sample_motion(motion: SampleMotion | None, sample_rate: float) -> s
     sd = float(np.sqrt(np.mean(motion.sd**2)))
     return (
         f"sample motion: {range_x:.2g} x {range_y:.2g} pixels peak to peak (x, y), known to {sd:.1g} pixels at each "
-        f"moment, was removed; frequencies up to {0.5 * sample_rate / motion.length:.3g} Hz are followed"
+        "moment, was removed; a vibration of hundreds of hertz may be left, which that standard deviation leaves out"
     )

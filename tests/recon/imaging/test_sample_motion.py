@@ -57,7 +57,7 @@ def test_a_sample_at_rest_is_reported_at_rest() -> None:
     assert not found.moving
     assert found.gain < 0.5 * MIN_LOG_LIKELIHOOD_GAIN
     assert not found.shift.any()
-    assert "none was found" in describe_sample_motion(found, RATE)
+    assert "none was found" in describe_sample_motion(found)
 
 
 def test_a_breathing_sample_is_followed_within_its_standard_deviation() -> None:
@@ -119,11 +119,11 @@ def test_a_scene_without_structure_and_a_scan_without_crossings_are_stated() -> 
     found = estimate_sample_motion(flat, PERIOD, (PIXELS, PIXELS))
     assert found is not None
     assert not found.moving
-    assert "too little structure" in describe_sample_motion(found, RATE)
+    assert "too little structure" in describe_sample_motion(found)
     line = (0.5 + 4.0 * (np.arange(samples.x.size) // 1800)).astype(np.float32)
     raster = ScanSamples(samples.x, line, samples.value)
     assert estimate_sample_motion(raster, 1800.0, (PIXELS, PIXELS)) is None
-    assert "too rarely" in describe_sample_motion(None, RATE)
+    assert "too rarely" in describe_sample_motion(None)
 
 
 @pytest.mark.slow
@@ -147,3 +147,10 @@ def test_the_command_removes_a_motion_and_states_it(tmp_path: Path) -> None:
     rows = list(csv.DictReader((out / "sample_motion.csv").open()))
     assert abs(float(rows[-1]["x_px"]) - float(rows[0]["x_px"])) == pytest.approx(4.0, abs=0.5)
     assert "Motion of the sample" in (out / "report.html").read_text()
+
+
+def test_the_note_of_a_removed_motion_says_what_may_be_left() -> None:
+    shift = np.array([[0.0, 0.0], [3.0, 1.0]])
+    note = describe_sample_motion(SampleMotion(1000, np.array([0.0, 1e5]), shift, np.full((2, 2), 0.05), True, 99.0))
+    assert "3 x 1 pixels peak to peak" in note
+    assert "a vibration of hundreds of hertz may be left" in note
