@@ -53,7 +53,8 @@ def measure_spectrum(sums: Array, counts: Array) -> Array:
     """
     variances = _fit_covariance(*_measure_covariance(sums, counts))
     down, across = (_mode_powers(size) for size in sums.shape)
-    return np.asarray(down @ variances @ across.T + RELATIVE_SPECTRUM_FLOOR * variances.sum() + np.finfo(float).tiny)
+    floor = max(RELATIVE_SPECTRUM_FLOOR * float(variances.sum()), float(np.finfo(np.float32).tiny))
+    return np.asarray(down @ variances @ across.T + floor)
 
 
 def stationary_mean(
@@ -134,10 +135,13 @@ def _fit_covariance(covariance: Array, pairs: Array) -> Array:
     """Variances of the Gaussian covariances, shape (lengths down, lengths across); lag 0, which has noise, is not used.
 
     A lag counts by its number of pairs and the inverse square of its distance: the values near a pixel determine it.
+    All variances are 0 where no lag has enough pairs.
     """
     down, across = (np.arange(size)[:, None] for size in covariance.shape)
     distance = np.hypot(down, across.T)
     used = (pairs >= MIN_PAIRS) & (distance > 0) & (distance <= MAX_LAG_PX)
+    if not used.any():
+        return np.zeros((LENGTHS_PX.size, LENGTHS_PX.size))
     shapes = [np.exp(-0.5 * (lag / LENGTHS_PX) ** 2) for lag in (down, across)]
     basis = np.einsum("ip,jq->ijpq", *shapes)[used].reshape(np.count_nonzero(used), -1)
     weight = np.sqrt(pairs[used]) / (1.0 + distance[used])

@@ -85,6 +85,20 @@ def test_a_scene_without_structure_has_its_mean() -> None:
     assert stationary_mean(means, samples.counts, spectrum, 7.0) == pytest.approx(np.full((SIZE, SIZE), 7.0))
 
 
+@pytest.mark.parametrize(("visited", "scene"), [(0.01, "texture"), (0.3, "noise"), (1.0, "noise")])
+def test_samples_without_a_covariance_have_a_picture(visited: float, scene: str) -> None:
+    """Too few pairs of pixels at any lag, or pixels that do not correlate at all."""
+    rng = np.random.default_rng(8)
+    values = texture(2.0, 2.0)[:48, :31] if scene == "texture" else rng.normal(size=(48, 31))
+    counts = (rng.random(values.shape) < visited).astype(float)
+    held = counts * (rng.random(values.shape) < 0.2)
+    samples = SplitSums(1e-6 * values * counts, counts, 1e-6 * values * held, held)
+    estimate = posterior_picture(samples, SampleNoise(0.0, 0.0, 0.0))
+    reached = np.isfinite(estimate.image)
+    assert reached.any()
+    assert np.isfinite(estimate.sd[reached]).all()
+
+
 def test_only_detail_of_the_size_of_a_pixel_is_larger_at_the_centres() -> None:
     fine, coarse = (
         centre_variance_ratio(measure_spectrum(texture(width, width), np.ones((SIZE, SIZE))), 1e-6)
