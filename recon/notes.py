@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.imaging.phase_agreement import describe_contradictions
+from recon.imaging.picture import Grid
 from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
+from recon.quality.detector_gaps import describe_detector_gaps
+from recon.sample_ranges import SampleRanges
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
@@ -19,6 +23,40 @@ COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative."""
 
 
+MIN_RISES = 1000
+"""Changes of an intensity, all in one direction, from which it is a running sum: noise alone has as many of either."""
+
+
+def describe_limits(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> list[str]:
+    """What the picture does not show, a line each.
+
+    Args:
+        beam, intensity, grid, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
+    """
+    sums = describe_running_sums(intensity)
+    return [
+        *(sums or describe_contradictions(beam, intensity)),
+        *describe_saturation(intensity),
+        *describe_detector_gaps(beam, intensity, grid, unlocated),
+    ]
+
+
+def describe_running_sums(intensity: Channel) -> list[str]:
+    """A line for each detector whose samples only rise, or only fall: a counter that is never reset."""
+    values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
+    lines = []
+    for name, column in zip(_detector_names(intensity), values.reshape(len(values), -1).T, strict=True):
+        steps = np.diff(column[np.isfinite(column)])
+        rises, falls = int(np.sum(steps > 0.0)), int(np.sum(steps < 0.0))
+        if max(rises, falls) >= MIN_RISES and min(rises, falls) == 0:
+            lines.append(
+                f"{name}: {'rises' if rises else 'falls'} at all of the {max(rises, falls)} samples at which it "
+                "changes, so that it is a running sum (a counter or an integrator), and the picture is wrong: record "
+                "the difference of successive samples"
+            )
+    return lines
+
+
 def describe_saturation(intensity: Channel) -> list[str]:
     """A line for each detector of which many samples stand exactly at the largest value.
 
@@ -26,8 +64,7 @@ def describe_saturation(intensity: Channel) -> list[str]:
         intensity: shape (n,) or (n, detectors).
     """
     rails = detector_rails(intensity)
-    several = intensity.detectors or [f"detector {number}" for number in range(len(rails))]
-    names = [f"intensity, {name}" for name in several] if len(rails) > 1 else ["intensity"]
+    names = _detector_names(intensity)
     checked = min(intensity.size, MAX_CHECKED_SAMPLES)
     return [
         f"{name}: {rail[1] / checked:.2%} of the samples stand at the largest value, {rail[0]:.4g} {intensity.unit}: "
@@ -36,6 +73,13 @@ def describe_saturation(intensity: Channel) -> list[str]:
         for name, rail in zip(names, rails, strict=True)
         if rail is not None
     ]
+
+
+def _detector_names(intensity: Channel) -> list[str]:
+    """Name of each detector in messages."""
+    count = intensity.shape[1] if len(intensity.shape) == 2 else 1
+    several = intensity.detectors or [f"detector {number}" for number in range(count)]
+    return [f"intensity, {name}" for name in several] if count > 1 else ["intensity"]
 
 
 def describe_negative_counts(intensity: Channel) -> list[str]:

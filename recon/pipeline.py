@@ -34,14 +34,13 @@ from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.notes import (
     describe_ambiguous_signs,
     describe_clock_jumps,
+    describe_limits,
     describe_long_frames,
     describe_negative_counts,
-    describe_saturation,
 )
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
-from recon.quality.detector_gaps import describe_detector_gaps
 from recon.quality.dropped_samples import find_timing_break, first_late_slice, restore_timing, slices_aligned
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
@@ -284,7 +283,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         defects=list(prepared.defects),
         unlocated_samples=sum(stop - first for first, stop in gridded.unlocated),
         affected=gridded.affected,
-        limits=[*describe_saturation(intensity), *describe_detector_gaps(*samples), *estimate.limits],
+        limits=[*describe_limits(*samples), *estimate.limits],
         notes=[
             *estimated.field_notes,
             *gridded.field_notes,

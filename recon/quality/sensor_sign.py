@@ -29,6 +29,14 @@ and a delay of the readout adds less than 30."""
 MIN_DRIVEN_FRACTION = 0.5
 """Fraction of a motion's power at its drive's frequency from which its phase to the drive is used."""
 
+MAX_DECAY = 0.05
+"""Relative decrease of a motion's amplitude from the first to the last quarter of the compared samples up to which its
+phase to the drive is used. A motion that decays, as after a start or in a beat with its resonance, may lead its torque:
+it then gives energy back."""
+
+MAX_WINDOWS = 8
+"""Parts of a recording, from its end to its start, in which a motion that does not decay is looked for."""
+
 MIN_DETUNING_WIDTHS = 3.0
 """Distance from the resonance, over its uncertainty and its width, from which the device predicts the sign of the
 response: three standard deviations."""
@@ -126,7 +134,7 @@ def _lead_of_torque(
         frequency = tone_frequency(drive)
     except BadInput:
         return None
-    phasors = _common_phasors(channel, drive, frequency)
+    phasors = _steady_phasors(channel, drive, frequency)
     if phasors is None or 0.5 * abs(phasors[0]) ** 2 <= MIN_DRIVEN_FRACTION * phasors[2]:
         return None
     angle = phasors[0] / (gain * 1j**order)
@@ -167,12 +175,27 @@ def _sign_by_angle(recording: Recording, axis: Axis, name: str) -> int:
     return int(np.sign(cosine)) if abs(cosine) > MIN_PHASE_SHARE else 0
 
 
-def _common_phasors(first: Channel, second: Channel, frequency: float) -> tuple[complex, complex, float] | None:
-    """Phasors of two channels at ``frequency`` [Hz] over the same time, and the variance of the first.
+def _steady_phasors(motion: Channel, drive: Channel, frequency: float) -> tuple[complex, complex, float] | None:
+    """Phasors as ``_common_phasors`` in the last part of a recording in which the motion does not decay, else None."""
+    start, stop = max(motion.start, drive.start), min(motion.end, drive.end)
+    length = COMPARED_SAMPLES / max(motion.sample_rate, drive.sample_rate)
+    count = int(np.clip((stop - start) // length, 1, MAX_WINDOWS))
+    for begin in np.linspace(max(stop - length, start), start, count).tolist():
+        quarter = 0.25 * (min(begin + length, stop) - begin)
+        early, late = (_phasor(motion, at, at + quarter, frequency)[1] for at in (begin, begin + 3.0 * quarter))
+        if late >= (1.0 - MAX_DECAY) ** 2 * early:
+            return _common_phasors(motion, drive, frequency, begin)
+    return None
+
+
+def _common_phasors(
+    first: Channel, second: Channel, frequency: float, begin: float = -np.inf
+) -> tuple[complex, complex, float] | None:
+    """Phasors of two channels at ``frequency`` [Hz] from ``begin`` [s] on, and the variance of the first.
 
     None if they share no period, or one is too slow to show it.
     """
-    start, stop = max(first.start, second.start), min(first.end, second.end)
+    start, stop = max(first.start, second.start, begin), min(first.end, second.end)
     stop = min(stop, start + COMPARED_SAMPLES / max(first.sample_rate, second.sample_rate))
     if not (stop - start) * frequency > 1.0 or min(first.sample_rate, second.sample_rate) < 2.0 * frequency:
         return None

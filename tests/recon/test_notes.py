@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.notes import describe_long_frames, describe_negative_counts, describe_saturation
+from recon.notes import describe_long_frames, describe_negative_counts, describe_running_sums, describe_saturation
 from scanner.arrays import Array
 from scanner.channel import Channel
 
@@ -46,3 +46,13 @@ def test_a_frame_longer_than_the_recording_is_stated() -> None:
     assert "2 s is longer than the intensity, 1 s" in note
     for frame_time in (None, 0.5, 1.0, 1.0005):
         assert describe_long_frames(frame_time, second) == []
+
+
+def test_a_running_sum_is_named_and_a_slow_drift_is_not() -> None:
+    counts = np.random.default_rng(3).poisson(2.0, 20_000).astype(float)
+    (note,) = describe_running_sums(detector(np.cumsum(counts)))
+    assert "running sum" in note
+    (note,) = describe_running_sums(detector(np.column_stack([counts, -np.cumsum(counts)])))
+    assert note.startswith("intensity, detector 1: falls at all of the")
+    assert describe_running_sums(detector(counts + np.linspace(0.0, 100.0, counts.size))) == []
+    assert describe_running_sums(detector(np.linspace(0.0, 1.0, 900))) == []

@@ -22,7 +22,7 @@ from recon.preparation import prepare
 from recon.quality import line_search
 from recon.quality.line_search import search_lines
 from recon.quality.sensor_noise import POSITION_ESTIMATORS, SENSE_ESTIMATORS, check_sensor_noise
-from recon.quality.sensor_sign import describe_unconfirmed_signs
+from recon.quality.sensor_sign import describe_inverted_sensors, describe_unconfirmed_signs
 from recon.reconstruction import Options
 from scanner.channel import make_channel
 from scanner.device import Device
@@ -298,3 +298,16 @@ def test_a_slow_drive_of_few_cycles_is_not_refused(cycles: int) -> None:
     recording = scan(drive_x=drive, sense_x=moved)
     assert check_sensor_noise(recording, DEVICE, "sensor") == []
     assert check_sensor_noise(recording, DEVICE, "ukf") == []
+
+
+@pytest.mark.parametrize("seconds", [0.005, 0.008])
+def test_a_motion_that_decays_after_a_jump_of_its_drive_is_not_called_inverted(seconds: float) -> None:
+    frequency, quality = FREQUENCY["x"], 100.0
+    time = np.arange(round(seconds * RATE)) / RATE
+    drive = 10.0 * np.cos(2 * np.pi * frequency * time)
+    size = 1.0 - 2.0 * np.exp(-np.pi * frequency / quality * time)
+    moved = scan(drive_x=(drive, "V", RATE), sense_x=(size * np.sin(2 * np.pi * frequency * time), "V", RATE))
+    assert list(describe_inverted_sensors(moved, DEVICE)) == []
+    steady = scan(drive_x=(drive, "V", RATE), sense_x=(-np.sin(2 * np.pi * frequency * time), "V", RATE))
+    (line,) = describe_inverted_sensors(steady, DEVICE)
+    assert "sense_x: the motion leads drive_x" in line
