@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimation.rail import upper_rail
 from recon.imaging.phase_agreement import describe_contradictions
 from recon.imaging.picture import Grid
 from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
@@ -23,6 +24,13 @@ COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative."""
 
 
+MIN_NEGATIVE_SHARE = 0.95
+"""Share of negative samples from which a voltage is taken for that of an inverting detector. A detector that is coupled
+without its mean has about a half."""
+
+MAX_SCANNER_HZ = 1e5
+"""Frequency above which a motion is doubted: mirrors, fibres and stages that scan light resonate below 0.1 MHz."""
+
 MIN_RISES = 1000
 """Changes of an intensity, all in one direction, from which it is a running sum: noise alone has as many of either."""
 
@@ -37,6 +45,7 @@ def describe_limits(beam: Motion, intensity: Channel, grid: Grid, unlocated: Sam
     return [
         *(sums or describe_contradictions(beam, intensity)),
         *describe_saturation(intensity),
+        *describe_lower_rail(intensity),
         *describe_detector_gaps(beam, intensity, grid, unlocated),
     ]
 
@@ -75,11 +84,52 @@ def describe_saturation(intensity: Channel) -> list[str]:
     ]
 
 
+def describe_lower_rail(intensity: Channel) -> list[str]:
+    """A line for each detector of which many samples stand exactly at the smallest value, which is not 0.
+
+    Samples at 0 are no error: darkness of a detector that counts photons.
+
+    Args:
+        intensity: shape (n,) or (n, detectors).
+    """
+    values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
+    lines = []
+    for name, column in zip(_detector_names(intensity), values.reshape(len(values), -1).T, strict=True):
+        finite = column[np.isfinite(column)]
+        rail = upper_rail(-finite) if finite.size else None
+        if rail is not None and rail[0] != 0.0:
+            lines.append(
+                f"{name}: {rail[1] / len(values):.2%} of the samples stand at the smallest value, {-rail[0]:.4g} "
+                f"{intensity.unit}: the signal is clipped there, and dark places appear too bright; change the offset "
+                "or the range of the converter"
+            )
+    return lines
+
+
+def describe_polarity(intensity: Channel) -> list[str]:
+    """A line for each detector of which nearly all samples are negative; counts have ``describe_negative_counts``."""
+    values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
+    if intensity.unit in COUNT_UNITS:
+        return []
+    shares = np.mean(values.reshape(len(values), -1) < 0.0, axis=0)
+    return [
+        f"{name}: {share:.0%} of the samples are negative: if the detector's pulses are negative, bright places appear "
+        "dark; invert the channel (gain = -1)"
+        for name, share in zip(_detector_names(intensity), shares, strict=True)
+        if share >= MIN_NEGATIVE_SHARE
+    ]
+
+
 def _detector_names(intensity: Channel) -> list[str]:
     """Name of each detector in messages."""
     count = intensity.shape[1] if len(intensity.shape) == 2 else 1
     several = intensity.detectors or [f"detector {number}" for number in range(count)]
     return [f"intensity, {name}" for name in several] if count > 1 else ["intensity"]
+
+
+def describe_intensity(intensity: Channel) -> list[str]:
+    """Lines on the values of an intensity that are doubtful."""
+    return [*describe_negative_counts(intensity), *describe_polarity(intensity)]
 
 
 def describe_negative_counts(intensity: Channel) -> list[str]:
@@ -104,12 +154,27 @@ def describe_long_frames(frame_time: float | None, intensity: Channel) -> list[s
     ]
 
 
+def describe_motion(motion: Motion, intensity: Channel) -> list[str]:
+    """Lines on a motion that is doubtful or not fully determined."""
+    return [*describe_fast_axes(motion, intensity), *describe_ambiguous_signs(motion)]
+
+
 def describe_ambiguous_signs(motion: Motion) -> list[str]:
     """A line for each axis of which the recording does not determine the sign."""
     return [
         f"the sign of {axis} is ambiguous: the picture may be mirrored; --flip-{axis} turns it"
         for axis in AXES
         if motion.axes[axis].sign == "ambiguous"
+    ]
+
+
+def describe_fast_axes(motion: Motion, intensity: Channel) -> list[str]:
+    """A line for each axis that moves faster than scanners do, as where times in ms are stated for seconds."""
+    return [
+        f"{name} moves at {frequency:.4g} Hz, and mirrors, fibres and stages move below {MAX_SCANNER_HZ:.0e} Hz: "
+        f"check the unit of time and sample_rate, {intensity.sample_rate:.4g} Hz"
+        for name, frequency in ((name, float(np.median(axis.frequency))) for name, axis in motion.axes.items())
+        if frequency > MAX_SCANNER_HZ
     ]
 
 

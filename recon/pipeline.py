@@ -32,11 +32,11 @@ from recon.imaging.sample_motion import SampleMotion
 from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion, relative_to_sample
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.notes import (
-    describe_ambiguous_signs,
     describe_clock_jumps,
+    describe_intensity,
     describe_limits,
     describe_long_frames,
-    describe_negative_counts,
+    describe_motion,
 )
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
@@ -289,9 +289,9 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *gridded.field_notes,
             *prepared.unknown_entries,
             *estimated.motion_notes,
-            *describe_ambiguous_signs(motion),
+            *describe_motion(motion, intensity),
             *describe_defects(prepared.defects),
-            *describe_negative_counts(intensity),
+            *describe_intensity(intensity),
             *estimate.notes,
             *describe_long_frames(options.frame_time, intensity),
         ],

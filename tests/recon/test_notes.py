@@ -4,9 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.notes import describe_long_frames, describe_negative_counts, describe_running_sums, describe_saturation
+from recon.notes import (
+    describe_fast_axes,
+    describe_long_frames,
+    describe_lower_rail,
+    describe_negative_counts,
+    describe_polarity,
+    describe_running_sums,
+    describe_saturation,
+)
 from scanner.arrays import Array
 from scanner.channel import Channel
+from scanner.motion import AxisMotion, Motion, SampledAngle
 
 
 def detector(values: Array) -> Channel:
@@ -56,3 +65,35 @@ def test_a_running_sum_is_named_and_a_slow_drift_is_not() -> None:
     assert note.startswith("intensity, detector 1: falls at all of the")
     assert describe_running_sums(detector(counts + np.linspace(0.0, 100.0, counts.size))) == []
     assert describe_running_sums(detector(np.linspace(0.0, 1.0, 900))) == []
+
+
+def test_a_detector_clipped_at_its_lower_rail_is_named() -> None:
+    light = np.random.default_rng(4).normal(0.0, 0.3, 10_000)
+    assert describe_lower_rail(detector(light)) == []
+    level = float(np.quantile(light, 0.1))
+    (note,) = describe_lower_rail(detector(np.maximum(light, level)))
+    assert "10.00% of the samples" in note
+    assert f"{level:.4g} V" in note
+    assert describe_saturation(detector(np.maximum(light, level))) == []
+
+
+def test_photon_counts_of_a_dark_scene_are_not_clipped() -> None:
+    scene = np.repeat([0.0, 0.05, 2.0, 200.0], 25_000)
+    assert describe_lower_rail(detector(np.random.default_rng(5).poisson(scene).astype(float))) == []
+
+
+def test_a_detector_of_negative_pulses_is_named_and_one_without_its_mean_is_not() -> None:
+    light = np.random.default_rng(6).poisson(20.0, 1000).astype(float)
+    (note,) = describe_polarity(detector(-light))
+    assert note.startswith("intensity: 100% of the samples are negative")
+    assert describe_polarity(detector(light - light.mean())) == []
+    assert describe_polarity(replace(detector(-light), unit="counts")) == []
+
+
+def test_a_motion_faster_than_any_scanner_is_noted() -> None:
+    knots, zero = np.array([0.0, 1.0]), np.zeros(2)
+    axis = AxisMotion(knots, zero, zero + 0.1, zero + 2e6, zero, SampledAngle(np.zeros(4), 1e9))
+    slow = replace(axis, frequency=zero + 5e4)
+    (note,) = describe_fast_axes(Motion({"x": axis, "y": slow}, "sensor"), detector(np.zeros(4)))
+    assert note.startswith("x moves at 2e+06 Hz")
+    assert "unit of time" in note
