@@ -95,6 +95,11 @@ class Fit:
         return float(np.mean(self.residual[self.validation_rows] ** 2))
 
 
+def misfit(fit: Fit) -> float:
+    """What a fit minimises: chi-square and the priors' penalty."""
+    return fit.chi2 + fit.penalty
+
+
 def held_out_samples(size: int, guard: tuple[int, int] = (0, 0)) -> Mask:
     """Samples of a channel that no fit uses, shape (size,): every fifth block, without the guards at its ends."""
     block = np.floor((np.arange(size) + 0.5) / size * TIME_BLOCKS).astype(int)

@@ -48,7 +48,8 @@ def improve(result: SelectionResult) -> Improvement:
 
     As long as the device with all findings predicts worse than the nominal one, beyond the uncertainty of the
     comparison, the weakest finding is removed. A discrepancy term always remains a finding, but if the device with its
-    measured law predicts any channel of any run worse, the nominal device is returned.
+    measured law predicts any channel of any run worse, the device with the named laws alone is returned, or the nominal
+    one if that is worse too.
     """
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
@@ -57,11 +58,17 @@ def improve(result: SelectionResult) -> Improvement:
         device = improved_device(fit_static_law(result) if unnamed else result.final)
         improved = open_loop(runs, device)
         if unnamed or not result.steps:
-            better = all(_is_better([run], stated, device) for run in runs)
-            return Improvement(result, device if better else stated, nominal, improved if better else nominal)
+            options = [device, *([_without_discrepancy(result)] if unnamed and len(result.steps) > 1 else [])]
+            better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
+            return Improvement(result, better, nominal, open_loop(runs, better))
         if not is_worse(nominal, improved):
             return Improvement(result, device, nominal, improved)
         result = without_weakest(result)
+
+
+def _without_discrepancy(result: SelectionResult) -> Device:
+    """The device with the named laws alone."""
+    return improved_device(refit_without(result.likelihood, result.final, result.final.model.candidates[-1]))
 
 
 def _is_better(runs: Sequence[Run], stated: Device, device: Device) -> bool:

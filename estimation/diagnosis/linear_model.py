@@ -15,20 +15,15 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.exchange import MIN_EXCHANGE_GAIN, RivalFit
-from estimation.diagnosis.fit import Fit, Likelihood
-from estimation.diagnosis.model import uncertain
 from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import (
     ScoreTest,
     is_amplitude,
-    is_linear,
-    score_candidate_starts,
 )
 from estimation.least_squares import regress, triangular_factor
 from scanner.arrays import Array
@@ -53,11 +48,45 @@ MAX_SCALE_BESIDE = 0.1
 """Largest scale of a discrepancy beside which laws are selected, in units of its prior: a tenth of a discrepancy that
 explains a misfit by itself."""
 
+MIN_EXPLAINED_RATIO = 0.1
+"""Fall of the misfit by laws over that by free corrections beside them, from which laws may be the answer. Nominal
+values absorb most of a drift, so that a small imperfection may be larger than what is left of the drift: a true one had
+0.3. Laws that imitated an unlisted effect had 0.04 and less."""
+
+MAX_REMAINDER_RATIO = 0.03
+"""Fall of the misfit by free corrections beside laws, over that by the laws, up to which the laws take the bulk of it.
+Gravity and friction of a measured pendulum leave 3 %, a cubic spring in the place of a stop on one side 4 %."""
+
+POLYNOMIAL_SPRINGS = frozenset({"quadratic-stiffness", "cubic-stiffness", "quintic-stiffness"})
+"""Powers of the angle, of which several together approximate any spring: they do not count as the bulk of a misfit."""
+
+SMALL_LAW_MARGIN = 25.0
+"""Advantage in -2 log evidence over a discrepancy alone that laws need which leave more. A quintic spring that imitates
+a delay with memory has 12, laws beside the imperfections of ``cases_imperfect`` have 62 and more."""
+
+NULL_DRAWS, NULL_SEED = 10_000, 1
+"""Draws of noise for the distribution of the largest gain in noise alone, which determine its 99.9 % quantile to 0.4,
+and the seed of them."""
+
+MIN_EXCHANGE_GAIN = 0.1
+"""Decrease of -2 log evidence from which a law is exchanged: twice the tolerance of a fit."""
+
 MAX_LAWS = 3
 """Laws that are selected together."""
 
-MAX_STARTS = 3
-"""Values of a law's time constant or frequency that stand for it in the linear model."""
+
+class RivalFit(NamedTuple):
+    """A rival of a term.
+
+    Attributes:
+        evidence_gap: its -2 log evidence minus that of the term.
+        candidate: the rival.
+        misfit_gap: its misfit (chi-square and penalty) minus that of the term, without the cost of its parameters.
+    """
+
+    evidence_gap: float
+    candidate: Candidate
+    misfit_gap: float
 
 
 @dataclass(frozen=True)
@@ -92,10 +121,6 @@ class Hypothesis:
     scales: Array
     neg2_log_evidence: float
     misfit: float
-
-
-def _score(hypothesis: Hypothesis) -> float:
-    return hypothesis.neg2_log_evidence + MIN_SCORE_GAIN * len(hypothesis.laws)
 
 
 @dataclass(frozen=True)
@@ -158,17 +183,65 @@ class LinearModel:
         all_scales[[i for i in range(len(self._groups)) if i not in without]] = values
         return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes, misfit)
 
-    def select(self) -> Hypothesis:
-        """The laws beside a small discrepancy that no addition, removal or exchange improves.
+    def select(self, laws: Sequence[int] = (), max_moves: int | None = None) -> Hypothesis:
+        """The laws beside a small discrepancy after the moves that improve them most: additions, removals, exchanges.
 
-        Each has to gain ``MIN_SCORE_GAIN``.
+        Each law has to gain ``MIN_SCORE_GAIN``, and a second or third law more than the discrepancy beside them still
+        gains: a law that gains less imitates what no law describes.
+
+        Args:
+            laws: to start from.
+            max_moves: None for as many as there are.
         """
-        best = self.hypothesis((), max_scale=MAX_SCALE_BESIDE)
-        while True:
-            better = min(self._moves(best), key=_score, default=best)
-            if _score(better) > _score(best) - MIN_EXCHANGE_GAIN:
-                return best
-            best = better
+        best = self.hypothesis(self._without_imitations(tuple(laws)), max_scale=MAX_SCALE_BESIDE)
+        while max_moves is None or max_moves > 0:
+            limit = self._score(best) - MIN_EXCHANGE_GAIN
+            moves = sorted((move for move in self._moves(best) if self._score(move) < limit), key=self._score)
+            better = next((move for move in moves if self._is_possible(move.laws)), None)
+            if better is None:
+                break
+            best, max_moves = better, None if max_moves is None else max_moves - 1
+        return best
+
+    def _score(self, hypothesis: Hypothesis) -> float:
+        """-2 log evidence with the price of each law. A discrepancy alone has the price of one law."""
+        if hypothesis.laws:
+            return hypothesis.neg2_log_evidence + MIN_SCORE_GAIN * len(hypothesis.laws)
+        nothing = self.hypothesis((), without=range(len(self.discrepancies)))
+        return min(nothing.neg2_log_evidence, hypothesis.neg2_log_evidence + MIN_SCORE_GAIN)
+
+    def _is_possible(self, laws: tuple[int, ...]) -> bool:
+        """Whether no law is an imitation, and all estimates have a physically possible sign."""
+        if self._without_imitations(laws) != laws:
+            return False
+        estimates, first = self.estimate([self.laws[i] for i in laws]), 0
+        for i in laws:
+            candidate = self.laws[i].candidate
+            signs = [p.sign for p in candidate.term.free_parameters if is_amplitude(candidate, p)]
+            if any(sign * estimates[first + j] < 0.0 for j, sign in enumerate(signs)):
+                return False
+            first += self.laws[i].columns.size
+        return True
+
+    def estimate(self, terms: Sequence[LinearTerm]) -> Array:
+        """Estimates of terms without others, one after the other."""
+        at = np.array([column for term in terms for column in term.columns], int)
+        regression = regress(self.factor[:, at], self.factor[:, -1:], np.ones(at.size))
+        return np.asarray(-np.linalg.solve(regression.factor, regression.projected[:, 0]))
+
+    def _without_imitations(self, laws: tuple[int, ...]) -> tuple[int, ...]:
+        """Several laws without those that gain less than the discrepancy beside all of them, the least first."""
+        while len(laws) > 1:
+            rests = [tuple(law for law in laws if law != removed) for removed in laws]
+            closest = min(rests, key=self._misfit)
+            if self._misfit(closest) - self._misfit(laws) > self.gain_of_discrepancy(laws):
+                break
+            laws = closest
+        return laws
+
+    def _misfit(self, laws: Sequence[int]) -> float:
+        """Of laws without a discrepancy."""
+        return self.hypothesis(laws, without=range(len(self.discrepancies))).misfit
 
     def _moves(self, best: Hypothesis) -> Iterator[Hypothesis]:
         if len(best.laws) < MAX_LAWS:
@@ -206,19 +279,21 @@ class LinearModel:
             first = last
         return np.array(gains)
 
-    def estimate(self, laws: Sequence[int]) -> tuple[Array, Array]:
-        """Estimates of laws without a discrepancy, and of what every hypothesis contains beside them, shape (p,).
+    def strongest(self, number: int) -> list[tuple[int, ...]]:
+        """The single laws of different effects with the best evidence beside a small discrepancy."""
+        singles = [self.hypothesis((i,), max_scale=MAX_SCALE_BESIDE) for i in range(len(self.laws))]
+        best: dict[frozenset[str], tuple[int, ...]] = {}
+        for single in sorted(singles, key=lambda hypothesis: hypothesis.neg2_log_evidence):
+            best.setdefault(self.effects(single.laws), single.laws)
+        return list(best.values())[:number]
 
-        The estimates of the laws follow each other in the order of ``laws``.
-        """
-        at = np.array([column for i in laws for column in self.laws[i].columns], int)
-        regression = regress(self.factor[:, at], self.factor[:, -1:], np.ones(at.size))
-        of_laws = np.asarray(-np.linalg.solve(regression.factor, regression.projected[:, 0]))
-        return of_laws, -(self.profile[:, at] @ of_laws + self.profile[:, -1])
+    def describe(self, laws: Iterable[int]) -> str:
+        """Names of laws as text."""
+        return ", ".join(sorted(self.effects(laws))) or "no named law"
 
-    def effects(self, laws: Iterable[int]) -> set[str]:
+    def effects(self, laws: Iterable[int]) -> frozenset[str]:
         """Names of laws."""
-        return {self.laws[i].candidate.term.effect for i in laws}
+        return frozenset(self.laws[i].candidate.term.effect for i in laws)
 
     def rivals(self, hypothesis: Hypothesis, law: int) -> tuple[RivalFit, ...]:
         """Other laws in the place of one, the best of each first.
@@ -234,78 +309,41 @@ class LinearModel:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
-    def are_needed(self, laws: Sequence[int], imitation_margin: float, margin: float) -> bool:
+    def are_needed(self, laws: Sequence[int], explained: float) -> bool:
         """Whether a discrepancy without bound on its scales needs laws beside it.
 
+        They have to explain ``MIN_EXPLAINED_RATIO`` of what the discrepancy beside them still does. Laws that do not
+        take the bulk of the misfit also need an advantage in evidence of ``SMALL_LAW_MARGIN``.
+
         Args:
-            imitation_margin: advantage in -2 log evidence that laws need over a discrepancy alone that fits better.
-            margin: advantage that they need in any case.
+            explained: fall of the misfit by the laws.
         """
-        alone, beside = self.hypothesis(()), self.hypothesis(laws)
-        fits_better = alone.misfit < beside.misfit - MIN_SCORE_GAIN
+        beside, alone = self.hypothesis(laws), self.hypothesis(())
+        without = self.hypothesis(laws, without=range(len(self.discrepancies)))
+        remainder = without.misfit - beside.misfit
+        if explained < MIN_EXPLAINED_RATIO * remainder:
+            return False
+        significant = without.neg2_log_evidence - beside.neg2_log_evidence > MIN_SCORE_GAIN
+        series = len(self.effects(laws) & POLYNOMIAL_SPRINGS) > 1
+        bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
         advantage = alone.neg2_log_evidence - beside.neg2_log_evidence
-        return advantage > (imitation_margin if fits_better else margin)
+        return advantage > (0.0 if bulk else SMALL_LAW_MARGIN)
 
-    def gain_of_discrepancy(self, laws: Sequence[int], stage: str | None = None) -> float:
-        """Fall of the misfit by the discrepancy terms of one stage, or of all, beside laws and all other terms."""
-        dropped = [i for i, term in enumerate(self.discrepancies) if stage in (None, term.candidate.term.stage)]
-        return max(self.hypothesis(laws, without=dropped).misfit - self.hypothesis(laws).misfit, 0.0)
+    def null_gain(self, probability: float) -> float:
+        """Fall of -2 log evidence that the best of all laws exceeds in noise alone with the given probability.
 
+        The misfit of noise alone is a standard normal vector in the space of the sensitivities.
+        """
+        noise = np.random.default_rng(NULL_SEED).normal(size=(self.factor.shape[0], NULL_DRAWS))
+        largest = np.full(NULL_DRAWS, -np.inf)
+        for law in self.laws:
+            columns = self.factor[:, law.columns]
+            normal = columns.T @ columns + np.eye(law.columns.size)
+            projected = columns.T @ noise
+            gain = np.einsum("id,id->d", projected, np.linalg.solve(normal, projected))
+            largest = np.maximum(largest, gain - np.linalg.slogdet(normal)[1] - law.cost)
+        return float(np.quantile(largest, 1.0 - probability)) if self.laws else 0.0
 
-def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> LinearModel:
-    """The linear model around a fit, of its own terms and of ``candidates``."""
-    rows, base = fit.rows, common_parameters(fit)
-    residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
-    blocks: list[tuple[Candidate, Array, ScoreTest | None, float]] = []
-    for candidate in uncertain(fit.model):
-        columns, part = _part_of_fit(fit, candidate)
-        residual = residual - part
-        blocks.append((candidate, columns, None, _shape_cost(fit, candidate)))
-    present = {candidate.key for candidate in fit.model.candidates}
-    others = [candidate for candidate in candidates if candidate.key not in present and is_linear(candidate)]
-    for tests in score_candidate_starts(likelihood, fit, others):
-        cost = 2.0 * float(np.log(len(tests)))
-        blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
-    whole = np.column_stack([*(columns[rows] for _, columns, *_ in blocks), residual[rows]])
-    common = regress(fit.jacobian[rows][:, base], whole, fit.model.precision[base])
-    profile = np.asarray(np.linalg.solve(common.factor, common.projected))
-    ends = np.cumsum([0, *(columns.shape[1] for _, columns, *_ in blocks)])
-    terms = [
-        LinearTerm(candidate, np.arange(low, high), test, cost)
-        for (candidate, _, test, cost), (low, high) in zip(blocks, pairwise(ends), strict=True)
-    ]
-    discrepancies = tuple(term for term in terms if term.candidate.term.effect in DISCREPANCY_TERMS)
-    laws = tuple(term for term in terms if term.candidate.term.effect not in DISCREPANCY_TERMS)
-    return LinearModel(common.remainder, profile, laws, discrepancies)
-
-
-def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
-    """The best starts of one candidate, where it has an effect."""
-    with_effect = [test for test in tests if np.any(test.columns)]
-    most = 1 if tests[0].candidate.term.effect in DISCREPANCY_TERMS else MAX_STARTS
-    return sorted(with_effect, key=lambda test: -test.predicted_gain)[:most]
-
-
-def _part_of_fit(fit: Fit, candidate: Candidate) -> tuple[Array, Array]:
-    """Sensitivities to the amplitudes of a term of a fit, shape (N, q), and its part of the residual, shape (N,)."""
-    at = [
-        i
-        for i, f in enumerate(fit.model.parameters)
-        if f.owner == candidate.key and f.parameter is not None and is_amplitude(candidate, f.parameter)
-    ]
-    return fit.jacobian[:, at], fit.jacobian[:, at] @ fit.x[at]
-
-
-def _shape_cost(fit: Fit, candidate: Candidate) -> float:
-    """-2 log of posterior over prior volume of the parameters of a term that are no amplitude."""
-    at = [
-        i
-        for i, f in enumerate(fit.model.parameters)
-        if f.owner == candidate.key and f.parameter is not None and not is_amplitude(candidate, f.parameter)
-    ]
-    return -float(np.linalg.slogdet(fit.covariance[np.ix_(at, at)])[1]) if at else 0.0
-
-
-def common_parameters(fit: Fit) -> list[int]:
-    """Indices of the parameters of a fit that belong to no term."""
-    return [i for i, f in enumerate(fit.model.parameters) if f.kind not in ("term", "hidden")]
+    def gain_of_discrepancy(self, laws: Sequence[int]) -> float:
+        """Fall of the misfit by the discrepancy terms of all stages beside laws."""
+        return max(self._misfit(laws) - self.hypothesis(laws).misfit, 0.0)

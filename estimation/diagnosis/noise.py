@@ -65,6 +65,12 @@ class Whitener:
         return int(self.weights.size)
 
     @property
+    def noise_variance(self) -> float:
+        """Variance of the noise of a sample, with the level of the last bin in those that are not compared."""
+        beyond = max(self.size // 2 - self.psd.size, 0)
+        return float(np.sum(self.psd) + beyond * self.psd[-1]) * 2.0 / self.size**2
+
+    @property
     def time(self) -> Array:
         """Position of every whitened sample as a fraction of the recording."""
         return (np.arange(self.samples) + 0.5) / self.samples

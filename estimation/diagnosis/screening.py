@@ -196,17 +196,17 @@ def hidden_state_indices(model: Model, candidate: Candidate) -> list[int]:
     return [i for i, f in enumerate(model.parameters) if f.kind == "hidden" and f.owner == candidate.key]
 
 
-def damped_newton_start(likelihood: Likelihood, base: Fit, score: ScoreTest, stop: float = 1.0) -> Array:
-    """Start of a fit: the first-order step, halved until chi-square grows by less than ``MAX_CHI2_GROWTH``."""
-    rows = base.rows & (likelihood.time < stop)
-    max_chi2 = MAX_CHI2_GROWTH * float(base.residual[rows] @ base.residual[rows])
+def damped_start(likelihood: Likelihood, base: Fit, model: Model, x: Array, step: Array) -> Array:
+    """Start of a fit: ``x`` and a step, halved until chi-square exceeds that of ``base`` by less than a factor of
+    ``MAX_CHI2_GROWTH``."""
+    max_chi2 = MAX_CHI2_GROWTH * base.chi2
     fraction = 1.0
     while fraction > 0.1:
-        residual = likelihood.residual(score.model, score.x + fraction * score.step, stop)[rows]
+        residual = likelihood.residual(model, x + fraction * step)[base.rows]
         if residual @ residual < max_chi2:
             break
         fraction *= 0.5
-    return np.asarray(score.x + fraction * score.step)
+    return np.asarray(x + fraction * step)
 
 
 def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequence[Array], amplitudes: Sequence[int],

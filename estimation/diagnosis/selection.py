@@ -1,20 +1,15 @@
-"""Stepwise selection of terms by evidence: nominal model, noise, one term after the other, joint refit."""
+"""Selection of the laws that a device omits, around fits that have the phase of the motion right."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
+from estimation.diagnosis.anchor import fit_anchor
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.data import Run
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.discrepancy_exchange import (
-    MAX_DISCREPANCY_FITS,
-    ends_with_discrepancy,
-    replace_discrepancy_by_terms,
-)
-from estimation.diagnosis.exchange import RivalFit, RivalFits, exchange_to_convergence, fit_exchanges, rivals_of
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models, misfit
 from estimation.diagnosis.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
 from estimation.diagnosis.initial import (
     estimate_whiteners,
@@ -25,47 +20,21 @@ from estimation.diagnosis.initial import (
 )
 from estimation.diagnosis.interference import with_interference_line
 from estimation.diagnosis.law_selection import choose_laws
+from estimation.diagnosis.linear_model import RivalFit
+from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.diagnosis.model import Model, uncertain
 from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.progressive_fit import fit_candidates_progressively, fit_screened_candidates
 from estimation.diagnosis.pruning import drop_redundant, prune_by_evidence, refit_without
-from estimation.diagnosis.screening import all_candidates
-from estimation.diagnosis.significance import (
-    DETECTION_THRESHOLD,
-    UNIQUE_NAME_THRESHOLD,
-    is_significant,
-    satisfies_sign_constraints,
-)
-from estimation.diagnosis.windows import CHI2_ADEQUATE, CHI2_LINEARISABLE
+from estimation.diagnosis.screening import all_candidates, damped_start, is_linear, score_candidate_starts
+from estimation.diagnosis.significance import DETECTION_THRESHOLD, evidence_gain, satisfies_sign_constraints
 from scanner.device import Device
 from scanner.terms import Term
 
 Progress = Callable[[str], None]
 """Called with one line of text at every step."""
 
-MAX_EFFECTS = 3
-"""Effects that are selected in one diagnosis. It bounds the cost: each effect needs a search among all candidates."""
-
-CHI2_LARGE = 10.0
-"""Held-out reduced chi-square of the nominal device above which several named terms may replace a discrepancy term.
-With a smaller misfit, three terms can explain nearly anything."""
-
-MAX_REMAINING_MISFIT_RATIO = 0.005
-"""Largest ratio of the remaining to the nominal misfit with which several named terms replace a discrepancy term. It
-corresponds to 7 % of the amplitude of the misfit."""
-
-CHI2_INADEQUATE = 1.3
-"""Held-out reduced chi-square above which named terms do not explain the data; probably confounders of the true effect
-were selected."""
-
-CHI2_DIVERGED = 100.0
-"""Reduced chi-square above which the phase error of a fit exceeds half a cycle, so that sensitivities around it do not
-predict the effect of a further term."""
-
-
-REFIT_MARGIN, REFIT_MARGIN_RELATIVE = 80.0, 0.1
-"""Candidates up to this distance from the best in -2 log evidence, or up to this share of the gain of the best, are
-refitted after the noise has been estimated again, because that may change their order."""
+MAX_DISCREPANCY_FITS = 3
+"""Number of discrepancy terms that are fitted, those with the best evidence in the linear model. Each costs a fit."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +44,13 @@ class SelectionStep:
     Attributes:
         candidate: the term.
         before, after: fits without and with the term. Both contain all other selected terms and use the same noise.
-        rivals: terms that were fitted instead of it.
+        rivals: terms that were compared with it.
     """
 
     candidate: Candidate
     before: Fit
     after: Fit
-    rivals: RivalFits
+    rivals: tuple[RivalFit, ...]
 
 
 @dataclass(frozen=True)
@@ -101,13 +70,22 @@ class SelectionResult:
     steps: tuple[SelectionStep, ...] = field(default_factory=tuple)
 
 
+@dataclass(frozen=True)
+class _Selected:
+    """Selected terms: the fit with them, the noise that it leaves, and the rivals of each by its key."""
+
+    likelihood: Likelihood
+    fit: Fit
+    rivals: Mapping[str, tuple[RivalFit, ...]] = field(default_factory=dict)
+
+
 def select_terms(
     runs: Sequence[Run], device: Device, terms: Mapping[str, Term], progress: Progress = lambda text: None
 ) -> SelectionResult:
     """Select the terms that ``device`` omits from ``runs``.
 
-    Where a discrepancy term fits better than any single term but not adequately, several terms may act. They are
-    selected if, added one after the other, they leave almost no misfit and have the better evidence.
+    Named laws are chosen around the nominal fit. If none suffice, they are chosen around the fit of a discrepancy term;
+    if none suffice there either, that term is selected.
 
     Args:
         terms: candidates by effect.
@@ -121,246 +99,106 @@ def select_terms(
     early = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)
     likelihood = Likelihood(runs, min_entropy_whiteners(fit_hum_variants(likelihood, early[-1])))
     nominal = select_mains_hum(likelihood, fit_model(likelihood, model, early[-1].x))
-    named = [term for term in terms.values() if term.effect not in {certain.term.effect for certain in clipped}]
-    states = [SelectionState(likelihood, nominal, nominal, {})]
-    states += _forward_steps(states[0], [*named, *DISCREPANCY_TERMS.values()], early, stops, progress)
-    selected = states[-1]
-    if not selected.settled and len(uncertain(selected.best.model)) > 1:
-        pool = all_candidates(device, selected.best.model, [*named, *DISCREPANCY_TERMS.values()])
-        chosen = _LawChoice(selected.nominal, pool, selected.rivals, progress)
-        if chosen.settles(selected.best) and chosen.state is not None:
-            selected = chosen.state
-    if (
-        ends_with_discrepancy(selected.best)
-        and selected.nominal.validation_chi2 > CHI2_LARGE
-        and selected.best.validation_chi2 > CHI2_ADEQUATE
-    ):
-        several = _accept_while_halving(
-            states[-2], _forward_steps(states[-2], named, early, stops, progress, selected.tried)
-        )
-        enough = several.best.validation_chi2 - 1.0 < MAX_REMAINING_MISFIT_RATIO * (
-            several.nominal.validation_chi2 - 1.0
-        )
-        if (
-            enough
-            and fit_model(selected.likelihood, several.best.model, several.best.x).neg2_log_evidence
-            < selected.best.neg2_log_evidence
-        ):
-            selected = several
-    if ends_with_discrepancy(selected.best):
-        # with the required amplitudes only, its law is simpler and better determined
-        fewer = prune_by_evidence(selected.likelihood, selected.best)
-        if fewer is not None and fewer.neg2_log_evidence < selected.best.neg2_log_evidence:
-            selected = replace(selected, best=fewer)
-    elif len(selected.best.model.candidates) > len(clipped) and not selected.settled:
-        selected = _replace_terms_by_discrepancy(selected)
-    steps = tuple(_selection_step(selected, candidate) for candidate in selected.best.model.candidates)
-    return SelectionResult(selected.likelihood, selected.nominal, selected.best, steps)
+    nominal = with_interference_line(likelihood, nominal)
+    certain = {candidate.term.effect for candidate in clipped}
+    named = [term for term in terms.values() if term.effect not in certain]
+    pool = all_candidates(device, nominal.model, [*named, *DISCREPANCY_TERMS.values()])
+    progress(f"{len(pool)} candidates")
+    selected = _choose_around_nominal(likelihood, nominal, early, stops, pool, progress)
+    selected = _with_nonlinear_term(selected, nominal, pool, progress)
+    nominal = fit_model(selected.likelihood, nominal.model, nominal.x)
+    steps = tuple(_step(selected, nominal, candidate) for candidate in selected.fit.model.candidates)
+    return SelectionResult(selected.likelihood, nominal, selected.fit, steps)
 
 
-@dataclass(frozen=True)
-class SelectionState:
-    """State of the selection.
-
-    Attributes:
-        nominal, best: the nominal device and the best fit, under the same noise.
-        rivals: of each term, by its key.
-        tried: fits of the named terms among which the last was chosen, under the noise before it.
-        settled: whether the terms were chosen beside a discrepancy, so that none may replace them.
-    """
-
-    likelihood: Likelihood
-    nominal: Fit
-    best: Fit
-    rivals: Mapping[str, RivalFits]
-    tried: Sequence[Fit] = ()
-    settled: bool = False
-
-
-def _forward_steps(
-    state: SelectionState,
-    terms: Sequence[Term],
+def _choose_around_nominal(
+    likelihood: Likelihood,
+    nominal: Fit,
     early: Sequence[Fit],
     stops: Sequence[float],
+    pool: Sequence[Candidate],
     progress: Progress,
-    tried: Sequence[Fit] = (),
-) -> Iterator[SelectionState]:
-    """States of the selection after each added term.
-
-    Args:
-        tried: fits of the candidates of the first step, if they exist already.
-    """
-    likelihood, nominal, best, rivals = state.likelihood, state.nominal, state.best, dict(state.rivals)
-    for _ in range(MAX_EFFECTS - len(best.model.candidates)):
-        taken = {candidate.key for candidate in best.model.candidates}
-        if taken:
-            # The noise was estimated before these terms were fitted, so it may contain part of their effect.
-            likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
-            best = fit_model(likelihood, best.model, best.x)
-        best = with_interference_line(likelihood, best)
-        adequate = bool(rivals) and best.validation_chi2 < CHI2_ADEQUATE
-        pool = [term for term in terms if not (adequate and term.effect in DISCREPANCY_TERMS)]
-        possible = all_candidates(best.model.device, best.model, pool)
-        candidates = [candidate for candidate in possible if candidate.key not in taken]
-        progress(f"{len(candidates)} candidates" + (f" beside {', '.join(sorted(taken))}" if taken else ""))
-        chosen = _LawChoice(nominal, candidates, rivals, progress)
-        if tried:
-            fits, tried = list(tried), ()
-        elif best.chi2 < (CHI2_DIVERGED if taken else CHI2_LINEARISABLE) * best.rows.sum():
-            fits = fit_screened_candidates(likelihood, best, candidates, chosen.settles)
-        else:
-            if taken:
-                progress(f"refitting windows with {', '.join(sorted(taken))}")
-                early = fit_progressively(
-                    likelihood, best.model, best.model.map_parameters_from(early[0].model, early[0].x), stops
-                )
-            fits = fit_candidates_progressively(likelihood, best.model, early, stops, candidates, chosen.settles)
-        if chosen.state is not None:
-            yield chosen.state
-            return
-        if not fits or best.neg2_log_evidence - fits[0].neg2_log_evidence < DETECTION_THRESHOLD:
-            return
-        progress(f"refit with {fits[0].model.candidates[-1].key}")
-        likelihood = Likelihood(best.model.runs, estimate_whiteners(fits[0].model, fits[0].x))
-        by_name = [fit for fit in fits if not ends_with_discrepancy(fit)]
-        reach = max(REFIT_MARGIN, REFIT_MARGIN_RELATIVE * (best.neg2_log_evidence - fits[0].neg2_log_evidence))
-        close = [fit for fit in fits if fit.neg2_log_evidence < fits[0].neg2_log_evidence + reach][:6]
-        close = fit_models(likelihood, [(fit.model, fit.x) for fit in close])
-        close = sorted((fit for fit in close if satisfies_sign_constraints(fit)), key=lambda fit: fit.neg2_log_evidence)
-        before = fit_model(likelihood, best.model, best.x, max_iterations=4)
-        nominal = before if not rivals else fit_model(likelihood, nominal.model, nominal.x, max_iterations=4)
-        extended = next((fit for fit in close if is_significant(likelihood, before, fit)), None)
-        if extended is None and before.validation_chi2 > CHI2_INADEQUATE and not taken:
-            extended = next(
-                (fit for fit in close if ends_with_discrepancy(fit)), None
-            )  # an effect is missing, of which only the stage is known
-        if extended is None:
-            yield SelectionState(likelihood, nominal, before, rivals, by_name)
-            return
-        named = [candidate for candidate in candidates if candidate.term.effect not in DISCREPANCY_TERMS]
-        leads = _rivals_of_newest(extended, before, close)
-        if ends_with_discrepancy(extended):
-            progress("named laws beside the discrepancy")
-            if chosen.settles(extended) and chosen.state is not None:
-                yield chosen.state
-                return
-            likelihood, before, extended = replace_discrepancy_by_terms(likelihood, before, extended, named)
-            close = []  # they were fitted under another noise if terms were exchanged
-        if not ends_with_discrepancy(extended) and extended.chi2 < CHI2_DIVERGED * extended.rows.sum():
-            # The first term may imitate several effects: where much misfit remains, it may be exchanged too.
-            kept = len(best.model.candidates) if extended.validation_chi2 <= CHI2_LINEARISABLE else 0
-            newest = min(len(extended.model.candidates) - kept, len(uncertain(extended.model)))
-            final = exchange_to_convergence(likelihood, extended, named, newest)
-            earlier = _rivals_of_newest(final.fit, before, close)
-            leads = {key: _merge_rivals(own, earlier.get(key, ())) for key, own in final.rivals.items()}
-            extended = final.fit
-        rivals |= leads
-        best = drop_redundant(likelihood, extended)
-        yield SelectionState(likelihood, nominal, best, rivals, by_name)
-        if ends_with_discrepancy(best):
-            return
+) -> _Selected:
+    """Named laws, else a discrepancy term, else nothing."""
+    mechanics = [c for c in pool if c.term.effect in DISCREPANCY_TERMS and c.term.stage == "mechanics"]
+    anchor = fit_anchor(likelihood, nominal, early, stops, mechanics[::-1])
+    selected = _choose_laws(anchor, nominal, pool, progress)
+    if selected is not None:
+        return selected
+    progress("discrepancy terms")
+    discrepancy = _choose_discrepancy(anchor, nominal, pool)
+    if discrepancy is None:
+        return _Selected(likelihood, nominal)
+    return _choose_laws(discrepancy.fit, nominal, pool, progress) or discrepancy
 
 
-class _LawChoice:
-    """Whether named laws with a small remainder explain the misfit, decided once the best named term is fitted.
-
-    Attributes:
-        state: with the laws, under the noise that they leave; None where they do not.
-    """
-
-    def __init__(
-        self, nominal: Fit, candidates: Sequence[Candidate], rivals: Mapping[str, RivalFits], progress: Progress
-    ):
-        self._nominal, self._candidates, self._rivals, self._progress = nominal, candidates, rivals, progress
-        self.state: SelectionState | None = None
-
-    def settles(self, best: Fit) -> bool:
-        """Whether no discrepancy term has to be fitted beside the best named term.
-
-        Where the nominal device is nearly adequate, the laws also have to be significant without a discrepancy. A law
-        that slow noise explains as well is dropped.
-        """
-        choice = choose_laws(best, self._candidates, self._progress)
-        if choice is None or not satisfies_sign_constraints(choice.fit):
-            return False
-        several = len(uncertain(choice.fit.model)) > 1
-        fit = drop_redundant(choice.likelihood, choice.fit) if several else choice.fit
-        before = fit_model(choice.likelihood, self._nominal.model, self._nominal.x)
-        if before.validation_chi2 < CHI2_INADEQUATE and not is_significant(choice.likelihood, before, fit):
-            return False
-        rivals = {**self._rivals, **choice.rivals}
-        self.state = SelectionState(choice.likelihood, before, fit, rivals, settled=True)
-        return True
+def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected | None:
+    """The named laws that take the bulk of the misfit of ``nominal``; None where none are significant."""
+    choice = choose_laws(anchor, nominal, pool, progress)
+    if choice is None:
+        return None
+    fit = drop_redundant(choice.likelihood, choice.fit)
+    if not evidence_gain(choice.likelihood, choice.before, fit):
+        return None
+    return _Selected(choice.likelihood, fit, choice.rivals)
 
 
-def _accept_while_halving(start: SelectionState, further: Iterator[SelectionState]) -> SelectionState:
-    """The last of ``further`` while each at least halves the misfit of the one before it."""
-    last = start
-    for state in further:
-        worth = state.best.validation_chi2 - 1.0 < 0.5 * (last.best.validation_chi2 - 1.0)
-        last = state
-        if not worth:
-            break
-    return last
-
-
-def _replace_terms_by_discrepancy(state: SelectionState) -> SelectionState:
-    """Replace named terms by one pruned discrepancy term if that lowers -2 log evidence by ``UNIQUE_NAME_THRESHOLD``.
-
-    All terms of one stage are replaced: they may be the first terms of the series of one law without a name, which can
-    be fitted only around a model that has the phase right. With a single term per stage, the most important term is
-    replaced if the fit is inadequate. The replaced terms are reported as rivals. Otherwise the state is unchanged.
-    """
-    likelihood, fit = state.likelihood, state.best
-    terms = uncertain(fit.model)
-    by_stage = [[other for other in terms if other.term.stage == first.term.stage] for first in terms]
-    removed = max(by_stage, key=len)
-    if len(removed) == 1:
-        if fit.validation_chi2 < CHI2_INADEQUATE:
-            return state
-        removed = [max(terms, key=lambda term: refit_without(likelihood, fit, term).neg2_log_evidence)]
-    free = all_candidates(fit.model.device, fit.model, DISCREPANCY_TERMS.values())
-    others = [other for other in fit_exchanges(likelihood, fit, removed, free) if other.chi2 < fit.chi2]
-    fewer = [
-        pruned
-        for pruned in (prune_by_evidence(likelihood, other) for other in others[:MAX_DISCREPANCY_FITS])
-        if pruned is not None
+def _choose_discrepancy(anchor: Fit, nominal: Fit, pool: Sequence[Candidate]) -> _Selected | None:
+    """The discrepancy term with the best evidence, with the amplitudes that the recording requires; None if none is."""
+    likelihood = Likelihood(anchor.model.runs, estimate_whiteners(anchor.model, anchor.x))
+    anchor = fit_model(likelihood, anchor.model, anchor.x)
+    linear = linear_model(likelihood, anchor, [c for c in pool if c.term.effect in DISCREPANCY_TERMS])
+    stages = range(len(linear.discrepancies))
+    alone = {i: linear.hypothesis((), without=[j for j in stages if j != i]).neg2_log_evidence for i in stages}
+    fits = [
+        fit_terms(linear, likelihood, anchor, [linear.discrepancies[i]])
+        for i in sorted(stages, key=lambda i: alone[i])[:MAX_DISCREPANCY_FITS]
     ]
-    best = min(fewer, key=lambda other: other.neg2_log_evidence, default=fit)
-    if best.neg2_log_evidence > fit.neg2_log_evidence - UNIQUE_NAME_THRESHOLD:
-        return state
-    free_fit = drop_redundant(likelihood, best)
-    worse = fit.chi2 + fit.penalty - best.chi2 - best.penalty
-    leads = tuple(RivalFit(fit.neg2_log_evidence - best.neg2_log_evidence, candidate, worse) for candidate in removed)
-    return replace(state, best=free_fit, rivals={**state.rivals, free_fit.model.candidates[-1].key: leads})
+    converged = [fit for fit in fits if fit.chi2 < MAX_CHI2_RATIO * anchor.chi2]
+    pruned = [fewer for fewer in (prune_by_evidence(likelihood, fit) for fit in converged) if fewer is not None]
+    best = min(pruned, key=lambda fit: fit.neg2_log_evidence, default=None)
+    if best is None:
+        return None
+    likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
+    best = fit_model(likelihood, best.model, best.x)
+    before = fit_model(likelihood, nominal.model, nominal.x)
+    return _Selected(likelihood, best) if evidence_gain(likelihood, before, best) else None
 
 
-def _rivals_of_newest(extended: Fit, before: Fit, tried: Sequence[Fit]) -> dict[str, RivalFits]:
-    """Rivals, among ``tried``, of the one term that ``extended`` has in addition to ``before``."""
-    old = {candidate.key for candidate in before.model.candidates}
-    new = [candidate.key for candidate in extended.model.candidates if candidate.key not in old]
-    less_likely = [
-        fit
-        for fit in tried
-        if fit.neg2_log_evidence > extended.neg2_log_evidence and fit.model.candidates[-1].key not in new
+def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected:
+    """The selection with a law that is linear in no amplitude, as a clip level or a mode that grows, where one gains.
+
+    The named laws are chosen again beside it.
+    """
+    named = all(c.term.effect not in DISCREPANCY_TERMS for c in uncertain(selected.fit.model))
+    base = selected.fit if named else fit_model(selected.likelihood, nominal.model, nominal.x)
+    present = {candidate.key for candidate in base.model.candidates}
+    nonlinear = [c for c in pool if not is_linear(c) and c.key not in present]
+    starts = [
+        (score.model, damped_start(selected.likelihood, base, score.model, score.x, score.step))
+        for scores in score_candidate_starts(selected.likelihood, base, nonlinear)
+        for score in scores
+        if score.predicted_gain > DETECTION_THRESHOLD
     ]
-    return {new[0]: rivals_of(extended, less_likely)} if len(new) == 1 else {}
+    fits = [fit for fit in fit_models(selected.likelihood, starts) if satisfies_sign_constraints(fit)]
+    best = min(fits, key=lambda fit: fit.neg2_log_evidence, default=None)
+    if best is None or not evidence_gain(selected.likelihood, selected.fit, best):
+        return selected
+    linear = linear_model(selected.likelihood, base, pool)
+    laws = [i for i, law in enumerate(linear.laws) if law.test is None]
+    if misfit(base) - misfit(best) < linear.gain_of_discrepancy(laws):
+        return selected
+    progress(f"laws beside {best.model.candidates[-1].key}")
+    beside = _choose_laws(best, nominal, pool, progress)
+    if beside is not None:
+        return beside
+    likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
+    return _Selected(likelihood, drop_redundant(likelihood, fit_model(likelihood, best.model, best.x)))
 
 
-def _merge_rivals(*parts: RivalFits) -> RivalFits:
-    """All rivals with their smallest gaps, sorted by evidence."""
-    nearest: dict[str, RivalFit] = {}
-    for rival in (entry for part in parts for entry in part):
-        previous = nearest.setdefault(rival.candidate.key, rival)
-        nearest[rival.candidate.key] = RivalFit(
-            min(previous.evidence_gap, rival.evidence_gap), rival.candidate, min(previous.misfit_gap, rival.misfit_gap)
-        )
-    return tuple(sorted(nearest.values(), key=lambda entry: entry.evidence_gap))
-
-
-def _selection_step(state: SelectionState, candidate: Candidate) -> SelectionStep:
-    """The selection step of one term of the best fit."""
-    best, rivals = state.best, state.rivals.get(candidate.key, ())
-    alone = len(best.model.candidates) == 1 and bool(candidate.term.free_parameters)
-    before = state.nominal if alone else refit_without(state.likelihood, best, candidate)
-    return SelectionStep(candidate, before, best, rivals)
+def _step(selected: _Selected, nominal: Fit, candidate: Candidate) -> SelectionStep:
+    """The selection step of one term."""
+    fit, rivals = selected.fit, selected.rivals.get(candidate.key, ())
+    alone = len(fit.model.candidates) == 1 and bool(candidate.term.free_parameters)
+    before = nominal if alone else refit_without(selected.likelihood, fit, candidate)
+    return SelectionStep(candidate, before, fit, rivals)

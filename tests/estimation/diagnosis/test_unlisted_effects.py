@@ -5,17 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model
-from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.selection import SelectionState, _replace_terms_by_discrepancy
-from scanner.recording import Recording
-from scanner.terms import catalogue
-from tests.support.bench import DEVICE, RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES, bench_recording
+from tests.support.bench import RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES, bench_recording
 
 
 @pytest.mark.slow
@@ -69,33 +61,11 @@ def test_backlash_of_the_readout_is_unknown_in_the_readout() -> None:
     assert "P_0" in curve["formula"]
 
 
-def replace_named_terms(run: Recording, *names: str, turns: int = 8) -> tuple[SelectionState, Fit]:
-    """The state of a search that replaced named terms by free ones where these explain more, and the named fit."""
-    prepared = prepare_run(run, DEVICE)
-    nominal = Model([prepared], DEVICE)
-    likelihood = Likelihood([prepared], flat_whiteners(nominal))
-    stops = window_schedule(nominal)
-    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
-    model = Model([prepared], DEVICE, [Candidate(catalogue()[name], "x", "sense") for name in names], nominal.mains)
-    named = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x), max_iterations=turns)
-    return _replace_terms_by_discrepancy(SelectionState(likelihood, early, named, {})), named
-
-
 @pytest.mark.slow
-def test_three_polynomial_terms_are_replaced_by_one_free_torque() -> None:
+def test_a_stop_on_one_side_is_unknown_in_the_mechanics() -> None:
     """A stop on one side is no polynomial of the angle. Three powers approximate it; one free torque describes it."""
-    powers = [f"{name}-stiffness" for name in ("quadratic", "cubic", "quintic")]
-    state, named = replace_named_terms(bench_recording(stop_stiffness=0.2, seed=6), *powers, turns=20)
-    assert [candidate.term.effect for candidate in state.best.model.candidates] == ["free-mechanics"]
-    assert [lead.candidate.term.effect for lead in state.rivals["x.free-mechanics"]] == powers
-    assert state.best.validation_chi2 < named.validation_chi2
-
-
-@pytest.mark.slow
-def test_two_timing_terms_are_replaced_by_one_pruned_free_delay() -> None:
-    state, named = replace_named_terms(bench_recording(delay=2e-6, seed=6), "channel-delay", "clock-skew")
-    (candidate,) = state.best.model.candidates
-    assert candidate.term.effect == "free-timing"
-    assert "r2" in {parameter.name for parameter in candidate.term.free_parameters}
-    assert len(candidate.term.free_parameters) < 5 < len(DISCREPANCY_TERMS["free-timing"].free_parameters)
-    assert state.best.validation_chi2 < named.validation_chi2
+    diagnosis = diagnose([bench_recording(stop_stiffness=0.2, seed=6)])
+    assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "mechanics")]
+    (candidate,) = diagnosis.search.final.model.candidates
+    free = len(candidate.term.free_parameters)
+    assert free < len(DISCREPANCY_TERMS[candidate.term.effect].free_parameters)

@@ -1,0 +1,136 @@
+"""The linear model around a fit, and fits from estimates in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from estimation.diagnosis.anchor import fit_growing
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model
+from estimation.diagnosis.initial import window_schedule
+from estimation.diagnosis.linear_model import LinearModel, LinearTerm
+from estimation.diagnosis.model import Model, uncertain
+from estimation.diagnosis.parameters import Candidate
+from estimation.diagnosis.screening import (
+    ScoreTest,
+    damped_start,
+    is_amplitude,
+    is_linear,
+    score_candidate_starts,
+    set_amplitudes,
+)
+from estimation.least_squares import regress
+from scanner.arrays import Array
+
+FIT_ITERATIONS = 20
+"""Largest number of iterations of a fit from an estimate in the linear model, which may lie in a narrow valley."""
+
+MAX_CHI2_RATIO = 100.0
+"""Chi-square of fitted laws over that of the fit around which they were selected, above which the fit has lost the
+motion."""
+
+MAX_STARTS = 3
+"""Values of a law's time constant or frequency that stand for it in the linear model."""
+
+
+def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> LinearModel:
+    """The linear model around a fit, of its own terms and of ``candidates``."""
+    rows, base = fit.rows, common_parameters(fit)
+    residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
+    blocks: list[tuple[Candidate, Array, ScoreTest | None, float]] = []
+    for candidate in filter(is_linear, uncertain(fit.model)):
+        columns, part = _part_of_fit(fit, candidate)
+        residual = residual - part
+        blocks.append((candidate, columns, None, _shape_cost(fit, candidate)))
+    present = {candidate.key for candidate in fit.model.candidates}
+    others = [candidate for candidate in candidates if candidate.key not in present and is_linear(candidate)]
+    for tests in score_candidate_starts(likelihood, fit, others):
+        cost = 2.0 * float(np.log(len(tests)))
+        blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
+    whole = np.column_stack([*(columns[rows] for _, columns, *_ in blocks), residual[rows]])
+    common = regress(fit.jacobian[rows][:, base], whole, fit.model.precision[base])
+    profile = np.asarray(np.linalg.solve(common.factor, common.projected))
+    ends = np.cumsum([0, *(columns.shape[1] for _, columns, *_ in blocks)])
+    terms = [
+        LinearTerm(candidate, np.arange(low, high), test, cost)
+        for (candidate, _, test, cost), (low, high) in zip(blocks, pairwise(ends), strict=True)
+    ]
+    discrepancies = tuple(term for term in terms if term.candidate.term.effect in DISCREPANCY_TERMS)
+    laws = tuple(term for term in terms if term.candidate.term.effect not in DISCREPANCY_TERMS)
+    return LinearModel(common.remainder, profile, laws, discrepancies)
+
+
+def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
+    """The best starts of one candidate, where it has an effect."""
+    with_effect = [test for test in tests if np.any(test.columns)]
+    most = 1 if tests[0].candidate.term.effect in DISCREPANCY_TERMS else MAX_STARTS
+    return sorted(with_effect, key=lambda test: -test.predicted_gain)[:most]
+
+
+def _part_of_fit(fit: Fit, candidate: Candidate) -> tuple[Array, Array]:
+    """Sensitivities to the amplitudes of a term of a fit, shape (N, q), and its part of the residual, shape (N,)."""
+    at = [
+        i
+        for i, f in enumerate(fit.model.parameters)
+        if f.owner == candidate.key and f.parameter is not None and is_amplitude(candidate, f.parameter)
+    ]
+    return fit.jacobian[:, at], fit.jacobian[:, at] @ fit.x[at]
+
+
+def _shape_cost(fit: Fit, candidate: Candidate) -> float:
+    """-2 log of posterior over prior volume of the parameters of a term that are no amplitude."""
+    at = [
+        i
+        for i, f in enumerate(fit.model.parameters)
+        if f.owner == candidate.key and f.parameter is not None and not is_amplitude(candidate, f.parameter)
+    ]
+    return -float(np.linalg.slogdet(fit.covariance[np.ix_(at, at)])[1]) if at else 0.0
+
+
+def common_parameters(fit: Fit) -> list[int]:
+    """Indices of the parameters of a fit that belong to no term that is linear in an amplitude."""
+    linear = {candidate.key for candidate in fit.model.candidates if is_linear(candidate)}
+    return [i for i, f in enumerate(fit.model.parameters) if f.kind not in ("term", "hidden") or f.owner not in linear]
+
+
+def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequence[LinearTerm]) -> Fit:
+    """The fit with these terms and no others, from their estimates in the linear model.
+
+    Where that fit loses the motion, it is repeated over windows of increasing length.
+
+    Args:
+        fit: around which the model is linear.
+    """
+    at = np.array([column for term in terms for column in term.columns], int)
+    estimates = linear.estimate(terms)
+    kept = [candidate for candidate in fit.model.candidates if not is_linear(candidate)]
+    model = Model(fit.model.runs, fit.model.device, [*kept, *(term.candidate for term in terms)], fit.model.mains)
+    start = fit.x.copy()
+    start[common_parameters(fit)] = -(linear.profile[:, at] @ estimates + linear.profile[:, -1])
+    x = model.map_parameters_from(fit.model, start)
+    without = model.map_parameters_from(fit.model, fit.x)
+    ends = np.cumsum([0, *(term.columns.size for term in terms)])
+    for term, (low, high) in zip(terms, pairwise(ends), strict=True):
+        for i, f in enumerate(model.parameters):
+            if term.test is not None and f.kind == "term" and f.owner == term.candidate.key:
+                x[i] = without[i] = term.test.x[term.test.model.index("term", f.owner, f.name)]
+        set_amplitudes(x, model, term.candidate, estimates[low:high])
+    start = damped_start(likelihood, fit, model, without, x - without)
+    fitted = fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
+    if fitted.chi2 < MAX_CHI2_RATIO * fit.chi2:
+        return fitted
+    grown = fit_growing(likelihood, model, x, window_schedule(model)[0])
+    return min(fitted, grown, key=lambda either: either.chi2)
+
+
+def fit_laws(
+    linear: LinearModel, likelihood: Likelihood, fit: Fit, laws: Sequence[int], fitted: Mapping[frozenset[str], Fit]
+) -> Fit:
+    """The fit with laws, from an earlier one of the same effects where there is one."""
+    earlier = fitted.get(linear.effects(laws))
+    if earlier is not None:
+        return fit_model(likelihood, earlier.model, earlier.x)
+    return fit_terms(linear, likelihood, fit, [linear.laws[i] for i in laws])

@@ -1,0 +1,115 @@
+"""Fits that follow the motion: discrepancy terms over growing windows, and the fits that they consist of."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.polynomial.chebyshev import chebval
+from scipy.integrate import solve_ivp
+
+from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, residual_ratio
+from estimation.diagnosis.data import prepare_run
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, cosine_series
+from estimation.diagnosis.fit import Likelihood, fit_model, fit_models
+from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
+from estimation.diagnosis.law_selection import choose_laws
+from estimation.diagnosis.model import Model
+from estimation.diagnosis.parameters import Candidate
+from estimation.diagnosis.screening import ProfiledLinearModel, all_candidates, damped_start, linear_gain
+from scanner.device import Axis, Device
+from scanner.recording import Recording
+from scanner.stages import Mechanics
+from scanner.terms import catalogue
+from tests.support.bench import DEVICE, bench_recording
+
+
+def hardening_decay() -> tuple[Device, Recording]:
+    """A free decay of 100 periods whose spring is 20 % stiffer at full swing than the nominal one."""
+    stiffness, rate = (2 * np.pi * 50.0) ** 2, 2500.0
+
+    def law(t: float, y: np.ndarray) -> list[float]:
+        return [y[1], -stiffness * y[0] * (1.0 + 20.0 * y[0] ** 2) - 3.0 * y[1]]
+
+    time_s = np.arange(0.0, 2.0, 1 / rate)
+    angle = solve_ivp(law, (0.0, 2.0), [0.1, 0.0], t_eval=time_s, rtol=1e-9, atol=1e-11).y[0]
+    axis = Axis(Mechanics(1.0, 3.0, stiffness), name="x", tolerance={"J": 1e-9, "b": 0.2})
+    device = Device("decay", {"x": axis})
+    noisy = angle + np.random.default_rng(3).normal(0.0, 2e-4, angle.size)
+    return device, Recording.from_arrays({"angle_x": (noisy, "rad", rate, 0.0)}, device=device)
+
+
+@pytest.mark.slow
+def test_a_drifting_stiffness_follows_the_motion_of_a_spring() -> None:
+    device, recording = hardening_decay()
+    run = prepare_run(recording, device)
+    nominal = Model([run], device)
+    likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
+    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)
+    assert residual_ratio(likelihood, early[-1]) > 3.0 * MAX_RESIDUAL_RATIO
+    drift = Candidate(DISCREPANCY_TERMS["free-stiffness"], "x", "sense")
+    anchor = fit_anchor(likelihood, early[-1], early, stops, [drift])
+    assert [candidate.key for candidate in anchor.model.candidates] == [drift.key]
+    assert residual_ratio(likelihood, anchor) < MAX_RESIDUAL_RATIO
+    pool = all_candidates(device, nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
+    choice = choose_laws(anchor, early[-1], pool, lambda text: None)
+    assert choice is not None
+    assert [candidate.term.effect for candidate in choice.fit.model.candidates] == ["cubic-stiffness"]
+    (size,) = choice.fit.model.values(choice.fit.model.candidates[0], choice.fit.x)
+    assert size == pytest.approx(20.0 * (2 * np.pi * 50.0) ** 2, rel=0.1)  # the angle's gain is known to 2 %
+
+
+def test_a_nominal_device_that_follows_the_motion_is_the_anchor() -> None:
+    run = prepare_run(bench_recording(seed=9), DEVICE)
+    nominal = Model([run], DEVICE)
+    likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
+    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)
+    terms = [Candidate(DISCREPANCY_TERMS["free-stiffness"], "x", "sense")]
+    assert fit_anchor(likelihood, early[-1], early, stops, terms) is early[-1]
+
+
+def test_a_step_that_raises_the_misfit_is_shortened() -> None:
+    run = prepare_run(bench_recording(seed=9), DEVICE)
+    model = Model([run], DEVICE)
+    likelihood, stop = Likelihood([run], flat_whiteners(model)), window_schedule(model)[0]
+    fit = fit_initial_state(likelihood, model, stop)
+    fit = fit_model(likelihood, model, fit.x, max_iterations=20)
+    step = np.zeros(fit.x.size)
+    step[0] = 3.0
+    start = damped_start(likelihood, fit, model, fit.x, step)
+    assert 0.0 < start[0] - fit.x[0] < 3.0
+    tiny = 1e-6 * step
+    np.testing.assert_array_equal(damped_start(likelihood, fit, model, fit.x, tiny), fit.x + tiny)
+
+
+def test_a_diverged_motion_predicts_no_gain() -> None:
+    free = [SimpleNamespace(kind="nominal", owner="x")] * 2
+    model = SimpleNamespace(parameters=free, precision=np.ones(2))
+    diverged = SimpleNamespace(jacobian=np.full((3, 2), 1e20), residual=np.full(3, 1e6), x=np.zeros(2), model=model)
+    known = ProfiledLinearModel(diverged, np.ones(3, bool))  # type: ignore[arg-type]
+    assert linear_gain(*known.normal_equations(np.ones((3, 1)))[:2])[0] == 0.0
+
+
+def test_parallel_fits_equal_sequential_fits() -> None:
+    run = prepare_run(bench_recording(k3=2.0, seed=9), DEVICE)
+    nominal = Model([run], DEVICE)
+    likelihood, stop = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)[0]
+    x = fit_initial_state(likelihood, nominal, stop).x
+    models = [Model([run], DEVICE, [Candidate(catalogue()[name], "x", "sense")]) for name in
+              ("cubic-stiffness", "quadratic-drag", "second-mode")]  # fmt: skip
+    starts = [(model, model.map_parameters_from(nominal, x)) for model in [*models, models[0]]]
+    for start, fit in zip(starts, fit_models(likelihood, starts, stop, max_iterations=3), strict=True):
+        alone = fit_model(likelihood, *start, stop, 3)
+        np.testing.assert_array_equal(fit.x, alone.x)
+        assert fit.neg2_log_evidence == alone.neg2_log_evidence
+
+
+@pytest.mark.parametrize("numbers", [1, 2, 9, 24])
+def test_cosine_series_equals_chebyshev_evaluation(numbers: int) -> None:
+    rng = np.random.default_rng(numbers)
+    turn, sizes = rng.uniform(0.0, np.pi, (700, 3)), rng.normal(size=numbers)
+    np.testing.assert_allclose(cosine_series(turn, sizes), chebval(np.cos(turn), sizes), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        cosine_series(turn, sizes), np.cos(np.multiply.outer(turn, range(numbers))) @ sizes, atol=1e-12
+    )
