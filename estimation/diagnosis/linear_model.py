@@ -204,11 +204,14 @@ class LinearModel:
         return best
 
     def _score(self, hypothesis: Hypothesis) -> float:
-        """-2 log evidence with the price of each law. A discrepancy alone has the price of one law."""
-        if hypothesis.laws:
-            return hypothesis.neg2_log_evidence + MIN_SCORE_GAIN * len(hypothesis.laws)
-        nothing = self.hypothesis((), without=range(len(self.discrepancies)))
-        return min(nothing.neg2_log_evidence, hypothesis.neg2_log_evidence + MIN_SCORE_GAIN)
+        """-2 log evidence with the price of each law, with the discrepancy or without any if that is better.
+
+        A discrepancy alone has the price of one law.
+        """
+        laws = hypothesis.laws
+        without = self.hypothesis(laws, without=range(len(self.discrepancies))).neg2_log_evidence
+        beside = hypothesis.neg2_log_evidence + (0.0 if laws else MIN_SCORE_GAIN)
+        return min(without, beside) + MIN_SCORE_GAIN * len(laws)
 
     def _is_possible(self, laws: tuple[int, ...]) -> bool:
         """Whether no law is an imitation, and all estimates have a physically possible sign."""
