@@ -1,7 +1,8 @@
 """A fit that follows the motion where the nominal device loses its phase.
 
-A discrepancy term of the mechanics is fitted over windows of increasing length. Around its fit the named laws are
-linear, however large their effect: a law in the place of the discrepancy changes the motion only by the difference of
+Terms of the mechanics are fitted over windows of increasing length: a frequency and a damping that depend on the
+amplitude, to which every weak nonlinearity of a free oscillation averages, else a discrepancy term. Around their fit
+the named laws are linear, however large their effect: a law in their place changes the motion only by the difference of
 the two torques along it.
 """
 
@@ -11,7 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model
+from estimation.diagnosis.fit import TIME_BLOCKS, Fit, Likelihood, fit_model
+from estimation.diagnosis.initial import window_schedule
 from estimation.diagnosis.model import Model
 from estimation.diagnosis.parameters import Candidate
 from scanner.arrays import Array
@@ -24,24 +26,36 @@ MAX_RATIO_GROWTH = 2.0
 """Growth of that ratio from the first window on, up to which a larger one has another cause than the phase. A phase
 error grows with the square of the length."""
 
-MAX_WINDOW_GROWTH, MIN_WINDOW_GROWTH = 3.0, 1.03
+MAX_WINDOW_GROWTH, MIN_WINDOW_GROWTH = 3.0, 1.1
 """Largest and smallest ratio of the lengths of successive windows."""
+
+MAX_SIGNAL = 1e100
+"""Signal from which a trajectory has diverged: its square would overflow."""
 
 WINDOW_ITERATIONS = 8
 """Iterations of the fit over a window."""
 
 
 def residual_ratio(likelihood: Likelihood, fit: Fit, stop: float = 1.0) -> float:
-    """Largest ratio of residual, without the noise, to signal over a window, as standard deviations of a channel."""
-    ratios = []
+    """Largest ratio of residual, without the noise, to signal in a window, as standard deviations.
+
+    It is taken over parts of the window, each as long as the first window of a fit: late in a decay the phase may be
+    lost although the residual is small. A diverging trajectory has an infinite ratio.
+    """
+    parts = int(np.clip(round(stop / window_schedule(fit.model)[0]), 1, TIME_BLOCKS))
+    ratios = [0.0]
     for run, whiteners, signals in zip(
         fit.model.runs, likelihood.whiteners, fit.model.outputs(fit.x, stop), strict=True
     ):
         for output, whitener, signal in zip(run.outputs, whiteners, signals, strict=True):
+            if not np.all(np.abs(signal) < MAX_SIGNAL):
+                return np.inf
             data = output.data[: signal.size]
-            misfit = float(np.var(data - signal)) - whitener.noise_variance
-            ratios.append(np.sqrt(max(misfit, 0.0) / max(float(np.var(data)), 1e-300)))
-    return max(ratios)
+            for part, misfit in zip(np.array_split(data, parts), np.array_split(data - signal, parts), strict=True):
+                motion = float(np.var(part)) - whitener.noise_variance
+                if motion > whitener.noise_variance:
+                    ratios.append(np.sqrt(max(float(np.var(misfit)) - whitener.noise_variance, 0.0) / motion))
+    return float(max(ratios))
 
 
 def max_residual_ratio(likelihood: Likelihood, first: Fit, stop: float) -> float:
@@ -50,33 +64,46 @@ def max_residual_ratio(likelihood: Likelihood, first: Fit, stop: float) -> float
 
 
 def fit_anchor(
-    likelihood: Likelihood, nominal: Fit, early: Sequence[Fit], stops: Sequence[float], terms: Sequence[Candidate]
-) -> Fit:
-    """The nominal fit if it follows the motion, else with the first of ``terms`` that does, or the best of them.
+    likelihood: Likelihood,
+    nominal: Fit,
+    early: Sequence[Fit],
+    stops: Sequence[float],
+    groups: Sequence[Sequence[Candidate]],
+) -> tuple[Fit, list[Fit]]:
+    """The nominal fit if it follows the motion, else that with the first of ``groups`` that does; nominal if none does.
+
+    A misfit that none of them changes has another cause than the phase.
 
     Args:
         nominal: over the whole recording.
         early: fits of the nominal device over the windows ``stops``.
-        terms: discrepancy terms of the mechanics.
+        groups: of terms of the mechanics.
+
+    Returns:
+        The fit, and all fits with groups that were made.
     """
     limit = max_residual_ratio(likelihood, early[0], stops[0])
-    fits = [nominal]
-    for term in terms:
-        if residual_ratio(likelihood, fits[-1]) < limit:
-            return fits[-1]
-        reached = 0
-        while reached + 1 < len(early) and residual_ratio(likelihood, early[reached + 1], stops[reached + 1]) < limit:
-            reached += 1
-        model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, term], nominal.model.mains)
+    if residual_ratio(likelihood, nominal) < limit:
+        return nominal, []
+    fits, reached = list[Fit](), 0
+    while reached + 1 < len(early) and residual_ratio(likelihood, early[reached + 1], stops[reached + 1]) < limit:
+        reached += 1
+    for terms in groups:
+        with_terms = [*nominal.model.candidates, *terms]
+        model = Model(nominal.model.runs, nominal.model.device, with_terms, nominal.model.mains)
         start = model.map_parameters_from(early[reached].model, early[reached].x)
         fits.append(fit_growing(likelihood, model, start, stops[reached], limit))
-    return min(fits, key=lambda fit: fit.chi2)
+        if residual_ratio(likelihood, fits[-1]) < limit:
+            return fits[-1], fits
+    return nominal, fits
 
 
 def fit_growing(
     likelihood: Likelihood, model: Model, x: Array, reached: float, limit: float = MAX_RESIDUAL_RATIO
 ) -> Fit:
     """Fit over windows that grow as fast as the motion is followed, from one of the length ``reached`` on.
+
+    Where it is not followed over a slightly longer window either, the whole recording is fitted from there.
 
     Args:
         x: start, shape (p,).
@@ -85,11 +112,13 @@ def fit_growing(
     growth, stop = MAX_WINDOW_GROWTH, reached
     while True:
         fit = fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=1.0)
-        if stop > reached and residual_ratio(likelihood, fit, stop) > limit and growth > MIN_WINDOW_GROWTH:
-            growth = np.sqrt(growth)
-        elif stop >= 1.0:
-            return fit
-        else:
+        if stop == reached or residual_ratio(likelihood, fit, stop) < limit:
+            if stop >= 1.0:
+                return fit
             reached, x = stop, fit.x
             growth = min(growth * growth, MAX_WINDOW_GROWTH)
+        elif growth < MIN_WINDOW_GROWTH:
+            return fit if stop >= 1.0 else fit_model(likelihood, model, fit.x, 1.0, WINDOW_ITERATIONS, tolerance=1.0)
+        else:
+            growth = np.sqrt(growth)
         stop = min(1.0, reached * growth)

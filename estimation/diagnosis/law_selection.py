@@ -12,9 +12,16 @@ from typing import NamedTuple
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model, misfit
 from estimation.diagnosis.initial import estimate_whiteners
-from estimation.diagnosis.linear_model import MAX_SCALE_BESIDE, RivalFit
+from estimation.diagnosis.linear_model import (
+    MAX_SCALE_BESIDE,
+    MIN_EXCHANGE_GAIN,
+    MIN_SCORE_GAIN,
+    LinearModel,
+    RivalFit,
+)
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
 from estimation.diagnosis.parameters import Candidate
+from estimation.diagnosis.screening import is_linear
 from estimation.diagnosis.significance import satisfies_sign_constraints
 
 MAX_LINEARISATIONS = 8
@@ -22,8 +29,8 @@ MAX_LINEARISATIONS = 8
 
 
 SINGLE_LAWS = 6
-"""Single laws that are fitted around a discrepancy that follows the motion, where sensitivities do not rank them well.
-Each costs a fit."""
+"""Single laws that are fitted around terms that follow the motion, where sensitivities do not rank them well. Each
+costs a fit."""
 
 
 def is_discrepancy(candidate: Candidate) -> bool:
@@ -65,7 +72,7 @@ def choose_laws(
         present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
         if alternates:
             break
-        if any(map(is_discrepancy, fit.model.candidates)):
+        if not fitted and any(map(is_linear, fit.model.candidates)):
             options = [linear.select().laws, *linear.strongest(SINGLE_LAWS)]
         else:
             options = [linear.select(present, max_moves=1).laws]
@@ -74,23 +81,74 @@ def choose_laws(
         if not options:
             return None
         if [linear.effects(laws) for laws in options] == [linear.effects(present)]:
-            break
+            exchanged = _exchange_near_rival(linear, likelihood, fit, present, candidates, fitted)
+            if exchanged is None:
+                break
+            fit = exchanged
+            continue
         fits = {linear.effects(laws): fit_laws(linear, likelihood, fit, laws, fitted) for laws in options}
-        fits = {names: one for names, one in fits.items() if satisfies_sign_constraints(one)}
+        if not fitted and present:
+            fits[linear.effects(present)] = fit
+        followed = MAX_CHI2_RATIO * fit.chi2
+        fits = {names: one for names, one in fits.items() if satisfies_sign_constraints(one) and one.chi2 < followed}
+        if not fits and present:
+            break
         if not fits:
             return None
         effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
         with_laws, alternates = fits[effects], effects in fitted
-        if with_laws.chi2 > MAX_CHI2_RATIO * fit.chi2:
-            return None
-        if alternates and with_laws.neg2_log_evidence > fit.neg2_log_evidence:
+        if alternates and (len(effects), with_laws.neg2_log_evidence) > (len(present), fit.neg2_log_evidence):
             break
         fitted[effects] = fit = with_laws
     else:
         return None
     before = fit_model(likelihood, nominal.model, nominal.x)
-    if not linear.are_needed(present, misfit(before) - misfit(fit)):
+    alone = linear.hypothesis(()).neg2_log_evidence
+    if any(map(is_discrepancy, anchor.model.candidates)):
+        alone = min(alone, _evidence_of_discrepancy(likelihood, anchor, candidates))
+    if not linear.are_needed(present, misfit(before) - misfit(fit), alone):
         return None
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
     return Choice(likelihood, before, fit, rivals)
+
+
+def _evidence_of_discrepancy(likelihood: Likelihood, anchor: Fit, candidates: Sequence[Candidate]) -> float:
+    """-2 log evidence of discrepancies of all stages around the fit of one."""
+    fit = fit_model(likelihood, anchor.model, anchor.x)
+    around = linear_model(likelihood, fit, [candidate for candidate in candidates if is_discrepancy(candidate)])
+    return around.hypothesis(()).neg2_log_evidence
+
+
+def _exchange_near_rival(
+    linear: LinearModel,
+    likelihood: Likelihood,
+    fit: Fit,
+    present: tuple[int, ...],
+    candidates: Sequence[Candidate],
+    fitted: dict[frozenset[str], Fit],
+) -> Fit | None:
+    """The fit with one law exchanged that has a better evidence around itself; None where there is none.
+
+    Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
+    ``MIN_SCORE_GAIN`` are fitted, each once, and compared around their own fits.
+    """
+    discrepancies = [candidate for candidate in candidates if is_discrepancy(candidate)]
+    hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
+    best, lowest = None, hypothesis.neg2_log_evidence - MIN_EXCHANGE_GAIN
+    for removed in present:
+        rest = tuple(law for law in present if law != removed)
+        for rival in linear.beside(rest, hypothesis.scales):
+            effects = linear.effects(rival.laws)
+            near = rival.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN
+            if not near or effects in fitted:
+                continue
+            fitted[effects] = other = fit_laws(linear, likelihood, fit, rival.laws, fitted)
+            if not satisfies_sign_constraints(other):
+                continue
+            around = linear_model(likelihood, other, discrepancies)
+            laws = range(len(around.laws))
+            score = around.hypothesis(tuple(laws), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
+            if score < lowest:
+                best, lowest = other, score
+    return best

@@ -135,12 +135,14 @@ class LinearModel:
             each, shape (p, q + 1).
         laws: named laws.
         discrepancies: discrepancy terms of all stages.
+        cost: -2 log of posterior over prior volume of what every hypothesis contains.
     """
 
     factor: Array
     profile: Array
     laws: tuple[LinearTerm, ...]
     discrepancies: tuple[LinearTerm, ...]
+    cost: float = 0.0
 
     @property
     def _groups(self) -> list[NDArray[np.intp]]:
@@ -181,7 +183,7 @@ class LinearModel:
         cost = regression.log_determinant - float(np.log(precision).sum())
         all_scales = np.array(start, float)
         all_scales[[i for i in range(len(self._groups)) if i not in without]] = values
-        return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes, misfit)
+        return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes + self.cost, misfit)
 
     def select(self, laws: Sequence[int] = (), max_moves: int | None = None) -> Hypothesis:
         """The laws beside a small discrepancy after the moves that improve them most: additions, removals, exchanges.
@@ -312,7 +314,7 @@ class LinearModel:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
-    def are_needed(self, laws: Sequence[int], explained: float) -> bool:
+    def are_needed(self, laws: Sequence[int], explained: float, alone: float) -> bool:
         """Whether a discrepancy without bound on its scales needs laws beside it.
 
         They have to explain ``MIN_EXPLAINED_RATIO`` of what the discrepancy beside them still does. Laws that do not
@@ -320,16 +322,17 @@ class LinearModel:
 
         Args:
             explained: fall of the misfit by the laws.
+            alone: -2 log evidence of the discrepancy without them.
         """
-        beside, alone = self.hypothesis(laws), self.hypothesis(())
+        beside = self.hypothesis(laws)
         without = self.hypothesis(laws, without=range(len(self.discrepancies)))
         remainder = without.misfit - beside.misfit
         if explained < MIN_EXPLAINED_RATIO * remainder:
             return False
         significant = without.neg2_log_evidence - beside.neg2_log_evidence > MIN_SCORE_GAIN
+        advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
         series = len(self.effects(laws) & POLYNOMIAL_SPRINGS) > 1
         bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
-        advantage = alone.neg2_log_evidence - beside.neg2_log_evidence
         return advantage > (0.0 if bulk else SMALL_LAW_MARGIN)
 
     def null_gain(self, probability: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
@@ -24,6 +25,7 @@ from estimation.diagnosis.screening import (
 )
 from estimation.least_squares import regress
 from scanner.arrays import Array
+from scanner.integrator.abi import MAX_TERMS_PER_STAGE
 
 FIT_ITERATIONS = 20
 """Largest number of iterations of a fit from an estimate in the linear model, which may lie in a narrow valley."""
@@ -37,7 +39,7 @@ MAX_STARTS = 3
 
 
 def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> LinearModel:
-    """The linear model around a fit, of its own terms and of ``candidates``."""
+    """The linear model around a fit, of its own terms and of ``candidates`` as far as the integrator takes them."""
     rows, base = fit.rows, common_parameters(fit)
     residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
     blocks: list[tuple[Candidate, Array, ScoreTest | None, float]] = []
@@ -46,7 +48,14 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
         residual = residual - part
         blocks.append((candidate, columns, None, _shape_cost(fit, candidate)))
     present = {candidate.key for candidate in fit.model.candidates}
-    others = [candidate for candidate in candidates if candidate.key not in present and is_linear(candidate)]
+    stages = Counter((candidate.axis, candidate.term.stage) for candidate in fit.model.candidates)
+    others = [
+        candidate
+        for candidate in candidates
+        if candidate.key not in present
+        and is_linear(candidate)
+        and stages[candidate.axis, candidate.term.stage] < MAX_TERMS_PER_STAGE
+    ]
     for tests in score_candidate_starts(likelihood, fit, others):
         cost = 2.0 * float(np.log(len(tests)))
         blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
@@ -60,7 +69,8 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     ]
     discrepancies = tuple(term for term in terms if term.candidate.term.effect in DISCREPANCY_TERMS)
     laws = tuple(term for term in terms if term.candidate.term.effect not in DISCREPANCY_TERMS)
-    return LinearModel(common.remainder, profile, laws, discrepancies)
+    cost = common.log_determinant - float(np.log(fit.model.precision[base]).sum())
+    return LinearModel(common.remainder, profile, laws, discrepancies, cost)
 
 
 def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
