@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, residual_ratio
 from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, cosine_series
-from estimation.diagnosis.fit import Likelihood, fit_model, fit_models
+from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.model import Model
@@ -38,6 +38,31 @@ def hardening_decay() -> tuple[Device, Recording]:
     device = Device("decay", {"x": axis})
     noisy = angle + np.random.default_rng(3).normal(0.0, 2e-4, angle.size)
     return device, Recording.from_arrays({"angle_x": (noisy, "rad", rate, 0.0)}, device=device)
+
+
+def decaying_fit(late_phase: float) -> tuple[Likelihood, Fit]:
+    """A decay over 40 periods, and a fit whose phase is off by ``late_phase`` [rad] in the last eighth."""
+    time = np.linspace(0.0, 40.0, 4001)
+    phase = 2 * np.pi * time
+    data = np.exp(-time / 10.0) * np.cos(phase)
+    signal = np.exp(-time / 10.0) * np.cos(phase + late_phase * (time > 35.0))
+    scales = SimpleNamespace(rate=2 * np.pi, k=1.0, J=1.0 / (2 * np.pi) ** 2)
+    run = SimpleNamespace(outputs=[SimpleNamespace(data=data)], duration=40.0, scales={"x": scales})
+    model = SimpleNamespace(runs=[run], outputs=lambda x, stop: [[signal]])
+    likelihood = SimpleNamespace(whiteners=[[SimpleNamespace(noise_variance=1e-8)]])
+    return likelihood, SimpleNamespace(model=model, x=np.zeros(0))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("late_phase", [0.0, 0.05, 0.4])
+def test_a_phase_that_is_lost_late_in_a_decay_counts_as_lost(late_phase: float) -> None:
+    likelihood, fit = decaying_fit(late_phase)
+    assert residual_ratio(likelihood, fit) == pytest.approx(2.0 * np.sin(late_phase / 2.0), abs=0.01)
+
+
+def test_a_diverged_motion_is_not_followed() -> None:
+    likelihood, fit = decaying_fit(0.0)
+    fit.model.outputs = lambda x, stop: [[np.full(4001, 1e200)]]  # type: ignore[method-assign, assignment, misc]
+    assert residual_ratio(likelihood, fit) == np.inf
 
 
 @pytest.mark.slow
