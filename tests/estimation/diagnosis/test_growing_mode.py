@@ -32,7 +32,7 @@ def test_a_mode_that_grows_late_is_found(tmp_path: Path) -> None:
     assert quality == pytest.approx(true.mode_frequency / true.mode_damping, rel=0.01)
     # In the units of the term, in which the energy of the mode is k q²/2.
     pushed = true.mode_coupling / np.sqrt(true.mode_exchange * true.k / true.J)
-    assert push == pytest.approx(pushed, rel=0.1)
+    assert abs(push) == pytest.approx(pushed, rel=0.1)  # mirrored, the mode makes the same signal
 
 
 @pytest.mark.slow
