@@ -84,18 +84,18 @@ def measure_sample_motion(beam: Motion, intensity: Channel, grid: Grid, unlocate
     """
     size = min(grid.width * grid.height, intensity.size / MIN_SAMPLES_PER_CELL)
     cell = max(max(grid.width, grid.height) / MAX_CELLS_ACROSS, float(np.sqrt(grid.width * grid.height / size)))
-    columns = [np.empty(intensity.size, np.float32) for _ in range(3)]
+    samples = ScanSamples.empty(intensity.size)
     x, y = (beam.axes[axis].angle for axis in AXES)
     for first in range(0, intensity.size, READ_CHUNK_SAMPLES):
-        part = slice(first, min(first + READ_CHUNK_SAMPLES, intensity.size))
-        columns[0][part] = 0.5 * grid.width / cell * (x.read(part.start, part.stop) / grid.half_angle_x + 1.0)
-        columns[1][part] = 0.5 * grid.height / cell * (y.read(part.start, part.stop) / grid.half_angle_y + 1.0)
-        columns[2][part] = intensity.read(part.start, part.stop).reshape(part.stop - part.start, -1).mean(axis=1)
+        stop = min(first + READ_CHUNK_SAMPLES, intensity.size)
+        across = 0.5 * grid.width / cell * (x.read(first, stop) / grid.half_angle_x + 1.0)
+        down = 0.5 * grid.height / cell * (y.read(first, stop) / grid.half_angle_y + 1.0)
+        samples.write(first, across, down, intensity.read(first, stop).reshape(stop - first, -1).mean(axis=1))
     for begin, end in unlocated:
-        columns[2][begin:end] = np.nan
+        samples.value[begin:end] = np.nan
     period = slow_period(beam) * intensity.sample_rate
     shape = math.ceil(grid.height / cell), math.ceil(grid.width / cell)
-    found = estimate_sample_motion(ScanSamples(*columns), period, shape)
+    found = estimate_sample_motion(samples, period, shape)
     return None if found is None else replace(found, shift=cell * found.shift, sd=cell * found.sd)
 
 

@@ -45,7 +45,7 @@ def place_jumps(
     """
     middle = (np.arange(len(shift)) + 0.5) * length - 0.5
     inside = sorted(block for block in jumps if MARGIN_BLOCKS <= block < len(shift) - MARGIN_BLOCKS)
-    references = fold_references(samples, shift, length, shape, width) if inside else np.empty(0)
+    references = fold_references(samples, shift, length, shape, width) if inside else np.empty(0, np.float32)
     keep, knots, places = np.ones(len(shift), bool), [], []
     for block in inside:
         before, after = block - MARGIN_BLOCKS, block + MARGIN_BLOCKS
@@ -66,10 +66,14 @@ def place_jumps(
 
 
 def _residuals(
-    samples: ScanSamples, part: NDArray[np.int64], shift: Array, references: Array, fold: NDArray[np.int64]
+    samples: ScanSamples,
+    part: NDArray[np.int64],
+    shift: Array,
+    references: NDArray[np.float32],
+    fold: NDArray[np.int64],
 ) -> Array:
     """Intensity less the picture of the other blocks under a displacement; NaN where it is not known."""
-    x, y = samples.x[part] - shift[0], samples.y[part] - shift[1]
+    x, y = (place - by for place, by in zip(samples.places(part), shift, strict=True))
     height, width = references.shape[1:3]
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     row, column = np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)

@@ -65,7 +65,7 @@ def search_motion(samples: ScanSamples, length: int, parts: int, shape: tuple[in
 
 def _grid(samples: ScanSamples, part: slice, shift: Array, shape: tuple[int, int]) -> Array:
     """Count, sum and sum of squares by cell of the samples of a part, shape (3, height, width)."""
-    x, y, value = (each[part] for each in samples)
+    (x, y), value = samples.places(part), samples.value[part]
     column, row = np.floor((x - shift[0]) / CELL_PX), np.floor((y - shift[1]) / CELL_PX)
     used = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0]) & np.isfinite(value)
     cell, value = (row[used] * shape[1] + column[used]).astype(np.int64), value[used]

@@ -40,7 +40,7 @@ def scan(displacement: np.ndarray, photons: float = 300.0, blocks: int = BLOCKS)
     half = 0.5 * len(picture)
     light = sample_scene(picture, x - u - 0.5 * PIXELS, y - v - 0.5 * PIXELS, half, half)
     counts = np.random.default_rng(1).poisson(photons * np.maximum(light, 0.0))
-    return ScanSamples(*(each.astype(np.float32) for each in (x, y, counts)))
+    return ScanSamples.from_arrays(x, y, counts)
 
 
 def error_of(found: SampleMotion, displacement: np.ndarray) -> np.ndarray:
@@ -121,7 +121,7 @@ def test_a_scene_without_structure_and_a_scan_without_crossings_are_stated() -> 
     assert not found.moving
     assert "too little structure" in describe_sample_motion(found)
     line = (0.5 + 4.0 * (np.arange(samples.x.size) // 1800)).astype(np.float32)
-    raster = ScanSamples(samples.x, line, samples.value)
+    raster = ScanSamples.from_arrays(samples.places(slice(None))[0], line, samples.value)
     assert estimate_sample_motion(raster, 1800.0, (PIXELS, PIXELS)) is None
     assert "too rarely" in describe_sample_motion(None)
 
