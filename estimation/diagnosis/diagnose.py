@@ -10,7 +10,7 @@ import numpy as np
 
 from estimation.diagnosis.clipping import rail_resolution
 from estimation.diagnosis.data import prepare_run
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
 from estimation.diagnosis.fit import Fit, Likelihood
@@ -199,7 +199,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
 
 def _finding(result: SelectionResult, step: SelectionStep) -> Finding:
     candidate = step.candidate
-    has_law = candidate.term.effect not in DISCREPANCY_TERMS
+    has_law = not is_discrepancy(candidate)
     effect = _name(candidate)
     weights = {effect: 1.0}  # evidence relative to that of the finding
     for rival in step.rivals:
@@ -254,9 +254,7 @@ def _distances(result: SelectionResult, step: SelectionStep) -> dict[str, float]
     """
     present = {other.key for other in result.final.model.candidates}
     rival_fits = [
-        rival
-        for rival in step.rivals
-        if rival.candidate.term.effect not in DISCREPANCY_TERMS and rival.candidate.key not in present
+        rival for rival in step.rivals if not is_discrepancy(rival.candidate) and rival.candidate.key not in present
     ]
     rivals = [rival.candidate for rival in rival_fits]
     first_order = distances_to_rivals(result.likelihood, result.final, step.candidate, rivals)
@@ -295,7 +293,7 @@ def _advice(result: SelectionResult, step: SelectionStep, distance: Mapping[str,
 
 def _name(candidate: Candidate) -> str:
     """Name of the effect in the findings; a discrepancy term is ``unknown``."""
-    return "unknown" if candidate.term.effect in DISCREPANCY_TERMS else candidate.term.effect
+    return "unknown" if is_discrepancy(candidate) else candidate.term.effect
 
 
 def parameter_estimates(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> tuple[ParameterEstimate, ...]:

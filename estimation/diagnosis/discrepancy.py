@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
+from estimation.diagnosis.parameters import Candidate
 from scanner.arrays import Array
 from scanner.integrator.abi import CAPACITANCE_LAW, TORQUE_LAW
 from scanner.lowpass import apply_lowpass
@@ -290,3 +291,8 @@ DISCREPANCY_TERMS: dict[str, Term] = {
     )
 }  # fmt: skip
 """Discrepancy terms by name. A finding never reports these names as its effect."""
+
+
+def is_discrepancy(candidate: Candidate) -> bool:
+    """Whether a term is a discrepancy term."""
+    return candidate.term.effect in DISCREPANCY_TERMS

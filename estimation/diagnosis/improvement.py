@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from estimation.diagnosis.data import Run
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.fit import Fit, fit_model
 from estimation.diagnosis.identifiability import determined_parameters
@@ -54,7 +54,7 @@ def improve(result: SelectionResult) -> Improvement:
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
     while True:
-        unnamed = any(step.candidate.term.effect in DISCREPANCY_TERMS for step in result.steps)
+        unnamed = any(is_discrepancy(step.candidate) for step in result.steps)
         device = improved_device(fit_static_law(result) if unnamed else result.final)
         improved = open_loop(runs, device)
         if unnamed or not result.steps:
@@ -118,7 +118,7 @@ def improved_device(fit: Fit) -> Device:
             term = candidate.term
             if candidate.axis != name:
                 continue
-            if term.effect not in DISCREPANCY_TERMS:
+            if not is_discrepancy(candidate):
                 values = fit.model.values(candidate, fit.x)
                 terms[term.effect] = {p.name: float(v) for p, v in zip(term.parameters, values, strict=True)}
                 if variant := term.channels.index(candidate.channel):

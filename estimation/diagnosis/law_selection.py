@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model, misfit
 from estimation.diagnosis.initial import estimate_whiteners
 from estimation.diagnosis.linear_model import (
@@ -27,15 +27,9 @@ from estimation.diagnosis.significance import satisfies_sign_constraints
 MAX_LINEARISATIONS = 8
 """Fits around which laws are selected, each with the laws selected before."""
 
-
 SINGLE_LAWS = 6
 """Single laws that are fitted around terms that follow the motion, where sensitivities do not rank them well. Each
 costs a fit."""
-
-
-def is_discrepancy(candidate: Candidate) -> bool:
-    """Whether a term is a discrepancy term."""
-    return candidate.term.effect in DISCREPANCY_TERMS
 
 
 class Choice(NamedTuple):
@@ -73,20 +67,20 @@ def choose_laws(
         if alternates:
             break
         if not fitted and any(map(is_linear, fit.model.candidates)):
-            options = [linear.select().laws, *linear.strongest(SINGLE_LAWS)]
+            selected = [linear.select().laws, *linear.strongest(SINGLE_LAWS)]
         else:
-            options = [linear.select(present, max_moves=1).laws]
-        progress("beside a discrepancy: " + " or ".join(map(linear.describe, options)))
-        options = [laws for laws in options if laws]
+            selected = [linear.select(present, max_moves=1).laws]
+        progress("beside a discrepancy: " + " or ".join(map(linear.describe, selected)))
+        options = {linear.effects(laws): laws for laws in selected if laws}
         if not options:
             return None
-        if [linear.effects(laws) for laws in options] == [linear.effects(present)]:
+        if list(options) == [linear.effects(present)]:
             exchanged = _exchange_near_rival(linear, likelihood, fit, present, candidates, fitted)
             if exchanged is None:
                 break
             fit = exchanged
             continue
-        fits = {linear.effects(laws): fit_laws(linear, likelihood, fit, laws, fitted) for laws in options}
+        fits = {names: fit_laws(linear, likelihood, fit, laws, fitted) for names, laws in options.items()}
         if not fitted and present:
             fits[linear.effects(present)] = fit
         followed = MAX_CHI2_RATIO * fit.chi2
@@ -116,7 +110,7 @@ def choose_laws(
 def _evidence_of_discrepancy(likelihood: Likelihood, anchor: Fit, candidates: Sequence[Candidate]) -> float:
     """-2 log evidence of discrepancies of all stages around the fit of one."""
     fit = fit_model(likelihood, anchor.model, anchor.x)
-    around = linear_model(likelihood, fit, [candidate for candidate in candidates if is_discrepancy(candidate)])
+    around = linear_model(likelihood, fit, list(filter(is_discrepancy, candidates)))
     return around.hypothesis(()).neg2_log_evidence
 
 
@@ -133,7 +127,7 @@ def _exchange_near_rival(
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
     ``MIN_SCORE_GAIN`` are fitted, each once, and compared around their own fits.
     """
-    discrepancies = [candidate for candidate in candidates if is_discrepancy(candidate)]
+    discrepancies = list(filter(is_discrepancy, candidates))
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     best, lowest = None, hypothesis.neg2_log_evidence - MIN_EXCHANGE_GAIN
     for removed in present:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from estimation.diagnosis.anchor import fit_growing
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.initial import window_schedule
 from estimation.diagnosis.linear_model import LinearModel, LinearTerm
@@ -67,8 +67,8 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
         LinearTerm(candidate, np.arange(low, high), test, cost)
         for (candidate, _, test, cost), (low, high) in zip(blocks, pairwise(ends), strict=True)
     ]
-    discrepancies = tuple(term for term in terms if term.candidate.term.effect in DISCREPANCY_TERMS)
-    laws = tuple(term for term in terms if term.candidate.term.effect not in DISCREPANCY_TERMS)
+    discrepancies = tuple(term for term in terms if is_discrepancy(term.candidate))
+    laws = tuple(term for term in terms if not is_discrepancy(term.candidate))
     cost = common.log_determinant - float(np.log(fit.model.precision[base]).sum())
     return LinearModel(common.remainder, profile, laws, discrepancies, cost)
 
@@ -76,7 +76,7 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
 def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
     """The best starts of one candidate, where it has an effect."""
     with_effect = [test for test in tests if np.any(test.columns)]
-    most = 1 if tests[0].candidate.term.effect in DISCREPANCY_TERMS else MAX_STARTS
+    most = 1 if is_discrepancy(tests[0].candidate) else MAX_STARTS
     return sorted(with_effect, key=lambda test: -test.predicted_gain)[:most]
 
 

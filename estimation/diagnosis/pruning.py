@@ -16,9 +16,7 @@ from estimation.diagnosis.fit import Fit, Likelihood, fit_model
 from estimation.diagnosis.hum import select_mains_hum
 from estimation.diagnosis.model import Model, uncertain
 from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.significance import (
-    evidence_gain,
-)
+from estimation.diagnosis.significance import evidence_gain
 from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from estimation.diagnosis.anchor import fit_anchor
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.data import Run
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models, misfit
 from estimation.diagnosis.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
 from estimation.diagnosis.initial import (
@@ -19,7 +19,7 @@ from estimation.diagnosis.initial import (
     window_schedule,
 )
 from estimation.diagnosis.interference import with_interference_line
-from estimation.diagnosis.law_selection import choose_laws, is_discrepancy
+from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.diagnosis.model import Model, uncertain
@@ -36,9 +36,9 @@ Progress = Callable[[str], None]
 MAX_DISCREPANCY_FITS = 3
 """Number of discrepancy terms that are fitted, those with the best evidence in the linear model. Each costs a fit."""
 
-AMPLITUDE_LAWS = ("cubic-stiffness", "quadratic-drag")
-"""A frequency and a damping that depend on the amplitude: the first laws that follow a motion which the nominal device
-does not."""
+ANCHOR_EFFECTS = (("cubic-stiffness", "quadratic-drag"), ("free-stiffness",), ("free-mechanics",))
+"""Terms that are fitted in this order, on all axes, where the nominal device does not follow the motion: a frequency
+and a damping that depend on the amplitude, a stiffness and a damping that drift, a free torque."""
 
 NONLINEAR_ITERATIONS, NONLINEAR_TOLERANCE = 60, 1e-3
 """Largest number of iterations of the fit with a law that is linear in no amplitude, and the fall of the misfit below
@@ -129,10 +129,8 @@ def _choose_around_nominal(
     progress: Progress,
 ) -> _Selected:
     """Named laws, else a discrepancy term, else nothing."""
-    mechanics = [c for c in pool if c.term.effect in DISCREPANCY_TERMS and c.term.stage == "mechanics"]
-    of_amplitude = [c for c in pool if c.term.effect in AMPLITUDE_LAWS]
-    groups = [of_amplitude, *([c] for c in mechanics[::-1])] if of_amplitude else [[c] for c in mechanics[::-1]]
-    anchor, tried = fit_anchor(likelihood, nominal, early, stops, groups)
+    groups = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
+    anchor, tried = fit_anchor(likelihood, nominal, early, stops, [group for group in groups if group])
     selected = _choose_laws(anchor, nominal, pool, progress)
     if selected is not None:
         return selected
@@ -165,7 +163,7 @@ def _choose_discrepancy(
     """
     likelihood = Likelihood(anchor.model.runs, estimate_whiteners(anchor.model, anchor.x))
     anchor = fit_model(likelihood, anchor.model, anchor.x)
-    linear = linear_model(likelihood, anchor, [c for c in pool if c.term.effect in DISCREPANCY_TERMS])
+    linear = linear_model(likelihood, anchor, list(filter(is_discrepancy, pool)))
     stages = range(len(linear.discrepancies))
     alone = {i: linear.hypothesis((), without=[j for j in stages if j != i]).neg2_log_evidence for i in stages}
     fits = [fit_model(likelihood, fit.model, fit.x) for fit in fitted]
@@ -211,7 +209,7 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
     base, best = min(possible, key=lambda pair: pair[1].neg2_log_evidence, default=(None, None))
     if base is None or best is None or not evidence_gain(selected.likelihood, selected.fit, best):
         return selected
-    discrepancies = [candidate for candidate in pool if is_discrepancy(candidate)]
+    discrepancies = list(filter(is_discrepancy, pool))
     without, beside = (linear_model(selected.likelihood, fit, discrepancies) for fit in (base, best))
     laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
     if not beside.are_needed(laws, misfit(base) - misfit(best), alone):
