@@ -21,15 +21,14 @@ from estimation.diagnosis.linear_model import (
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
 from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.screening import is_linear
 from estimation.diagnosis.significance import satisfies_sign_constraints
 
 MAX_LINEARISATIONS = 8
 """Fits around which laws are selected, each with the laws selected before."""
 
 SINGLE_LAWS = 6
-"""Single laws that are fitted around terms that follow the motion, where sensitivities do not rank them well. Each
-costs a fit."""
+"""Single laws that are fitted around a discrepancy that follows the motion, where sensitivities do not rank them well.
+Each costs a fit."""
 
 
 class Choice(NamedTuple):
@@ -66,8 +65,10 @@ def choose_laws(
         present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
         if alternates:
             break
-        if not fitted and any(map(is_linear, fit.model.candidates)):
+        if not fitted and any(map(is_discrepancy, fit.model.candidates)):
             selected = [linear.select().laws, *linear.strongest(SINGLE_LAWS)]
+        elif not fitted and present:
+            selected = [linear.select().laws, *((law,) for law in present)]
         else:
             selected = [linear.select(present, max_moves=1).laws]
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, selected)))
