@@ -104,13 +104,13 @@ def empty_history(blocks: int, axes: int) -> FilterHistory:
 @njit(cache=True, error_model="numpy")
 def _acquire(signal, k, a, x, P):  # type: ignore[no-untyped-def]
     """Set phase and amplitude of axis ``a`` from block k's main line alone; False where the line is not significant."""
-    moments, whitener = signal.whitened_moments[signal.geometry[k], 0], signal.whiteners[signal.geometry[k]]
-    fitted = whitener @ signal.whitened[k]
+    moments, solver = signal.whitened_moments[signal.geometry[k], 0], signal.solvers[signal.geometry[k]]
+    fitted = solver @ signal.whitened[k]
     at = a * AXIS_STATES
     for i in range(signal.lines.shape[0]):
         if signal.lines[i, 0] == a and signal.lines[i, 1] == signal.main_order:
             line = complex(fitted[1 + 2 * i], -fitted[2 + 2 * i])
-            var = signal.noise_var[k] * max((whitener[1 + 2 * i] ** 2).sum(), (whitener[2 + 2 * i] ** 2).sum())
+            var = signal.noise_var[k] * max((solver[1 + 2 * i] ** 2).sum(), (solver[2 + 2 * i] ** 2).sum())
             missing = (moments[:, 1 + 2 * i] ** 2).sum() <= 0.0
             if missing or abs(line) < DETECTION_SIGMA * np.sqrt(var):
                 return False
