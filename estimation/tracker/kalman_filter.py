@@ -56,8 +56,13 @@ REACQUIRE_NIS = 100.0
 MAX_REUSE_DISTANCE = 0.5
 """``state_distance`` beyond which a stored linearisation is no starting point for the iterated update."""
 
-JUMP_SD = (0.02, 3.0)
-"""Largest standard deviations of stiffness [1] and its rate [1/s] that a jump may cause: 2 %, or 2 % in 7 ms."""
+JUMP_SD = (0.02, 3.0, 0.5)
+"""Largest standard deviations of stiffness [1], its rate [1/s] and damping [1] that a jump may cause: 2 %, 2 % in 7 ms,
+and half of the damping, so that it is positive within two standard deviations.
+
+A phase that the device file misses by 37 degrees, as by filters behind the demodulator, needs another ratio of damping
+to drive as well as another resonance: with the damping fixed, the phase would be biased by one to two degrees.
+"""
 
 
 @dataclass(frozen=True)
@@ -232,7 +237,7 @@ def _update_iterated(laws, signal, k, predicted, P_predicted, linear, noise_var)
 
 @njit(cache=True, error_model="numpy")
 def _inflate_covariance(laws, signal, k, x, P, transitions, mean_nis):  # type: ignore[no-untyped-def]
-    """Admit a jump: scale the variances of phase, ln A and stiffness by the mean NIS, or acquire the motion again."""
+    """Admit a jump: scale the variances of all states but the gain by the mean NIS, or acquire the motion again."""
     scale = min(mean_nis, REACQUIRE_NIS)
     for a in range(len(laws)):
         at = a * AXIS_STATES
@@ -241,7 +246,7 @@ def _inflate_covariance(laws, signal, k, x, P, transitions, mean_nis):  # type: 
         else:
             P[at + PHASE, at + PHASE] *= scale
             P[at + LOG_AMPLITUDE, at + LOG_AMPLITUDE] *= scale
-        for i, sd in ((at + STIFFNESS, JUMP_SD[0]), (at + STIFFNESS_RATE, JUMP_SD[1])):
+        for i, sd in ((at + STIFFNESS, JUMP_SD[0]), (at + STIFFNESS_RATE, JUMP_SD[1]), (at + DAMPING, JUMP_SD[2])):
             P[i, i] = max(P[i, i], min(P[i, i] * scale, sd * sd))
 
 

@@ -230,7 +230,8 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
     noise, median_noise = _noise_variance(
         projections, channel, starts, pieces, lines, w, sense.readout.noise_sd, model_error
     )
-    line_noise = np.fmax(line_noise_variance(projections, channel, starts, length, lines), model_error)
+    line_noise = line_noise_variance(projections, channel, starts, length, lines, median_noise)
+    line_noise = np.fmax(line_noise, model_error)
     spectrum = noise_spectrum(line_noise, median_noise, length)
     whitened, moments, _, solvers = whiten_projections(
         projections.sums, projections.grams, projections.geometry, spectrum

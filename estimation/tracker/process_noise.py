@@ -45,6 +45,10 @@ MIN_INFORMATIVE_DOF = 1e-3
 PRIOR_DOF = (0.0, 1.0, 0.0, 0.0)
 """Degrees of freedom that the prior adds to each density's score: one for a prior that is flat in the square root."""
 
+OFFSET_PRIOR_DOF = 1.0
+"""Degrees of freedom of the prior of the offset's density, about the thermal drift MIN_OFFSET_DENSITY_V2_PER_S: as many
+as the prior of the stiffness rate has. Without it, noise would be attributed to an offset that is at rest."""
+
 MAX_DENSITY_GROWTH = 10.0
 """Largest factor by which a density grows in a round; keeps the fixed-point iteration stable."""
 
@@ -91,10 +95,13 @@ def tune_process_noise(
     """Most probable spectral densities of the process noise, shape (axes, 4), and of the offset [V^2/s].
 
     For a density q, step h and the sums R = sum of r^2 and N of ``disturbance_scores``, the derivative of the
-    log-posterior by ln q is (q h R + dof_prior - q h N) / 2. The iteration q <- (q R + dof_prior / h) / N has its fixed
-    point where this vanishes. A density with less than one degree of freedom q h N in the data does not delay the end.
-    The prior is flat in the standard deviation of the stiffness rate (Gelman, Bayesian Analysis 1, 515, 2006). Without
-    it, a likelihood that is flat towards zero drift would often yield none.
+    log-likelihood by ln q is (q h R - q h N) / 2. The prior adds (a - b) / 2. The iteration q <- q (q h R + a) /
+    (q h N + b) has its fixed point where the sum vanishes. A density with less than one degree of freedom q h N in the
+    data and no prior does not delay the end.
+    The prior of the stiffness rate is flat in its standard deviation: a = 1, b = 0 (Gelman, Bayesian Analysis 1, 515,
+    2006). Without it, a likelihood that is flat towards zero drift would often yield none. That of the offset is a
+    scaled inverse chi-square distribution with OFFSET_PRIOR_DOF degrees of freedom n about the thermal drift q0:
+    a = n q0 / q, b = n.
 
     Args:
         start: estimate before the first block of each part. parts: blocks to tune on.
@@ -102,7 +109,9 @@ def tune_process_noise(
     """
     step, axes = observations.signal.step, len(observations.parameters)
     densities = np.tile(INITIAL_DENSITIES, (axes, 1)) if densities is None else densities
-    prior_dof = np.append(np.tile(PRIOR_DOF, axes), 0.0)
+    added, removed = np.append(np.tile(PRIOR_DOF, axes), 0.0), np.append(np.zeros(4 * axes), OFFSET_PRIOR_DOF)
+    idle = added == 0.0  # densities that the prior does not keep from their least value
+    idle[-1] = True
     low, high = (
         np.append(np.tile(limits, axes), offset)
         for limits, offset in ((MIN_DENSITIES, MIN_OFFSET_DENSITY_V2_PER_S), (MAX_DENSITIES, np.inf))
@@ -110,14 +119,15 @@ def tune_process_noise(
     q = np.append(densities, observations.signal.offset_density)
     for _ in range(MAX_TUNING_ROUNDS):
         parts = with_offset_density(parts, q[-1])
+        added[-1] = OFFSET_PRIOR_DOF * MIN_OFFSET_DENSITY_V2_PER_S / q[-1]
         squares, information = _score_terms(observations, parts, start, q[:-1].reshape(axes, -1))
         dof = information * q * step
-        informative = dof > MIN_INFORMATIVE_DOF
-        fixed_point = (q * squares + prior_dof / step) / np.where(informative, information, 1.0)
+        informative = dof + removed > MIN_INFORMATIVE_DOF
+        fixed_point = q * (squares * q * step + added) / np.where(informative, dof + removed, 1.0)
         limited = np.clip(np.minimum(fixed_point, MAX_DENSITY_GROWTH * q), low, high)
         new = np.where(informative, limited, q)
         converged = np.abs(np.log(new / q)) < LOG_DENSITY_TOLERANCE
-        converged |= (dof < 1.0) & (prior_dof == 0.0)
+        converged |= (dof < 1.0) & idle
         q = new
         if converged.all():
             break
