@@ -5,13 +5,36 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.tracker import track
-from estimation.tracker.demodulation import NoiseSpectrum, whiten_projections
-from estimation.tracker.line_noise import noise_spectrum
+from estimation.tracker.block_signal import MIN_OFFSET_DENSITY_V2_PER_S
+from estimation.tracker.demodulation import NoiseSpectrum, Projections, whiten_projections
+from estimation.tracker.line_noise import (
+    MAX_SPECTRUM_BLOCKS,
+    initial_offset_density,
+    line_noise_variance,
+    noise_spectrum,
+    shrink_to_white,
+)
 from scanner import devices
+from scanner.channel import make_channel
 from scanner.motion import Motion
 from tests.support.simulated import noisy, with_sense
 
 SAMPLE_RATE_HZ = 5e6
+
+
+def constant_blocks(means: np.ndarray, length: int, frequency_hz: float) -> Projections:
+    """Projections on a constant alone, of blocks with these means, shape (blocks,) [V]."""
+    blocks = means.size
+    return Projections(
+        sums=length * means[:, None],
+        grams=np.full((1, 3, 1, 1), float(length)),
+        geometry=np.zeros(blocks, int),
+        squares=length * means**2,
+        counts=np.full(blocks, length),
+        table_w=np.full((blocks, 1), 2.0 * np.pi * frequency_hz),
+        rails=np.tile([-np.inf, np.inf], (blocks, 1)),
+        clipped_counts=np.zeros(blocks, int),
+    )
 
 
 def tracked_with(added: np.ndarray) -> tuple[Motion, Motion]:
@@ -64,3 +87,46 @@ def test_whitened_projections_of_coloured_noise_have_independent_errors() -> Non
         np.testing.assert_allclose(whiteners[0] @ grams[0, 0], moments[0, 0])
     flat = whiten_projections(sums, grams, np.zeros(4000, int), NoiseSpectrum(1.0, np.zeros(5)))
     np.testing.assert_allclose(flat[2][0] @ grams[0, 0] @ flat[2][0].T, np.eye(5), atol=1e-6)
+
+
+def test_white_noise_has_one_variance_and_coloured_noise_keeps_its_own() -> None:
+    length, frequency, lines = 2000, 13840.0, np.array([[0, 2], [0, 4], [0, 6]])
+    noise = np.random.default_rng(8).standard_normal(MAX_SPECTRUM_BLOCKS * length)
+    hum = coloured_noise(2e5, 1.0, noise.size)
+    projections = constant_blocks(np.zeros(MAX_SPECTRUM_BLOCKS), length, frequency)
+    starts = np.arange(MAX_SPECTRUM_BLOCKS) * length
+    white, coloured = (
+        line_noise_variance(
+            projections, make_channel("s", y, unit="V", sample_rate=SAMPLE_RATE_HZ), starts, length, lines, 1.0
+        )
+        for y in (noise, hum)
+    )
+    error = 0.15  # standard deviation of the logarithm of one variance from 24 blocks
+    np.testing.assert_allclose(white, 1.0, atol=error)  # without shrinkage, all four are with a probability of 0.2
+    frequencies = np.append(3.5 * SAMPLE_RATE_HZ / length, frequency * lines[:, 1])
+    full = np.linspace(0.0, SAMPLE_RATE_HZ / 2, 10000)
+    density = 1.0 / (1.0 + frequencies / 2e5) / np.mean(1.0 / (1.0 + full / 2e5))
+    np.testing.assert_allclose(np.log(coloured), np.log(density), atol=3 * error)
+
+
+def test_shrinkage_weighs_the_lines_by_their_errors() -> None:
+    variance = np.full(5, 0.15**2)
+    white = np.random.default_rng(2).normal(0.0, 0.15, (200, 5))
+    shrunk = np.array([shrink_to_white(each, variance) for each in white])
+    assert np.sqrt(np.mean(shrunk**2)) < 0.15 / 3
+    clear = np.array([3.0, 2.0, 1.0, 0.5, 0.0])
+    np.testing.assert_allclose(shrink_to_white(clear, variance), clear, atol=0.15)
+    uncertain = shrink_to_white(clear, 100.0 * variance)
+    assert np.all(uncertain <= shrink_to_white(clear, variance))
+
+
+def test_a_steady_drift_of_the_mean_is_not_a_walk_of_the_offset() -> None:
+    rng, blocks, length, step, noise_var = np.random.default_rng(5), 400, 2000, 4e-4, 1e-4
+    noise = rng.normal(0.0, np.sqrt(noise_var / length), blocks)
+    drift = 1e-2 * np.arange(blocks) / blocks
+    at_rest = initial_offset_density(constant_blocks(drift + noise, length, 1e4), noise_var, step)
+    assert at_rest == MIN_OFFSET_DENSITY_V2_PER_S
+    density = 1e-3
+    walk = np.cumsum(rng.normal(0.0, np.sqrt(density * step), blocks))
+    found = initial_offset_density(constant_blocks(walk + drift + noise, length, 1e4), noise_var, step)
+    assert abs(np.log(found / density)) < 4.0 * 2.33 / np.sqrt(blocks)  # the median of chi-square, four sigma
