@@ -52,7 +52,7 @@ UNDESCRIBED_DELAY_SD_S = 0.5e-6
 """Standard deviation of the delay of electronics that no device file describes, where no picture measures it: cables,
 converters and amplifiers are late by up to a microsecond."""
 REPORTED_SDS = 3.0
-"""Number of standard deviations from which a phase error is reported in a note: 0.3 % of correct readouts exceed it."""
+"""Standard deviations from which a phase error is reported, or a growing change refutes it: 0.3 % of noise exceeds it."""
 MAX_SLICE_SPREAD_RAD = 2.0 * DRIFT_SDS_RAD[-1]
 """Largest difference between the phase errors of two slices: two standard deviations of the largest drift. In a pattern
 that repeats within the reach of the registration, slices agree on no period."""
@@ -185,8 +185,8 @@ def remove_readout_phase(
                 axes[name] = advance_axis(axis, estimate)
                 moved = axes[name].phase - corrected.axes[name].phase
                 changes[name].append(float(np.max(np.abs(moved) / axes[name].phase_sd)))
-            if name in found and (estimate is None or changes[name][-1] > max(changes[name][-2], 1.0)):
-                refuted.add(name)  # rounds that converge change less and less, down to the stated uncertainty
+            if name in found and (estimate is None or changes[name][-1] > max(changes[name][-2], REPORTED_SDS)):
+                refuted.add(name)  # rounds that converge change less and less, down to their noise
             if estimate is None or name in refuted:
                 found.pop(name, None)
                 axes[name] = widen_undetermined(axis)
