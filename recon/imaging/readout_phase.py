@@ -52,7 +52,7 @@ UNDESCRIBED_DELAY_SD_S = 0.5e-6
 """Standard deviation of the delay of electronics that no device file describes, where no picture measures it: cables,
 converters and amplifiers are late by up to a microsecond."""
 REPORTED_SDS = 3.0
-"""Standard deviations from which a phase error is reported, or a growing change refutes it: 0.3 % of noise exceeds it."""
+"""Standard deviations from which a phase error is reported, or a growing change refutes it: 0.3 % of noise exceeds."""
 MAX_SLICE_SPREAD_RAD = 2.0 * DRIFT_SDS_RAD[-1]
 """Largest difference between the phase errors of two slices: two standard deviations of the largest drift. In a pattern
 that repeats within the reach of the registration, slices agree on no period."""
