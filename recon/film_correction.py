@@ -172,7 +172,7 @@ def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = Fa
     model = with_reference(model, ((k, _as_channels(frame)) for k, frame in frames), known)
     model, measured, measured_sd = _measure(film, model, quiet)
     shift, sd = _smooth(measured, measured_sd, rows, model.detail_sd)
-    sd = np.hypot(sd, model.fill_error)
+    sd, measured_sd = (np.hypot(each, model.fill_error) for each in (sd, measured_sd))
     account = _Account()
     with tqdm(
         total=film.frames, desc="correct", unit="frame", file=sys.stderr, leave=False, disable=quiet or None

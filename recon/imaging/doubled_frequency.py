@@ -4,6 +4,10 @@ A detector in the centre of the swing gives an edge on the way up and one on the
 crossings in one direction, the motion appears at twice its frequency: successive periods show opposite halves of the
 swing in turn. At the right frequency the samples of one phase of both axes differ by noise, in any two periods. At
 twice the frequency they differ more in successive periods than in periods whose numbers differ by 2.
+
+The groups of periods may also pass slightly different places of fine detail. Therefore the direction has to agree as
+well: with theta = A sin(phi) the beam is at one place at phi and pi - phi. At twice the frequency, with
+theta = A sin(phi / 2), it is so at phi and -phi.
 """
 
 from __future__ import annotations
@@ -56,7 +60,7 @@ def describe_doubled_axes(beam: Motion, intensity: Channel) -> list[str]:
     for column, name in enumerate(AXES):
         if _event(beam, name).startswith("zero-crossing"):
             excess, sd = _excess_of_successive(beam, intensity, column)
-            if excess > max(MIN_EXCESS, MIN_EXCESS_SD * sd):
+            if _is_significant(excess, sd):
                 found[name] = excess
     if not found:
         return []
@@ -79,7 +83,7 @@ def _event(beam: Motion, name: str) -> str:
 def _excess_of_successive(beam: Motion, intensity: Channel, column: int) -> tuple[float, float]:
     """Logarithm of the ratio of squared differences, successive periods over those two apart, and its standard error.
 
-    (0, inf) where too few cells are shared.
+    (0, inf) where too few cells are shared, or samples at phi and -phi agree no better than those at phi and pi - phi.
     """
     found = axis_phases(beam, intensity, 0, min(intensity.size, MAX_SAMPLES))
     if found is None:
@@ -87,29 +91,46 @@ def _excess_of_successive(beam: Motion, intensity: Channel, column: int) -> tupl
     phases, values = found
     group = np.floor(np.unwrap(phases[column]) / (2 * pi)).astype(np.int64) % GROUPS
     for cells in CELLS:
-        x, y = (np.floor(phase / (2 * pi) * cells).astype(np.int64) % cells for phase in phases)
-        cell, size = (group * cells + y) * cells + x, GROUPS * cells * cells
-        count = np.bincount(cell, None, size).reshape(GROUPS, -1)
-        total = np.bincount(cell, values - values.mean(), size).reshape(GROUPS, -1)
-        squares = [_squared_differences(count, total, pairs) for pairs in (SAME, SUCCESSIVE)]
-        if squares[0].size < MIN_COMMON_CELLS * len(SAME) or not all(each.any() for each in squares):
+        own, other = (np.floor(phases[k] / (2 * pi) * cells).astype(np.int64) % cells for k in (column, 1 - column))
+        cell, shape = (group * cells + other) * cells + own, (GROUPS, cells, cells)
+        count = np.bincount(cell, None, GROUPS * cells * cells).reshape(shape)
+        total = np.bincount(cell, values - values.mean(), GROUPS * cells * cells).reshape(shape)
+        same, successive = (
+            np.concatenate([_squared_differences(count[a], total[a], count[b], total[b]) for a, b in pairs])
+            for pairs in (SAME, SUCCESSIVE)
+        )
+        at = np.arange(cells)
+        halved, stated = (
+            _squared_differences(count, total, count[..., turned], total[..., turned])
+            for turned in (cells - 1 - at, (cells // 2 - 1 - at) % cells)
+        )
+        if min(same.size, halved.size, stated.size) < MIN_COMMON_CELLS * len(SAME):
             continue
-        same, other = (float(each.mean()) for each in squares)
-        relative_sds = [float(each.std() / each.mean()) / np.sqrt(each.size) for each in squares]
-        return float(np.log(other / same)), float(np.hypot(*relative_sds))
+        excess, of_direction = _log_ratio(successive, same), _log_ratio(stated, halved)
+        return excess if _is_significant(*of_direction) else (0.0, np.inf)
     return 0.0, np.inf
 
 
-def _squared_differences(count: NDArray[Any], total: NDArray[Any], pairs: tuple[tuple[int, int], ...]) -> Array:
-    """Squared differences of the cells that two groups share, in their variances for noise of 1.
+def _is_significant(excess: float, sd: float) -> bool:
+    return excess > max(MIN_EXCESS, MIN_EXCESS_SD * sd)
+
+
+def _log_ratio(a: Array, b: Array) -> tuple[float, float]:
+    """Logarithm of the ratio of two means and its standard error; (0, inf) of constant samples."""
+    if not (a.any() and b.any()):
+        return 0.0, np.inf
+    relative = [float(each.std() / each.mean()) / np.sqrt(each.size) for each in (a, b)]
+    return float(np.log(a.mean() / b.mean())), float(np.hypot(*relative))
+
+
+def _squared_differences(
+    count_a: NDArray[Any], total_a: NDArray[Any], count_b: NDArray[Any], total_b: NDArray[Any]
+) -> Array:
+    """Squared differences of the means of the cells that both pictures have, in their variances for noise of 1.
 
     Args:
-        count, total: samples and their sum in each cell of each group, shape (groups, cells).
-        pairs: of groups that are compared.
+        count_a, total_a, count_b, total_b: samples and their sum in each cell, of one shape.
     """
-    squares = []
-    for a, b in pairs:
-        both = (count[a] > 0) & (count[b] > 0)
-        difference = total[a, both] / count[a, both] - total[b, both] / count[b, both]
-        squares.append(np.square(difference) / (1.0 / count[a, both] + 1.0 / count[b, both]))
-    return np.concatenate(squares)
+    both = (count_a > 0) & (count_b > 0)
+    n_a, n_b = count_a[both], count_b[both]
+    return np.asarray(np.square(total_a[both] / n_a - total_b[both] / n_b) / (1.0 / n_a + 1.0 / n_b))

@@ -275,11 +275,19 @@ def solve_line_phase(
 
 
 def standard_errors(score: Array, slope: Array, step: Array) -> Array:
-    """Standard errors from the scatter of the blocks' scores, shape (parameters,) [of ``step``]."""
-    left = score - slope @ step
+    """Standard errors from the scatter of the blocks' scores, shape (parameters,) [of ``step``].
+
+    Each block is compared with the parameters that the other blocks give (jackknife), because a few blocks with most of
+    the structure pull the parameters towards themselves.
+
+    Source:
+        MacKinnon and White 1985, "Some heteroskedasticity-consistent covariance matrix estimators" (HC3).
+    """
     inverse = np.linalg.inv(slope.sum(axis=0))
-    blocks = len(score)
-    return np.sqrt(np.diag(inverse @ (left.T @ left) @ inverse.T) * blocks / (blocks - 2))
+    left = score - slope @ step
+    others = np.eye(len(step)) - slope @ inverse
+    left = (np.linalg.pinv(others) @ left[..., None])[..., 0]
+    return np.sqrt(np.diag(inverse @ (left.T @ left) @ inverse.T))
 
 
 def _smoothed_lines(lines: NDArray[np.float32], parity: int, smoothing: float) -> NDArray[np.float32]:
