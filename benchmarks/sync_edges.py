@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.sync.motion import axis_motion_from_edges, phase_from_edges
+from estimation.sync.edge_phase import phase_from_edges
+from estimation.sync.motion import axis_motion_from_edges
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.sync import SyncDetector, sync_edges
 from recon.evaluation import evaluate_axis

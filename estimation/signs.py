@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimation.sync.motion import phase_from_edges
+from estimation.sync.checks import check_event, check_one_direction
+from estimation.sync.edge_phase import phase_from_edges
 from scanner.channel import Channel
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
@@ -40,9 +41,15 @@ def resolve_signs(motion: Motion, recording: Recording, flips: Mapping[str, bool
 
 
 def sign_from_edges(axis: AxisMotion, recording: Recording, name: str) -> tuple[bool, str]:
-    """Whether the edges of an axis show the opposite of its motion, and the source of its sign or "ambiguous"."""
+    """Whether the edges of an axis show the opposite of its motion, and the source of its sign or "ambiguous".
+
+    Raises:
+        BadInput: the edges are of both directions and state one, or the other way round.
+    """
     edges = recording.edges[f"sync_{name}"]
+    check_one_direction(edges)
     found = phase_from_edges(edges)
+    check_event(edges, float(np.median(found.frequency)), float(np.median(axis.frequency)), f"{name} moves at")
     if found.sign == "ambiguous":
         return False, "ambiguous"
     time = axis.angle.start + np.arange(min(axis.angle.size, SIGN_SAMPLES)) / axis.angle.sample_rate

@@ -5,25 +5,33 @@ from __future__ import annotations
 import csv
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from recon.imaging.film_phase import MAX_SHIFT_SD_PX, FilmModel, fit_film, frame_phase, smooth_phases
-from recon.imaging.line_phase import BLOCKS_ACROSS
+from recon.imaging.film_equations import PooledEquations
+from recon.imaging.film_phase import FilmModel, fit_film, frame_phase, share_equations, with_reference
+from recon.imaging.line_phase import BLOCKS_ACROSS, MAX_SHIFT_SD_PX
 from recon.imaging.line_shift import correct_frame, to_dtype
+from recon.imaging.phase_smoothing import smooth_phases
 from recon.io.film import Film, write_film
 from recon.io.output import finite
 from scanner.arrays import Array
 from scanner.errors import BadInput
 
 SAMPLED_FRAMES = 16
-"""Frames, spread over the film, that determine what all frames share."""
+"""Frames, spread over the film, that determine the smoothing and where the fit of the fill begins."""
+
+REFERENCE_FRAMES = 64
+"""Frames, spread over the film, whose mean is the reference. It has 1/64 of the noise of a frame, so that at 20 photons
+a pixel its gradient adds less than 2 % to the standard error."""
+
+Item = TypeVar("Item")
 
 MIN_SIDE_PX = 2 * BLOCKS_ACROSS
 """Least number of lines and columns: two in each of the blocks whose scatter gives the standard error."""
@@ -37,7 +45,7 @@ class CorrectedFilm:
         film: as recorded.
         model: what the frames share.
         shift, sd: of each frame after smoothing over time [px], shape (frames,).
-        measured, measured_sd: of each frame by itself [px]; (nan, inf) where it determines none.
+        measured, measured_sd: of each frame before smoothing [px]; (nan, inf) where it determines none.
         before, after: picture of one frame as recorded and corrected, summed over channels, shape (rows, columns).
         rows_rms: root mean square of the lines less the mean of their neighbours in the sampled frames: as recorded,
             corrected, and corrected by the same shift in all columns.
@@ -134,7 +142,8 @@ class CorrectedFilm:
 def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = False) -> CorrectedFilm:
     """Measure the line phase of every frame, write the corrected film, and return the account.
 
-    One frame is in memory at a time, besides ``SAMPLED_FRAMES`` at the beginning. The file is read three times.
+    One frame is in memory at a time, besides ``SAMPLED_FRAMES`` at the beginning. The file is read three times, and
+    ``REFERENCE_FRAMES`` of it once more.
 
     Args:
         film: to correct.
@@ -150,16 +159,20 @@ def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = Fa
     if min(rows, columns) < MIN_SIDE_PX:
         what = f"has frames of {rows} lines of {columns} pixels"
         raise BadInput(what, file=film.path, hint=f"at least {MIN_SIDE_PX} of each are needed")
-    sampled = np.unique(np.linspace(0, film.frames - 1, min(film.frames, SAMPLED_FRAMES)).round().astype(int))
+    sampled = _spread(film.frames, SAMPLED_FRAMES)
     samples = [_as_channels(frame) for frame in film.read(sampled)]
     try:
         model = fit_film(samples)
     except BadInput as error:
         error.file = film.path
         raise
-    measured, measured_sd = _measure(film, model, quiet)
+    members = _spread(film.frames, REFERENCE_FRAMES)
+    frames = _progress(zip(members, film.read(members), strict=True), "reference", len(members), quiet)
+    known = dict(zip(sampled, samples, strict=True))
+    model = with_reference(model, ((k, _as_channels(frame)) for k, frame in frames), known)
+    model, measured, measured_sd = _measure(film, model, quiet)
     shift, sd = _smooth(measured, measured_sd, rows, model.detail_sd)
-    sd = np.hypot(sd, model.fill_error)
+    sd, measured_sd = (np.hypot(each, model.fill_error) for each in (sd, measured_sd))
     account = _Account()
     with tqdm(
         total=film.frames, desc="correct", unit="frame", file=sys.stderr, leave=False, disable=quiet or None
@@ -198,30 +211,33 @@ def _as_channels(frame: NDArray[Any]) -> list[NDArray[np.float32]]:
     return [np.ascontiguousarray(plane, np.float32) for plane in frame]
 
 
-def _measure(film: Film, model: FilmModel, quiet: bool) -> tuple[Array, Array]:
-    """Line phase of each frame by itself and its standard error [px], shape (frames,)."""
-    value, sd, before = np.full(film.frames, np.nan), np.full(film.frames, np.inf), model.typical
-    frames = tqdm(
-        film.read(range(film.frames)),
-        "measure",
-        film.frames,
-        unit="frame",
-        file=sys.stderr,
-        leave=False,
-        disable=quiet or None,
-    )
-    for k, frame in enumerate(frames):
-        phase = frame_phase(_as_channels(frame), model, before)
+def _spread(frames: int, count: int) -> list[int]:
+    """At most ``count`` indices of frames, spread over the film."""
+    return [int(k) for k in np.unique(np.linspace(0, frames - 1, min(frames, count)).round())]
+
+
+def _progress(each: Iterable[Item], name: str, total: int, quiet: bool) -> Iterable[Item]:
+    bar: Iterable[Item] = tqdm(each, name, total, unit="frame", file=sys.stderr, leave=False, disable=quiet or None)
+    return bar
+
+
+def _measure(film: Film, model: FilmModel, quiet: bool) -> tuple[FilmModel, Array, Array]:
+    """The model with what all frames share, and line phase of each frame and its standard error [px], (frames,)."""
+    value, sd, by_fill = np.full(film.frames, np.nan), np.full(film.frames, np.inf), np.full(film.frames, np.nan)
+    pooled, before = PooledEquations(film.shape[-1], model.fill**2), model.typical
+    for k, frame in enumerate(_progress(film.read(range(film.frames)), "measure", film.frames, quiet)):
+        phase, equations = frame_phase(_as_channels(frame), k, model, before)
         value[k], sd[k] = phase
+        by_fill[k] = pooled.add(phase, equations)
         if np.isfinite(phase.shift):
             before = phase.shift
-    return value, sd
+    if not np.isfinite(value).any():
+        raise BadInput("no frame determines a line phase", file=film.path)
+    return *share_equations(model, pooled, value, by_fill), sd
 
 
 def _smooth(value: Array, sd: Array, rows: int, shared_sd: float) -> tuple[Array, Array]:
     """Smooth over time; frames of an odd number of lines may alternate in direction, and are smoothed apart."""
-    if not np.isfinite(value).any():
-        raise BadInput("no frame determines a line phase")
     if rows % 2 == 0 or len(value) < 4 or not all(np.isfinite(value[k::2]).any() for k in (0, 1)):
         return smooth_phases(value, sd, shared_sd)
     smooth, smooth_sd = np.empty_like(value), np.empty_like(sd)

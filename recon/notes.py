@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.rail import upper_rail
+from recon.imaging.doubled_frequency import describe_doubled_axes
 from recon.imaging.phase_agreement import describe_contradictions
 from recon.imaging.picture import Grid
 from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
@@ -43,7 +44,7 @@ def describe_limits(beam: Motion, intensity: Channel, grid: Grid, unlocated: Sam
     """
     sums = describe_running_sums(intensity)
     return [
-        *(sums or describe_contradictions(beam, intensity)),
+        *(sums or describe_doubled_axes(beam, intensity) or describe_contradictions(beam, intensity)),
         *describe_saturation(intensity),
         *describe_lower_rail(intensity),
         *describe_detector_gaps(beam, intensity, grid, unlocated),

@@ -40,6 +40,11 @@ class Edges:
     file: str | None = None
 
     @property
+    def is_one_direction(self) -> bool:
+        """Whether the edges state that the beam passes the detector in one direction."""
+        return self.event.startswith("zero-crossing")
+
+    @property
     def attributes(self) -> dict[str, Any]:
         """Attributes of the channel in a file."""
         stated: dict[str, Any] = {"unit": "s", "event": self.event}
@@ -90,4 +95,6 @@ def make_edges(name: str, values: ArrayLike, stated: Mapping[str, Any], file: st
         at = int(np.argmax(np.diff(times) < 0.0)) + 1
         raise bad(f"edge {at} at {times[at]:.9g} s is earlier than the one before", "sort the times")
     times.flags.writeable = False
-    return Edges(name, times, event, None if angle is None else float(angle), float(stated.get("hysteresis", 0)), file)
+    return Edges(
+        name, times, str(event), None if angle is None else float(angle), float(stated.get("hysteresis", 0)), file
+    )

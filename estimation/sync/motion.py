@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from estimation.reference import absolute_reference
-from estimation.signals import drive_motion_frequency, phase_reference
+from estimation.signals import phase_reference
+from estimation.sync.checks import check_frequency, check_one_direction
+from estimation.sync.edge_phase import NOMINAL_PHASE, EdgePhase, amplitude_from_edges, phase_from_edges
 from estimation.sync.harmonics import MotionHarmonics, motion_harmonics
-from estimation.sync.numbering import MIN_EDGES, NumberedEdges, number_edges
-from estimation.sync.smoother import SmoothedPhase, smooth_phase
+from estimation.sync.numbering import MIN_EDGES
 from scanner.arrays import Array
 from scanner.device import AXES, Device
 from scanner.edges import Edges
@@ -18,19 +19,8 @@ from scanner.errors import BadInput
 from scanner.motion import AxisMotion, SampledAngle
 from scanner.recording import Recording
 
-NOMINAL_PHASE = {
-    "zero-crossing-up": (0.0,),
-    "zero-crossing-down": (np.pi,),
-    "turn": (0.5 * np.pi, 1.5 * np.pi),
-    "both-edges": (0.0, np.pi),
-}
-"""Phase of theta = A sin(phi) at the edges of each kind, for a detector in the centre [rad]."""
-
 KNOT_PERIODS = 4.0
 """Periods between two points of the slow clock: as those of the other estimators."""
-
-SIGNIFICANT_SD = 6.0
-"""Asymmetry in standard deviations from which it determines sign and amplitude; by chance once in 1e8."""
 
 HARMONICS_SD_BY_FIELD = 0.2
 """Relative standard deviation of the harmonics where the amplitude is taken from the field: a mirror with combs that
@@ -39,97 +29,8 @@ exceeds its field by 8 % has a third harmonic that is 13 % off."""
 CHUNK_SAMPLES = 1 << 18
 """Samples whose angle is computed at a time: their harmonics take 25 MB."""
 
-MAX_FREQUENCY_DIFFERENCE = 0.05
-"""Relative difference of the frequencies of edges and drive above which they are not of one motion. A decay moves at
-the resonance, which a drive that excites it is nearer to."""
-
 MAX_BEYOND_PERIODS = 2.0
 """Periods before the first and after the last edge to which the angle is extrapolated."""
-
-
-@dataclass(frozen=True)
-class EdgePhase:
-    """Phase of an axis at the edges that are used.
-
-    Attributes:
-        time: shape (n,) [s].
-        phase: of theta = A sin(phase), unwrapped, shape (n,) [rad]. frequency: shape (n,) [Hz].
-        phase_sd: shape (n,) [rad].
-        asymmetry: phase by which the beam passes the detector after the centre on its way up, shape (n,) [rad].
-        asymmetry_sd: its standard deviation, shape (n,) [rad].
-        jitter_sd: of an edge [s].
-        sign: ``"known: <how>"`` or ``"ambiguous"``.
-        numbered: the edges before outliers were left out.
-        outliers: edges left out for their distance from the smoothed phase.
-    """
-
-    time: Array
-    phase: Array
-    frequency: Array
-    phase_sd: Array
-    asymmetry: Array
-    asymmetry_sd: Array
-    jitter_sd: float
-    sign: str
-    numbered: NumberedEdges
-    outliers: int
-
-    def describe(self, name: str) -> str:
-        """Description of missing, repeated and stray edges in one line; empty if there are none."""
-        counts = {
-            "missing": self.numbered.missing,
-            "repeated and left out": self.numbered.doubled,
-            "out of place and left out": self.numbered.stray + self.outliers,
-        }
-        found = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-        return f"{name}: {self.time.size} edges are used; {found}" if found else ""
-
-
-def phase_from_edges(edges: Edges) -> EdgePhase:
-    """Phase and frequency of a motion from edge times alone. Raises as ``number_edges``."""
-    numbered = number_edges(edges)
-    nominal = np.array(NOMINAL_PHASE[edges.event])
-    f0, t0 = 1.0 / numbered.length, float(numbered.times[0])
-    periods = (numbered.times - t0) * f0
-    side = np.array([-1.0, 1.0] if nominal.size == 2 else [0.0, 0.0])[numbered.kind]
-    measured = 2 * np.pi * (numbered.period - periods) + nominal[numbered.kind]
-    smoothed = smooth_phase(periods, measured, side, walking_asymmetry=bool(edges.angle))
-    flipped, sign = _sign(edges, smoothed)
-    used = smoothed.used
-    return EdgePhase(
-        time=numbered.times[used],
-        phase=(2 * np.pi * periods + smoothed.phase + np.pi * flipped)[used],
-        frequency=f0 * (1.0 + smoothed.rate[used] / (2 * np.pi)),
-        phase_sd=smoothed.phase_sd[used],
-        asymmetry=(-smoothed.asymmetry if flipped else smoothed.asymmetry)[used],
-        asymmetry_sd=smoothed.asymmetry_sd[used],
-        jitter_sd=smoothed.jitter_sd / (2 * np.pi * f0),
-        sign=sign,
-        numbered=numbered,
-        outliers=int(np.sum(~used)),
-    )
-
-
-def _sign(edges: Edges, smoothed: SmoothedPhase) -> tuple[bool, str]:
-    """Whether the phase has to be turned by half a period, and what the edges say of the sign."""
-    if edges.event.startswith("zero-crossing"):
-        return False, f"known: {edges.name}"
-    if edges.event == "turn" or not edges.angle or not _is_significant(smoothed.asymmetry, smoothed.asymmetry_sd):
-        return False, "ambiguous"
-    return bool(np.median(smoothed.asymmetry) * edges.angle < 0.0), f"known: {edges.name}"
-
-
-def _is_significant(asymmetry: Array, sd: Array) -> bool:
-    """Whether the asymmetry differs from 0 by ``SIGNIFICANT_SD`` at every edge, and has one sign."""
-    return bool(np.all(np.abs(asymmetry) > SIGNIFICANT_SD * sd) and np.ptp(np.sign(asymmetry)) == 0.0)
-
-
-def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[Array, Array] | None:
-    """Amplitude and its sd at each edge, shape (n,) [rad], by a detector at a known angle; else None."""
-    if not edges.angle or found.sign == "ambiguous" or not _is_significant(found.asymmetry, found.asymmetry_sd):
-        return None
-    amplitude = edges.angle / np.sin(found.asymmetry)
-    return amplitude, np.abs(amplitude / np.tan(found.asymmetry)) * found.asymmetry_sd
 
 
 def _without_harmonics(
@@ -147,23 +48,6 @@ def _without_harmonics(
         place = asymmetry + late
         amplitude = edges.angle / (np.sin(place) + harmonics.deviation(place))
     return replace(found, phase=found.phase + late, phase_sd=sd), amplitude
-
-
-def _check_frequency(recording: Recording, device: Device, edges: Edges, name: str, frequency: float) -> None:
-    """Check that an axis moves at the frequency at which its drive moves it.
-
-    Raises:
-        BadInput: it does not.
-    """
-    driven = {axis: drive_motion_frequency(recording, device, axis) for axis in device.axes}
-    expected = driven.get(name)
-    if expected is None or abs(frequency / expected - 1.0) < MAX_FREQUENCY_DIFFERENCE:
-        return
-    others = [axis for axis, other in driven.items()
-              if axis != name and other and abs(frequency / other - 1.0) < MAX_FREQUENCY_DIFFERENCE]  # fmt: skip
-    what = f"has edges of a motion at {frequency:.6g} Hz, and the drive moves {name} at {expected:.6g} Hz"
-    hint = f"they fit {others[0]}: sync_x and sync_y are swapped" if others else "check event, unit and drive frequency"
-    raise BadInput(what, file=edges.file, channel=edges.name, hint=hint)
 
 
 def axis_motion_from_edges(
@@ -188,8 +72,9 @@ def axis_motion_from_edges(
         what = f"{inside} of its {edges.times.size} edges lie between {start:.6g} s and {start + n / rate:.6g} s, when "
         what += f"the intensity was recorded; they last from {edges.times[0]:.6g} s to {edges.times[-1]:.6g} s"
         raise BadInput(what, file=edges.file, channel=edges.name, hint="check their unit and the channels' start")
+    check_one_direction(edges)
     name, found = edges.name.partition("_")[2], phase_from_edges(edges)
-    _check_frequency(recording, device, edges, name, float(np.median(found.frequency)))
+    check_frequency(recording, device, edges, name, float(np.median(found.frequency)))
     measured = amplitude_from_edges(edges, found)
     notes = [line for line in [found.describe(edges.name)] if line]
     if measured is None:
@@ -245,6 +130,7 @@ def axis_motion_from_edges(
         amplitude_sd=None if measured is None else measured[1][::step],
     )
     facts: dict[str, object] = {
+        "event": edges.event,
         "edges": int(found.time.size),
         "missing": found.numbered.missing,
         "repeated": found.numbered.doubled,

@@ -154,7 +154,7 @@ def _describe(found: Contradiction, frequency: float) -> str:
 
 
 def _slices(beam: Motion, intensity: Channel) -> list[tuple[int, int]]:
-    """Samples (first, stop) of the slices; none of a scan that is too short."""
+    """Samples (first, stop) of the slices whose samples are compared; none of a scan that is too short."""
     period = slow_period(beam) * intensity.sample_rate
     if not period * MIN_PERIODS <= intensity.size:
         return []
@@ -164,8 +164,8 @@ def _slices(beam: Motion, intensity: Channel) -> list[tuple[int, int]]:
     return [(first, first + length) for first in firsts]
 
 
-def _match_slice(beam: Motion, intensity: Channel, first: int, stop: int) -> _Slice | None:
-    """Correlations of one slice; None without samples that differ."""
+def axis_phases(beam: Motion, intensity: Channel, first: int, stop: int) -> tuple[tuple[Array, Array], Array] | None:
+    """Phases of both axes [rad] and intensity of a slice, each of shape (n,); None without samples that differ."""
     values = intensity.read(first, stop)
     values = values.mean(axis=1) if values.ndim == 2 else values
     angles = [beam.axes[name].angle.read(first, stop) for name in AXES]
@@ -173,10 +173,18 @@ def _match_slice(beam: Motion, intensity: Channel, first: int, stop: int) -> _Sl
     if known.sum() < 2 or np.ptp(values[known]) == 0.0:
         return None
     # The largest angle as amplitude makes a phase a matter of place and direction alone, in a spiral too.
-    phases = [np.arctan2(angle, quadrature(angle, float(np.abs(angle[known]).max()))) for angle in angles]
-    x, y = match_phases(phases[0][known], phases[1][known], values[known])
+    x, y = (np.arctan2(angle, quadrature(angle, float(np.abs(angle[known]).max())))[known] for angle in angles)
+    return (x, y), values[known]
+
+
+def _match_slice(beam: Motion, intensity: Channel, first: int, stop: int) -> _Slice | None:
+    """Correlations of one slice; None without samples that differ."""
+    found = axis_phases(beam, intensity, first, stop)
+    if found is None:
+        return None
+    phases, values = found
     lag = round(intensity.sample_rate / max(float(np.median(beam.axes[name].frequency)) for name in AXES))
-    return _Slice((x, y), _autocorrelation(values[known], lag))
+    return _Slice(match_phases(*phases, values), _autocorrelation(values, lag))
 
 
 def _autocorrelation(values: Array, lag: int) -> float:

@@ -12,7 +12,8 @@ import pytest
 
 from estimation.amplitude_calibration import motion_calibration_sd
 from estimation.estimate import default_estimator, estimate
-from estimation.sync.motion import amplitude_from_edges, axis_motion_from_edges, phase_from_edges
+from estimation.sync.edge_phase import amplitude_from_edges, phase_from_edges
+from estimation.sync.motion import axis_motion_from_edges
 from phantoms.sync import SyncDetector, sync_edges
 from recon.cli import main
 from recon.evaluation import evaluate_axis

@@ -113,6 +113,7 @@ def field(x: float, y: float) -> str:
 
 FIELD = "[x]\n[y]\n[scan]\nhalf_angle_x = 0.11\nhalf_angle_y = 0.11\n"
 DRIVEN = '[x.drive]\nkind = "linear"\nfrequency = {}\n[y.drive]\nkind = "linear"\nfrequency = {}\n' + FIELD[8:]
+RESONANT = "[x.mechanics]\nJ = 1e-10\nb = 1.2566e-8\nk = 1.5791e-2\n"
 SENSES = ("sense_x", "sense_y")
 
 
@@ -125,6 +126,21 @@ def edges(scale: float = 1.0, swapped: bool = False, frequency: float = 2000.0, 
             times = np.arange(0.0, SAMPLES / RATE, period) * scale
             dataset = file.create_dataset(f"channels/sync_{'xy'['yx'.index(name)] if swapped else name}", data=times)
             dataset.attrs.update({"unit": "s", **(stated or {"event": "zero-crossing-up"})})
+
+    return change
+
+
+def both_crossings(place: float = 0.0) -> Change:
+    """Edges of x in both directions, by a detector at ``place`` of the swing, stated as upward ones."""
+
+    def change(file: h5py.File) -> None:
+        late = np.arcsin(place) / np.pi
+        half_periods = np.arange(2.0 * 2000.0 * SAMPLES / RATE)
+        times = (half_periods + late * (-1.0) ** half_periods) / 4000.0
+        dataset = file.create_dataset("channels/sync_x", data=times[times >= 0.0])
+        dataset.attrs.update({"unit": "s", "event": "zero-crossing-up"})
+        angle = file.create_dataset("channels/angle_y", data=signals()["sense_y"])
+        angle.attrs.update({"unit": "rad", "sample_rate": RATE})
 
     return change
 
@@ -174,6 +190,11 @@ REFUSED_RECORDINGS: dict[str, tuple[str, Change | None, str]] = {
     "edges in ms stated as s": (FIELD, edges(1e3), "of its 40 edges lie between 0 s and 0.02 s"),
     "edges swapped": (DRIVEN.format(2000.0, 800.0), edges(swapped=True), "they fit y: sync_x and sync_y are swapped"),
     "every second edge missing": (DRIVEN.format(2000.0, 800.0), edges(frequency=1000.0), "the drive moves x at 2000"),
+    "both crossings as upward, driven": (DRIVEN.format(2000.0, 800.0), both_crossings(), "twice as many edges"),
+    "both crossings as upward, resonant": (
+        FIELD + RESONANT, both_crossings(), "the resonance of x in the device file is 1999.98 Hz; state event as"),
+    "both crossings as upward, beside the centre": (FIELD, both_crossings(0.02), "its intervals alternate between"),
+    "both crossings as upward, far from the centre": (FIELD, both_crossings(0.7), "its intervals alternate between"),
     "edges of an unknown event": (FIELD, edges(event="rising"), "sync_x: event 'rising' is unknown"),
     "drive frequency in kHz": (DRIVEN.format(2.0, 0.8), None, "0.04 periods of a motion at 2 Hz in x; check frequency"),
     "intensity transposed": (DEVICE, values("intensity", lambda v: np.stack([v, v])), "2 samples of 20000 detectors"),

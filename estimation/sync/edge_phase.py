@@ -1,0 +1,108 @@
+"""Phase and amplitude of a motion at the edges of a detector, from the edge times alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimation.sync.numbering import NumberedEdges, number_edges
+from estimation.sync.smoother import SmoothedPhase, smooth_phase
+from scanner.arrays import Array
+from scanner.edges import Edges
+
+NOMINAL_PHASE = {
+    "zero-crossing-up": (0.0,),
+    "zero-crossing-down": (np.pi,),
+    "turn": (0.5 * np.pi, 1.5 * np.pi),
+    "both-edges": (0.0, np.pi),
+}
+"""Phase of theta = A sin(phi) at the edges of each kind, for a detector in the centre [rad]."""
+
+SIGNIFICANT_SD = 6.0
+"""Asymmetry in standard deviations from which it determines sign and amplitude; by chance once in 1e8."""
+
+
+@dataclass(frozen=True)
+class EdgePhase:
+    """Phase of an axis at the edges that are used.
+
+    Attributes:
+        time: shape (n,) [s].
+        phase: of theta = A sin(phase), unwrapped, shape (n,) [rad]. frequency: shape (n,) [Hz].
+        phase_sd: shape (n,) [rad].
+        asymmetry: phase by which the beam passes the detector after the centre on its way up, shape (n,) [rad].
+        asymmetry_sd: its standard deviation, shape (n,) [rad].
+        jitter_sd: of an edge [s].
+        sign: ``"known: <how>"`` or ``"ambiguous"``.
+        numbered: the edges before outliers were left out.
+        outliers: edges left out for their distance from the smoothed phase.
+    """
+
+    time: Array
+    phase: Array
+    frequency: Array
+    phase_sd: Array
+    asymmetry: Array
+    asymmetry_sd: Array
+    jitter_sd: float
+    sign: str
+    numbered: NumberedEdges
+    outliers: int
+
+    def describe(self, name: str) -> str:
+        """Description of missing, repeated and stray edges in one line; empty if there are none."""
+        counts = {
+            "missing": self.numbered.missing,
+            "repeated and left out": self.numbered.doubled,
+            "out of place and left out": self.numbered.stray + self.outliers,
+        }
+        found = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        return f"{name}: {self.time.size} edges are used; {found}" if found else ""
+
+
+def phase_from_edges(edges: Edges) -> EdgePhase:
+    """Phase and frequency of a motion from edge times alone. Raises as ``number_edges``."""
+    numbered = number_edges(edges)
+    nominal = np.array(NOMINAL_PHASE[edges.event])
+    f0, t0 = 1.0 / numbered.length, float(numbered.times[0])
+    periods = (numbered.times - t0) * f0
+    side = np.array([-1.0, 1.0] if nominal.size == 2 else [0.0, 0.0])[numbered.kind]
+    measured = 2 * np.pi * (numbered.period - periods) + nominal[numbered.kind]
+    smoothed = smooth_phase(periods, measured, side, walking_asymmetry=bool(edges.angle))
+    flipped, sign = _sign(edges, smoothed)
+    used = smoothed.used
+    return EdgePhase(
+        time=numbered.times[used],
+        phase=(2 * np.pi * periods + smoothed.phase + np.pi * flipped)[used],
+        frequency=f0 * (1.0 + smoothed.rate[used] / (2 * np.pi)),
+        phase_sd=smoothed.phase_sd[used],
+        asymmetry=(-smoothed.asymmetry if flipped else smoothed.asymmetry)[used],
+        asymmetry_sd=smoothed.asymmetry_sd[used],
+        jitter_sd=smoothed.jitter_sd / (2 * np.pi * f0),
+        sign=sign,
+        numbered=numbered,
+        outliers=int(np.sum(~used)),
+    )
+
+
+def _sign(edges: Edges, smoothed: SmoothedPhase) -> tuple[bool, str]:
+    """Whether the phase has to be turned by half a period, and what the edges say of the sign."""
+    if edges.is_one_direction:
+        return False, f"known: {edges.name}"
+    if edges.event == "turn" or not edges.angle or not is_significant(smoothed.asymmetry, smoothed.asymmetry_sd):
+        return False, "ambiguous"
+    return bool(np.median(smoothed.asymmetry) * edges.angle < 0.0), f"known: {edges.name}"
+
+
+def is_significant(asymmetry: Array, sd: Array) -> bool:
+    """Whether the asymmetry differs from 0 by ``SIGNIFICANT_SD`` at every edge, and has one sign."""
+    return bool(np.all(np.abs(asymmetry) > SIGNIFICANT_SD * sd) and np.ptp(np.sign(asymmetry)) == 0.0)
+
+
+def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[Array, Array] | None:
+    """Amplitude and its sd at each edge, shape (n,) [rad], by a detector at a known angle; else None."""
+    if not edges.angle or found.sign == "ambiguous" or not is_significant(found.asymmetry, found.asymmetry_sd):
+        return None
+    amplitude = edges.angle / np.sin(found.asymmetry)
+    return amplitude, np.abs(amplitude / np.tan(found.asymmetry)) * found.asymmetry_sd
