@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
+from estimation.device_fit.initial import estimate_whiteners
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.discrepancy import is_discrepancy
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model, misfit
-from estimation.diagnosis.initial import estimate_whiteners
 from estimation.diagnosis.linear_model import (
     MAX_SCALE_BESIDE,
     MIN_EXCHANGE_GAIN,
@@ -20,7 +21,6 @@ from estimation.diagnosis.linear_model import (
     RivalFit,
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
-from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.significance import satisfies_sign_constraints
 
 MAX_LINEARISATIONS = 8

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import ScoreTest, is_amplitude
 from estimation.least_squares import regress, triangular_factor
 from scanner.arrays import Array

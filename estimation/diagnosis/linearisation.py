@@ -8,13 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from estimation.device_fit.fit import Fit, Likelihood, fit_model
+from estimation.device_fit.initial import window_schedule
+from estimation.device_fit.model import Model, uncertain
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_growing
 from estimation.diagnosis.discrepancy import is_discrepancy
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model
-from estimation.diagnosis.initial import window_schedule
 from estimation.diagnosis.linear_model import LinearModel, LinearTerm
-from estimation.diagnosis.model import Model, uncertain
-from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import (
     ScoreTest,
     damped_start,
