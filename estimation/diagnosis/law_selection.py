@@ -17,6 +17,7 @@ from estimation.diagnosis.linear_model import (
     MAX_SCALE_BESIDE,
     MIN_EXCHANGE_GAIN,
     MIN_SCORE_GAIN,
+    Effects,
     LinearModel,
     RivalFit,
 )
@@ -57,7 +58,7 @@ def choose_laws(
         candidates: named laws and discrepancy terms.
         progress: called with one line of text at every step.
     """
-    fit, fitted, alternates = anchor, dict[frozenset[str], Fit](), False
+    fit, fitted, alternates = anchor, dict[Effects, Fit](), False
     for _ in range(MAX_LINEARISATIONS):
         likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
         fit = fit_model(likelihood, fit.model, fit.x)
@@ -121,7 +122,7 @@ def _exchange_near_rival(
     fit: Fit,
     present: tuple[int, ...],
     candidates: Sequence[Candidate],
-    fitted: dict[frozenset[str], Fit],
+    fitted: dict[Effects, Fit],
 ) -> Fit | None:
     """The fit with one law exchanged that has a better evidence around itself; None where there is none.
 

@@ -25,6 +25,9 @@ from estimation.diagnosis.screening import ScoreTest, is_amplitude
 from estimation.least_squares import regress, triangular_factor
 from scanner.arrays import Array
 
+Effects = frozenset[tuple[str, str]]
+"""Effects of a set of laws: axis and name of each."""
+
 SCALE_ITERATIONS = 12
 """Fixed-point iterations of the discrepancy's scales. They change a score by less than 1 afterwards."""
 
@@ -255,8 +258,8 @@ class LinearModel:
 
     def beside(self, laws: tuple[int, ...], scales: Array) -> list[Hypothesis]:
         """The laws with one more, for the most promising of all others."""
-        taken = {self.laws[i].candidate.term.effect for i in laws}
-        others = [i for i, law in enumerate(self.laws) if law.candidate.term.effect not in taken]
+        taken = self.effects(laws)
+        others = [i for i in range(len(self.laws)) if not self.effects([i]) & taken]
         chosen: set[int] = set()
         for factor in SCREENING_FACTORS:
             gains = self._gains(laws, np.maximum(scales * factor**2, MIN_SCALE**2), others)
@@ -284,18 +287,19 @@ class LinearModel:
     def strongest(self, number: int) -> list[tuple[int, ...]]:
         """The single laws of different effects with the best evidence beside a small discrepancy."""
         singles = [self.hypothesis((i,), max_scale=MAX_SCALE_BESIDE) for i in range(len(self.laws))]
-        best: dict[frozenset[str], tuple[int, ...]] = {}
+        best: dict[Effects, tuple[int, ...]] = {}
         for single in sorted(singles, key=lambda hypothesis: hypothesis.neg2_log_evidence):
             best.setdefault(self.effects(single.laws), single.laws)
         return list(best.values())[:number]
 
     def describe(self, laws: Iterable[int]) -> str:
-        """Names of laws as text."""
-        return ", ".join(sorted(self.effects(laws))) or "no named law"
+        """Names of laws with their axes as text."""
+        return ", ".join(f"{axis} {effect}" for axis, effect in sorted(self.effects(laws))) or "no named law"
 
-    def effects(self, laws: Iterable[int]) -> frozenset[str]:
-        """Names of laws."""
-        return frozenset(self.laws[i].candidate.term.effect for i in laws)
+    def effects(self, laws: Iterable[int]) -> Effects:
+        """Axis and name of laws."""
+        candidates = (self.laws[i].candidate for i in laws)
+        return frozenset((candidate.axis, candidate.term.effect) for candidate in candidates)
 
     def rivals(self, hypothesis: Hypothesis, law: int) -> tuple[RivalFit, ...]:
         """Other laws in the place of one, the best of each first.
@@ -307,7 +311,7 @@ class LinearModel:
         for rival in sorted(self.beside(rest, hypothesis.scales), key=lambda other: other.neg2_log_evidence):
             candidate = self.laws[rival.laws[-1]].candidate
             gap = rival.neg2_log_evidence - hypothesis.neg2_log_evidence
-            if candidate.term.effect != self.laws[law].candidate.term.effect and gap > -MIN_EXCHANGE_GAIN:
+            if self.effects(rival.laws[-1:]) != self.effects([law]) and gap > -MIN_EXCHANGE_GAIN:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
@@ -328,7 +332,8 @@ class LinearModel:
             return False
         significant = without.neg2_log_evidence - beside.neg2_log_evidence > MIN_SCORE_GAIN
         advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
-        series = len(self.effects(laws) & POLYNOMIAL_SPRINGS) > 1
+        springs = [axis for axis, effect in self.effects(laws) if effect in POLYNOMIAL_SPRINGS]
+        series = len(springs) > len(set(springs))
         bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
         return advantage > (0.0 if bulk else SMALL_LAW_MARGIN)
 

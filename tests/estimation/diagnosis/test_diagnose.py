@@ -223,7 +223,7 @@ def test_a_pair_of_laws_is_selected_around_a_discrepancy() -> None:
     free_fit = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x), max_iterations=20)
     pool = all_candidates(DEVICE, nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
     linear = linear_model(likelihood, free_fit, [c for c in pool if not c.channel.startswith("angle")])
-    assert linear.effects(linear.select().laws) == {"cubic-stiffness", "gain-drift"}
+    assert linear.effects(linear.select().laws) == {("x", "cubic-stiffness"), ("x", "gain-drift")}
 
 
 def test_a_foreign_tone_among_the_lines_of_a_multisine_is_detected() -> None:
