@@ -66,12 +66,12 @@ def choose_laws(
         present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
         if alternates:
             break
-        if not fitted and any(map(is_discrepancy, fit.model.candidates)):
-            selected = [linear.select().laws, *linear.strongest(SINGLE_LAWS)]
-        elif not fitted and present:
-            selected = [linear.select().laws, *((law,) for law in present)]
-        else:
+        if fitted:
             selected = [linear.select(present, max_moves=1).laws]
+        elif any(map(is_discrepancy, fit.model.candidates)):
+            selected = [linear.select().laws, linear.strongest_together(), *linear.strongest(SINGLE_LAWS)]
+        else:
+            selected = [linear.select().laws, linear.strongest_together(), *((law,) for law in present)]
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, selected)))
         options = {linear.effects(laws): laws for laws in selected if laws}
         if not options:
@@ -93,7 +93,8 @@ def choose_laws(
             return None
         effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
         with_laws, alternates = fits[effects], effects in fitted
-        if alternates and (len(effects), with_laws.neg2_log_evidence) > (len(present), fit.neg2_log_evidence):
+        has_new_law = bool(effects - linear.effects(present))
+        if present and has_new_law and (alternates or with_laws.neg2_log_evidence > fit.neg2_log_evidence):
             break
         fitted[effects] = fit = with_laws
     else:

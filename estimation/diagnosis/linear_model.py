@@ -195,7 +195,10 @@ class LinearModel:
             laws: to start from.
             max_moves: None for as many as there are.
         """
-        best = self.hypothesis(self._without_imitations(tuple(laws)), max_scale=MAX_SCALE_BESIDE)
+        kept = self._without_imitations(tuple(laws))
+        best = self.hypothesis(kept, max_scale=MAX_SCALE_BESIDE)
+        if max_moves is not None and kept != tuple(laws):
+            max_moves -= 1
         while max_moves is None or max_moves > 0:
             limit = self._score(best) - MIN_EXCHANGE_GAIN
             moves = sorted((move for move in self._moves(best) if self._score(move) < limit), key=self._score)
@@ -211,7 +214,7 @@ class LinearModel:
         A discrepancy alone has the price of one law.
         """
         laws = hypothesis.laws
-        without = self.hypothesis(laws, without=range(len(self.discrepancies))).neg2_log_evidence
+        without = self._without_discrepancy(laws).neg2_log_evidence
         beside = hypothesis.neg2_log_evidence + (0.0 if laws else MIN_SCORE_GAIN)
         return min(without, beside) + MIN_SCORE_GAIN * len(laws)
 
@@ -244,9 +247,12 @@ class LinearModel:
             laws = closest
         return laws
 
+    def _without_discrepancy(self, laws: Sequence[int]) -> Hypothesis:
+        return self.hypothesis(laws, without=range(len(self.discrepancies)))
+
     def _misfit(self, laws: Sequence[int]) -> float:
         """Of laws without a discrepancy."""
-        return self.hypothesis(laws, without=range(len(self.discrepancies))).misfit
+        return self._without_discrepancy(laws).misfit
 
     def _moves(self, best: Hypothesis) -> Iterator[Hypothesis]:
         if len(best.laws) < MAX_LAWS:
@@ -283,6 +289,24 @@ class LinearModel:
             gains.append(gain - self.laws[i].cost)
             first = last
         return np.array(gains)
+
+    def strongest_together(self) -> tuple[int, ...]:
+        """Laws without a discrepancy, each the one that improves the evidence most beside those before it.
+
+        They take the bulk of a misfit where the sensitivities are too inaccurate for the small discrepancy beside the
+        right laws, so that :meth:`select` prefers a law that leaves everything to a discrepancy.
+        """
+        laws: tuple[int, ...] = ()
+        lowest = self._without_discrepancy(laws).neg2_log_evidence
+        while len(laws) < MAX_LAWS:
+            taken = self.effects(laws)
+            more = [(*laws, i) for i in range(len(self.laws)) if not self.effects([i]) & taken]
+            improved = {m: e for m in more if (e := self._without_discrepancy(m).neg2_log_evidence) < lowest}
+            best = next((m for m in sorted(improved, key=improved.__getitem__) if self._is_possible(m)), None)
+            if best is None or improved[best] > lowest - MIN_SCORE_GAIN:
+                break
+            laws, lowest = best, improved[best]
+        return laws
 
     def strongest(self, number: int) -> list[tuple[int, ...]]:
         """The single laws of different effects with the best evidence beside a small discrepancy."""
@@ -326,7 +350,7 @@ class LinearModel:
             alone: -2 log evidence of the discrepancy without them.
         """
         beside = self.hypothesis(laws)
-        without = self.hypothesis(laws, without=range(len(self.discrepancies)))
+        without = self._without_discrepancy(laws)
         remainder = without.misfit - beside.misfit
         if explained < MIN_EXPLAINED_RATIO * remainder:
             return False
