@@ -25,18 +25,19 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e8
 """Below the first, damping is lost in rounding; above the second, a step is too short to change anything."""
 
 DAMPING_RAISE, DAMPING_LOWER = 6.0, 8.0
-"""Factors by which damping grows after a step that raises the misfit and falls after one that lowers it."""
+"""Factors by which damping grows after a step that does not lower the misfit as predicted, and falls after one that
+does."""
+
+MIN_GAIN_RATIO = 0.25
+"""Fall of the misfit over the predicted one from which a step counts as predicted. With too large steps the fit would
+jump from one side of a minimum to the other. Source: Nocedal & Wright, Numerical Optimization, algorithm 4.1."""
 
 JACOBIAN_REUSE_RATIO = 0.9
 """Share of the predicted fall in misfit from which the Jacobian is kept for one more step."""
 
-PROBE_LENGTH = 0.1
-"""Part of a step at which the residual is computed for its curvature along the step: long against rounding, short
-against the step."""
-
 MAX_CORRECTION_RATIO = 0.375
-"""Largest length of the correction for the curvature over that of the step, both in standard deviations of the single
-parameters: half the value of 0.75 that Transtrum and Sethna recommend for twice the correction."""
+"""Largest length of the correction for the curvature over that of the step, each parameter in its standard deviation
+when the others are fixed: half the value of 0.75 that Transtrum and Sethna recommend for twice the correction."""
 
 DIVERGED_RATIO = 100.0
 """Misfit over ``abort_above`` from which a fit counts as diverged and gets 2 instead of 4 iterations to improve."""
@@ -124,7 +125,8 @@ def fit_levenberg_marquardt(
         tolerance: stop when a step lowers the misfit by less.
         abort_above: misfit of a competing fit. A fit above it that no longer approaches it is stopped early.
 
-    In a curved valley, where steps along the tangent are short, a step with a new Jacobian follows the curvature.
+    Where a step lowers the misfit by less than predicted, as in a curved valley, it is corrected for the second
+    derivative along it, which its own residual gives, if that lowers the misfit further.
 
     Source: Marquardt, J. SIAM 11, 431 (1963), with damping relative to the diagonal; Transtrum & Sethna,
     arXiv:1201.5885 (2012), geodesic acceleration.
@@ -146,6 +148,7 @@ def fit_levenberg_marquardt(
         normal[held], normal[:, held], gradient[held] = 0.0, 0.0, 0.0
         normal[held, held] = 1.0
         gain = predicted = 0.0
+        before = damping
         while damping < MAX_DAMPING:
             damped = normal + damping * np.diag(np.diag(normal))
             try:
@@ -153,29 +156,30 @@ def fit_levenberg_marquardt(
             except np.linalg.LinAlgError:  # a diverged model makes the normal matrix singular
                 damping *= DAMPING_RAISE
                 continue
-            change = step
-            if fresh:
-                probe = residual(x + PROBE_LENGTH * step)
-                curvature = 2.0 / PROBE_LENGTH * ((probe - current) / PROBE_LENGTH - slopes @ step)
-                slope = part.T @ curvature[used]
-                slope[held] = 0.0
-                correction, size = -0.5 * np.linalg.solve(damped, slope), np.sqrt(np.diag(normal))
-                if np.linalg.norm(size * correction) <= MAX_CORRECTION_RATIO * np.linalg.norm(size * step):
-                    change = step + correction
             if max_step is not None:
-                change = change / max(1.0, float(np.max(np.abs(change) / max_step, initial=0.0)))
-            trial = residual(x + change)
-            trial_value = misfit(x + change, trial)
+                step = step / max(1.0, float(np.max(np.abs(step) / max_step, initial=0.0)))
+            trial = residual(x + step)
+            trial_value = misfit(x + step, trial)
+            predicted = -float(step @ (2.0 * gradient + normal @ step))
+            if fresh and value - trial_value < JACOBIAN_REUSE_RATIO * predicted:
+                slope = part.T @ (trial - current - slopes @ step)[used]
+                slope[held] = 0.0
+                correction, size = -np.linalg.solve(damped, slope), np.sqrt(np.diag(normal))
+                if np.linalg.norm(size * correction) < MAX_CORRECTION_RATIO * np.linalg.norm(size * step):
+                    corrected = residual(x + step + correction)
+                    corrected_value = misfit(x + step + correction, corrected)
+                    if corrected_value < trial_value:
+                        step, trial, trial_value = step + correction, corrected, corrected_value
             if trial_value < value:
-                gain, value, current, x = value - trial_value, trial_value, trial, x + change
-                predicted = -float(step @ (2.0 * gradient + normal @ step))
-                damping = max(damping / DAMPING_LOWER, MIN_DAMPING)
+                gain, value, current, x = value - trial_value, trial_value, trial, x + step
+                is_linear = gain > MIN_GAIN_RATIO * predicted
+                damping = max(damping / DAMPING_LOWER, MIN_DAMPING) if is_linear else damping * DAMPING_RAISE
                 break
-            if (
-                not fresh or gradient @ -step < 0.1 * tolerance
-            ):  # the linear model is old, or promises no more than that
+            if gradient @ -step < 0.1 * tolerance:  # even the linear model promises no more than that
                 break
             damping *= DAMPING_RAISE
+        if not fresh:  # that an old linear model fails says nothing about the next one
+            damping = min(damping, before)
         if fresh and gain < tolerance and iteration > 0:
             break
         fresh = gain <= JACOBIAN_REUSE_RATIO * predicted or gain <= tolerance
