@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from estimation.device_fit.predict import predict
 from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.predict import predict
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.recording import Recording

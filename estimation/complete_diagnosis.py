@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from estimation.device_fit.fit import fit_model
+from estimation.device_fit.model import Model
 from estimation.diagnosis.diagnose import Diagnosis, Finding, diagnose, nominal_device
 from estimation.diagnosis.selection import Progress
 from estimation.slow.diagnose import diagnose_decays, slow_decays
@@ -109,19 +111,35 @@ def _diagnose_readout(
         }
         for name, axis in diagnosis.device.axes.items()
     }
-    device, findings = nominal.with_terms(known), tuple[Finding, ...]()
+    device, findings, sense_evidence = nominal.with_terms(known), tuple[Finding, ...](), _sense_evidence(diagnosis)
     for recording in pictures:
         if not any(f"angle_{axis}" in recording for axis in nominal.axes):
             progress(f"readout of {recording.name} against its picture")
             reference = measure_reference(recording, device)
             if reference is not None:
-                found, device = diagnose_readout(reference)
+                found, device = diagnose_readout(reference, sense_evidence)
                 findings = (*findings, *found)
     axes = {
         name: replace(axis, terms={effect: axis.terms[effect] for effect in axis.terms if effect not in known[name]})
         for name, axis in device.axes.items()
     }
     return findings, replace(device, axes=axes)
+
+
+def _sense_evidence(diagnosis: Diagnosis) -> Callable[[Device], float]:
+    """-2 log evidence of the recordings under a device, with the other terms of ``diagnosis`` fitted."""
+    search = diagnosis.search
+    if search is None:
+        return lambda device: 0.0
+    final = search.final
+
+    def evidence(device: Device) -> float:
+        terms = [c for c in final.model.candidates if c.term.effect not in device.axes[c.axis].terms]
+        model = Model(final.model.runs, device, terms, final.model.mains)
+        fit = fit_model(search.likelihood, model, model.map_parameters_from(final.model, final.x))
+        return fit.neg2_log_evidence
+
+    return evidence
 
 
 def add_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 from missing_physics import UNMODELLED, calibration, phase_errors, scanned, with_terms
 
 import lissajous
-from estimation.diagnosis.data import prepare_run
+from estimation.device_fit.data import prepare_run
 from estimation.diagnosis.diagnose import build_diagnosis
 from estimation.diagnosis.selection import select_terms
 from recon.report.figures import fill_small_holes, normalise_intensity

@@ -18,12 +18,12 @@ from afm_spiral import TURNS_PER_SECOND, fit_spiral
 from effect_contributions import findings_text, nested_fits
 from numpy.typing import NDArray
 
-from estimation.diagnosis.data import prepare_run
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit, Likelihood, fit_model
+from estimation.device_fit.initial import flat_whiteners
+from estimation.device_fit.model import Model
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit, Likelihood, fit_model
-from estimation.diagnosis.initial import flat_whiteners
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.parameters import Candidate
 from recon.io.readers import read
 from scanner.arrays import Array
 from scanner.device import Axis, Device

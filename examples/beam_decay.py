@@ -15,8 +15,8 @@ import numpy as np
 from effect_contributions import findings_text, nested_fits
 from numpy.typing import NDArray
 
+from estimation.device_fit.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit
 from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.fit import TIME_BLOCKS, VALIDATION_BLOCK_INTERVAL, Fit
 from recon.io.convert import convert_file
 from scanner.arrays import Array
 from scanner.recording import Recording

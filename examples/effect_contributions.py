@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from estimation.device_fit.fit import Fit
 from estimation.diagnosis.diagnose import Diagnosis
-from estimation.diagnosis.fit import Fit
 from estimation.diagnosis.pruning import refit_without
 
 

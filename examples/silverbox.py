@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from effect_contributions import findings_text, nested_fits
 
+from estimation.device_fit.predict import Predicted, predict
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.improvement import improved_device
-from estimation.diagnosis.predict import Predicted, predict
 from recon.io.convert import convert_file
 from scanner.arrays import Array
 from scanner.recording import Recording

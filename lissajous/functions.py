@@ -15,8 +15,8 @@ from scanner.errors import BadInput
 from scanner.recording import Recording
 
 if TYPE_CHECKING:
+    from estimation.device_fit.predict import Predicted
     from estimation.diagnosis.diagnose import Diagnosis
-    from estimation.diagnosis.predict import Predicted
     from estimation.identification.calibrate import Identification
     from recon.imaging.intensity_drift import DriftKind
     from recon.imaging.picture_estimate import PictureKind
@@ -239,7 +239,7 @@ def predict(
     Raises:
         BadInput: no device, or nothing to compare with.
     """
-    from estimation.diagnosis.predict import predict as predict_channels
+    from estimation.device_fit.predict import predict as predict_channels
 
     opened = _opened(recording, device, mapping)
     if opened.device is None:

@@ -28,7 +28,7 @@ from scanner.files import read_toml
 from scanner.recording import Recording
 
 if TYPE_CHECKING:
-    from estimation.diagnosis.data import Run
+    from estimation.device_fit.data import Run
     from estimation.diagnosis.identifiability import Detectability
 
 SCHEMA = "lissajous-plan/1"
@@ -170,7 +170,7 @@ def simulate_excitation(excitation: Excitation, device: Device) -> Recording:
 
 def prepare_planned_run(excitation: Excitation, device: Device) -> Run:
     """Simulate an excitation and prepare the recording for a fit; raises as :func:`played`."""
-    from estimation.diagnosis.data import prepare_run
+    from estimation.device_fit.data import prepare_run
 
     run = prepare_run(simulate_excitation(excitation, device), device)
     noise = excitation.angle_noise
@@ -186,10 +186,10 @@ def predict_detectability(runs: Sequence[Run], device: Device) -> list[Detectabi
     Raises:
         BadInput: a readout states no noise.
     """
-    from estimation.diagnosis.fit import Likelihood
+    from estimation.device_fit.fit import Likelihood
+    from estimation.device_fit.initial import fit_initial_state, window_schedule
+    from estimation.device_fit.model import Model
     from estimation.diagnosis.identifiability import detectability, linearise_simulated, stated_whitener
-    from estimation.diagnosis.initial import fit_initial_state, window_schedule
-    from estimation.diagnosis.model import Model
     from scanner.terms import catalogue
 
     whiteners = [[stated_whitener(output) for output in run.outputs] for run in runs]
@@ -217,7 +217,7 @@ def plan_files(
     """
     from tqdm import tqdm
 
-    from estimation.diagnosis.data import prepare_run
+    from estimation.device_fit.data import prepare_run
     from recon.report.diagnosis import plan_report
 
     check_folder(output)

@@ -1,21 +1,16 @@
 """Diagnosis of unmodelled dynamics: which effect the nominal device omits, its size, and the updated device.
 
-The package contains the fit of the forward model to recordings and the selection of terms by evidence; simulation of
-test data, pictures and reports do not belong here. Modules in the order of the computation:
+The package contains the selection of terms by evidence among fits of ``estimation.device_fit``; simulation of test
+data, pictures and reports do not belong here. Modules in the order of the computation:
 
-1. ``data``: recorded inputs and outputs on the grids of the simulation; ``drive_lines``: spectral lines of a drive;
-   ``resampling``; ``clipping``: readouts that are clipped.
-2. ``model``: simulated channels as a function of ``parameters``; ``noise``: noise spectrum and whitening; ``mains`` and
-   ``hum``: hum as part of the noise; ``interference``: tones that are neither motion nor drive.
-3. ``fit``: whitened residuals, Jacobian and fit; ``initial``: initial state and growing windows.
-4. ``discrepancy``: flexible terms for effects without a law; ``anchor``: a fit that follows the motion.
-5. ``screening``: sensitivities to every candidate term; ``linear_model``: named laws beside a discrepancy, compared by
+1. ``clipping``: readouts that are clipped; ``structure``: further modes of the structure.
+2. ``discrepancy``: flexible terms for effects without a law; ``anchor``: a fit that follows the motion.
+3. ``screening``: sensitivities to every candidate term; ``linear_model``: named laws beside a discrepancy, compared by
    evidence; ``linearisation``: that model around a fit, and fits from it; ``law_selection``: laws selected, fitted and
    selected again; ``pruning``: terms and amplitudes that are not required; ``significance``; ``selection``: named laws,
    else a discrepancy, else nothing.
-6. ``profile_likelihood``: intervals; ``localisation``: channel, time and harmonics of a misfit;
+4. ``localisation``: channel, time and harmonics of a misfit; ``gain_drift``: damping that a drifting gain imitates;
    ``identifiability``: detectability of every effect; ``experiment_design``: further measurements.
-7. ``discrepancy_law``, ``effect_curve``, ``posterior``: a fitted effect as formula, curve and draws.
-8. ``open_loop``: prediction error of a device; ``improvement``: the improved device; ``shares``: what each finding
-   explains; ``diagnose``: verdict and findings; ``predict``: prediction of a recording.
+5. ``discrepancy_law``, ``effect_curve``: a fitted effect as formula and curve.
+6. ``improvement``: the improved device; ``shares``: what each finding explains; ``diagnose``: verdict and findings.
 """

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimation.diagnosis.fit import TIME_BLOCKS, Fit, Likelihood, fit_model
-from estimation.diagnosis.initial import window_schedule
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.fit import TIME_BLOCKS, Fit, Likelihood, fit_model
+from estimation.device_fit.initial import window_schedule
+from estimation.device_fit.model import Model
+from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
 
 MAX_RESIDUAL_RATIO = 0.1

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.diagnosis.data import Run
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.data import Run
+from estimation.device_fit.parameters import Candidate
 from estimation.rail import upper_rail
 from scanner.arrays import Array
 from scanner.terms import Parameter, Term

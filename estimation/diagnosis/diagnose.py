@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.open_loop import open_loop
+from estimation.device_fit.parameters import Candidate
+from estimation.device_fit.profile_likelihood import profile_interval
 from estimation.diagnosis.clipping import rail_resolution
-from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
-from estimation.diagnosis.fit import Fit, Likelihood
 from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE, may_be_gain_drift
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_parameters
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.localisation import describe_localisation
-from estimation.diagnosis.open_loop import open_loop
-from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.profile_likelihood import profile_interval
 from estimation.diagnosis.selection import Progress, SelectionResult, SelectionStep, select_terms
 from estimation.diagnosis.shares import describe_unexplained, find_remainder, share_of_finding
 from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD

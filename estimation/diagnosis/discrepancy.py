@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
 from scanner.integrator.abi import CAPACITANCE_LAW, TORQUE_LAW
 from scanner.lowpass import apply_lowpass

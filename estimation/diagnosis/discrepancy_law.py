@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from estimation.device_fit.fit import Fit
 from estimation.diagnosis.discrepancy import (
     AMPLITUDE_MEMORY_SHARES,
     DELAY_MEMORY_PERIODS,
@@ -15,7 +16,6 @@ from estimation.diagnosis.discrepancy import (
     PLAY_HALF_WIDTHS,
     apply_play,
 )
-from estimation.diagnosis.fit import Fit
 from scanner.arrays import Array
 from scanner.terms import NaturalScales
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.device_fit.fit import Fit
+from estimation.device_fit.parameters import Candidate
+from estimation.device_fit.posterior import axis_trajectories, draw_parameters
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.fit import Fit
-from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.posterior import axis_trajectories, draw_parameters
 from scanner.arrays import Array
 from scanner.forward_model import (
     ActiveTerm,

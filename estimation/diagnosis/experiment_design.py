@@ -7,8 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.diagnosis.data import Run
-from estimation.diagnosis.fit import Fit, Likelihood
+from estimation.device_fit.data import Run
+from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.model import Model
+from estimation.device_fit.noise import Whitener
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.identifiability import (
     DISCRIMINATION_SIGMA,
     candidate_sensitivities,
@@ -16,9 +19,6 @@ from estimation.diagnosis.identifiability import (
     stated_whitener,
     unexplained_norms,
 )
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.noise import Whitener
-from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.screening import amplitude_indices
 from scanner.arrays import Array
 

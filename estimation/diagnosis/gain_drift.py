@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimation.diagnosis.data import Run, readout_of
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.data import Run, readout_of
+from estimation.device_fit.parameters import Candidate
 from scanner.device import Device
 from scanner.stages import MotionSensor
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.diagnosis.data import Output
-from estimation.diagnosis.fit import Fit, Likelihood, linearise_at
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.data import Output
+from estimation.device_fit.fit import Fit, Likelihood, linearise_at
+from estimation.device_fit.model import Model
+from estimation.device_fit.noise import Whitener, flat_psd, make_whitener
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
 from scanner.arrays import Array
 from scanner.errors import BadInput

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from estimation.diagnosis.data import Run
+from estimation.device_fit.data import Run
+from estimation.device_fit.fit import Fit, fit_model
+from estimation.device_fit.model import Model
+from estimation.device_fit.open_loop import OpenLoop, is_worse, open_loop
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
-from estimation.diagnosis.fit import Fit, fit_model
 from estimation.diagnosis.identifiability import determined_parameters
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from scanner.device import Axis, Device

@@ -9,18 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
+from estimation.device_fit.initial import estimate_whiteners
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.discrepancy import is_discrepancy
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model, misfit
-from estimation.diagnosis.initial import estimate_whiteners
 from estimation.diagnosis.linear_model import (
     MAX_SCALE_BESIDE,
     MIN_EXCHANGE_GAIN,
     MIN_SCORE_GAIN,
+    Effects,
     LinearModel,
     RivalFit,
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
-from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.significance import satisfies_sign_constraints
 
 MAX_LINEARISATIONS = 8
@@ -57,7 +58,7 @@ def choose_laws(
         candidates: named laws and discrepancy terms.
         progress: called with one line of text at every step.
     """
-    fit, fitted, alternates = anchor, dict[frozenset[str], Fit](), False
+    fit, fitted, alternates = anchor, dict[Effects, Fit](), False
     for _ in range(MAX_LINEARISATIONS):
         likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
         fit = fit_model(likelihood, fit.model, fit.x)
@@ -65,12 +66,12 @@ def choose_laws(
         present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
         if alternates:
             break
-        if not fitted and any(map(is_discrepancy, fit.model.candidates)):
-            selected = [linear.select().laws, *linear.strongest(SINGLE_LAWS)]
-        elif not fitted and present:
-            selected = [linear.select().laws, *((law,) for law in present)]
-        else:
+        if fitted:
             selected = [linear.select(present, max_moves=1).laws]
+        elif any(map(is_discrepancy, fit.model.candidates)):
+            selected = [linear.select().laws, linear.strongest_together(), *linear.strongest(SINGLE_LAWS)]
+        else:
+            selected = [linear.select().laws, linear.strongest_together(), *((law,) for law in present)]
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, selected)))
         options = {linear.effects(laws): laws for laws in selected if laws}
         if not options:
@@ -92,7 +93,8 @@ def choose_laws(
             return None
         effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
         with_laws, alternates = fits[effects], effects in fitted
-        if alternates and (len(effects), with_laws.neg2_log_evidence) > (len(present), fit.neg2_log_evidence):
+        has_new_law = bool(effects - linear.effects(present))
+        if present and has_new_law and (alternates or with_laws.neg2_log_evidence > fit.neg2_log_evidence):
             break
         fitted[effects] = fit = with_laws
     else:
@@ -121,7 +123,7 @@ def _exchange_near_rival(
     fit: Fit,
     present: tuple[int, ...],
     candidates: Sequence[Candidate],
-    fitted: dict[frozenset[str], Fit],
+    fitted: dict[Effects, Fit],
 ) -> Fit | None:
     """The fit with one law exchanged that has a better evidence around itself; None where there is none.
 

@@ -20,10 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import ScoreTest, is_amplitude
 from estimation.least_squares import regress, triangular_factor
 from scanner.arrays import Array
+
+Effects = frozenset[tuple[str, str]]
+"""Effects of a set of laws: axis and name of each."""
 
 SCALE_ITERATIONS = 12
 """Fixed-point iterations of the discrepancy's scales. They change a score by less than 1 afterwards."""
@@ -192,7 +195,10 @@ class LinearModel:
             laws: to start from.
             max_moves: None for as many as there are.
         """
-        best = self.hypothesis(self._without_imitations(tuple(laws)), max_scale=MAX_SCALE_BESIDE)
+        kept = self._without_imitations(tuple(laws))
+        best = self.hypothesis(kept, max_scale=MAX_SCALE_BESIDE)
+        if max_moves is not None and kept != tuple(laws):
+            max_moves -= 1
         while max_moves is None or max_moves > 0:
             limit = self._score(best) - MIN_EXCHANGE_GAIN
             moves = sorted((move for move in self._moves(best) if self._score(move) < limit), key=self._score)
@@ -208,7 +214,7 @@ class LinearModel:
         A discrepancy alone has the price of one law.
         """
         laws = hypothesis.laws
-        without = self.hypothesis(laws, without=range(len(self.discrepancies))).neg2_log_evidence
+        without = self._without_discrepancy(laws).neg2_log_evidence
         beside = hypothesis.neg2_log_evidence + (0.0 if laws else MIN_SCORE_GAIN)
         return min(without, beside) + MIN_SCORE_GAIN * len(laws)
 
@@ -241,9 +247,12 @@ class LinearModel:
             laws = closest
         return laws
 
+    def _without_discrepancy(self, laws: Sequence[int]) -> Hypothesis:
+        return self.hypothesis(laws, without=range(len(self.discrepancies)))
+
     def _misfit(self, laws: Sequence[int]) -> float:
         """Of laws without a discrepancy."""
-        return self.hypothesis(laws, without=range(len(self.discrepancies))).misfit
+        return self._without_discrepancy(laws).misfit
 
     def _moves(self, best: Hypothesis) -> Iterator[Hypothesis]:
         if len(best.laws) < MAX_LAWS:
@@ -255,8 +264,8 @@ class LinearModel:
 
     def beside(self, laws: tuple[int, ...], scales: Array) -> list[Hypothesis]:
         """The laws with one more, for the most promising of all others."""
-        taken = {self.laws[i].candidate.term.effect for i in laws}
-        others = [i for i, law in enumerate(self.laws) if law.candidate.term.effect not in taken]
+        taken = self.effects(laws)
+        others = [i for i in range(len(self.laws)) if not self.effects([i]) & taken]
         chosen: set[int] = set()
         for factor in SCREENING_FACTORS:
             gains = self._gains(laws, np.maximum(scales * factor**2, MIN_SCALE**2), others)
@@ -281,21 +290,40 @@ class LinearModel:
             first = last
         return np.array(gains)
 
+    def strongest_together(self) -> tuple[int, ...]:
+        """Laws without a discrepancy, each the one that improves the evidence most beside those before it.
+
+        They take the bulk of a misfit where the sensitivities are too inaccurate for the small discrepancy beside the
+        right laws, so that :meth:`select` prefers a law that leaves everything to a discrepancy.
+        """
+        laws: tuple[int, ...] = ()
+        lowest = self._without_discrepancy(laws).neg2_log_evidence
+        while len(laws) < MAX_LAWS:
+            taken = self.effects(laws)
+            more = [(*laws, i) for i in range(len(self.laws)) if not self.effects([i]) & taken]
+            improved = {m: e for m in more if (e := self._without_discrepancy(m).neg2_log_evidence) < lowest}
+            best = next((m for m in sorted(improved, key=improved.__getitem__) if self._is_possible(m)), None)
+            if best is None or improved[best] > lowest - MIN_SCORE_GAIN:
+                break
+            laws, lowest = best, improved[best]
+        return laws
+
     def strongest(self, number: int) -> list[tuple[int, ...]]:
         """The single laws of different effects with the best evidence beside a small discrepancy."""
         singles = [self.hypothesis((i,), max_scale=MAX_SCALE_BESIDE) for i in range(len(self.laws))]
-        best: dict[frozenset[str], tuple[int, ...]] = {}
+        best: dict[Effects, tuple[int, ...]] = {}
         for single in sorted(singles, key=lambda hypothesis: hypothesis.neg2_log_evidence):
             best.setdefault(self.effects(single.laws), single.laws)
         return list(best.values())[:number]
 
     def describe(self, laws: Iterable[int]) -> str:
-        """Names of laws as text."""
-        return ", ".join(sorted(self.effects(laws))) or "no named law"
+        """Names of laws with their axes as text."""
+        return ", ".join(f"{axis} {effect}" for axis, effect in sorted(self.effects(laws))) or "no named law"
 
-    def effects(self, laws: Iterable[int]) -> frozenset[str]:
-        """Names of laws."""
-        return frozenset(self.laws[i].candidate.term.effect for i in laws)
+    def effects(self, laws: Iterable[int]) -> Effects:
+        """Axis and name of laws."""
+        candidates = (self.laws[i].candidate for i in laws)
+        return frozenset((candidate.axis, candidate.term.effect) for candidate in candidates)
 
     def rivals(self, hypothesis: Hypothesis, law: int) -> tuple[RivalFit, ...]:
         """Other laws in the place of one, the best of each first.
@@ -307,7 +335,7 @@ class LinearModel:
         for rival in sorted(self.beside(rest, hypothesis.scales), key=lambda other: other.neg2_log_evidence):
             candidate = self.laws[rival.laws[-1]].candidate
             gap = rival.neg2_log_evidence - hypothesis.neg2_log_evidence
-            if candidate.term.effect != self.laws[law].candidate.term.effect and gap > -MIN_EXCHANGE_GAIN:
+            if self.effects(rival.laws[-1:]) != self.effects([law]) and gap > -MIN_EXCHANGE_GAIN:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
@@ -322,13 +350,14 @@ class LinearModel:
             alone: -2 log evidence of the discrepancy without them.
         """
         beside = self.hypothesis(laws)
-        without = self.hypothesis(laws, without=range(len(self.discrepancies)))
+        without = self._without_discrepancy(laws)
         remainder = without.misfit - beside.misfit
         if explained < MIN_EXPLAINED_RATIO * remainder:
             return False
         significant = without.neg2_log_evidence - beside.neg2_log_evidence > MIN_SCORE_GAIN
         advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
-        series = len(self.effects(laws) & POLYNOMIAL_SPRINGS) > 1
+        springs = [axis for axis, effect in self.effects(laws) if effect in POLYNOMIAL_SPRINGS]
+        series = len(springs) > len(set(springs))
         bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
         return advantage > (0.0 if bulk else SMALL_LAW_MARGIN)
 

@@ -8,13 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from estimation.device_fit.fit import Fit, Likelihood, fit_model
+from estimation.device_fit.initial import window_schedule
+from estimation.device_fit.model import Model, uncertain
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_growing
 from estimation.diagnosis.discrepancy import is_discrepancy
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model
-from estimation.diagnosis.initial import window_schedule
-from estimation.diagnosis.linear_model import LinearModel, LinearTerm
-from estimation.diagnosis.model import Model, uncertain
-from estimation.diagnosis.parameters import Candidate
+from estimation.diagnosis.linear_model import Effects, LinearModel, LinearTerm
 from estimation.diagnosis.screening import (
     ScoreTest,
     damped_start,
@@ -137,7 +137,11 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
 
 
 def fit_laws(
-    linear: LinearModel, likelihood: Likelihood, fit: Fit, laws: Sequence[int], fitted: Mapping[frozenset[str], Fit]
+    linear: LinearModel,
+    likelihood: Likelihood,
+    fit: Fit,
+    laws: Sequence[int],
+    fitted: Mapping[Effects, Fit],
 ) -> Fit:
     """The fit with laws, from an earlier one of the same effects where there is one."""
     earlier = fitted.get(linear.effects(laws))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.diagnosis.fit import Fit, Likelihood
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
 
 

@@ -12,10 +12,10 @@ from math import comb, log
 
 import numpy as np
 
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model
-from estimation.diagnosis.hum import select_mains_hum
-from estimation.diagnosis.model import Model, uncertain
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.fit import Fit, Likelihood, fit_model
+from estimation.device_fit.hum import select_mains_hum
+from estimation.device_fit.model import Model, uncertain
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.significance import evidence_gain
 from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
 

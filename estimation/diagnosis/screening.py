@@ -9,9 +9,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.diagnosis.fit import TRAJECTORY_POOL, Fit, Likelihood
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.parameters import Candidate
+from estimation.device_fit.fit import TRAJECTORY_POOL, Fit, Likelihood
+from estimation.device_fit.model import Model
+from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.integrator.runge_kutta import LANES

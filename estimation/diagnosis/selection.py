@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from estimation.diagnosis.anchor import fit_anchor
-from estimation.diagnosis.clipping import clipped_readouts
-from estimation.diagnosis.data import Run
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models, misfit
-from estimation.diagnosis.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
-from estimation.diagnosis.initial import (
+from estimation.device_fit.data import Run
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models, misfit
+from estimation.device_fit.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
+from estimation.device_fit.initial import (
     estimate_whiteners,
     fit_initial_state,
     fit_progressively,
     flat_whiteners,
     window_schedule,
 )
-from estimation.diagnosis.interference import with_interference_line
+from estimation.device_fit.interference import with_interference_line
+from estimation.device_fit.model import Model, uncertain
+from estimation.device_fit.parameters import Candidate
+from estimation.diagnosis.anchor import fit_anchor
+from estimation.diagnosis.clipping import clipped_readouts
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
-from estimation.diagnosis.model import Model, uncertain
-from estimation.diagnosis.parameters import Candidate
 from estimation.diagnosis.pruning import drop_redundant, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import (
     ScoreTest,

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from estimation.device_fit.fit import Fit, Likelihood, held_out_samples
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.fit import Fit, Likelihood, held_out_samples
 from estimation.diagnosis.screening import all_candidates, score_candidates
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from estimation.diagnosis.fit import Fit, Likelihood
+from estimation.device_fit.fit import Fit, Likelihood
 
 DETECTION_THRESHOLD = 10.0
 """Decrease of -2 log evidence from which a term is detected: a factor of 150 in probability, with a margin for the

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.diagnosis.data import Output, Run, sense_channel
-from estimation.diagnosis.open_loop import is_worse, open_loop
+from estimation.device_fit.data import Output, Run, sense_channel
+from estimation.device_fit.open_loop import is_worse, open_loop
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.integrator.nodes import nodes_to_samples

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.diagnosis.data import MIN_SAMPLES_PER_PERIOD
+from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD
 from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S, IdentifiedValue
 from scanner.arrays import Array
 from scanner.channel import Channel

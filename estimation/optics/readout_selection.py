@@ -10,14 +10,15 @@ motion with that term in the device, so that any readout and any estimator is ha
 of the picture and that of the estimator. The corner frequencies of the readout are in every set of effects, with their
 tolerance: a value within its tolerance is calibration. Sets of effects are compared by their evidence. The two axes
 have different frequencies, which distinguishes effects that grow with the frequency from feedthrough of one drive.
-Effects that act alike at both frequencies, as a delay and a lag far above them do, are rivals.
+Effects that act alike at both frequencies, as a delay and a lag far above them do, are rivals. Sets of effects that the
+picture alone does not tell apart are compared by the evidence of the sense signal too: its harmonics may.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -54,6 +55,9 @@ MAX_EFFECTS = 2
 UNDETERMINED_SD_RAD = math.pi
 """Standard deviation of a phase error that the picture does not determine."""
 
+SenseEvidence = Callable[[Device], float]
+"""-2 log evidence of the sense signal under a device, up to a constant."""
+
 HELDOUT_METRIC = (
     "mean squared phase error of forward against backward half-periods, in standard errors, in every second part of "
     "the scan; the effects were fitted to the other parts"
@@ -71,11 +75,19 @@ class _Posterior:
 
 @dataclass(frozen=True)
 class _Data:
-    """Phase errors y, shape (2,), their covariance C, shape (2, 2), and the effects that every set of effects has."""
+    """The data that effects are compared by.
+
+    Attributes:
+        value: phase errors y, shape (2,) [rad].
+        covariance: C, shape (2, 2) [rad²].
+        calibrations: effects that every set of effects has.
+        sense: -2 log evidence of the sense signal, by the sets for which it was evaluated.
+    """
 
     value: Array
     covariance: Array
     calibrations: list[ReadoutEffect]
+    sense: Mapping[frozenset[ReadoutEffect], float] = field(default_factory=dict)
 
     def posterior(self, effects: Sequence[ReadoutEffect]) -> _Posterior:
         """Posterior of the sizes of the calibrations and ``effects``."""
@@ -92,15 +104,22 @@ class _Data:
         return _Posterior(sizes, sds, math.inf if impossible else neg2)
 
     def neg2_log_evidence(self, effects: Sequence[ReadoutEffect]) -> float:
-        """-2 log evidence of the calibrations and ``effects``, up to a constant."""
-        return self.posterior(effects).neg2_log_evidence
+        """-2 log evidence of the calibrations and ``effects``, up to a constant.
+
+        Sets for which the sense signal was not evaluated have the best evidence of those for which it was.
+        """
+        of_sense = self.sense.get(frozenset(effects), min(self.sense.values(), default=0.0))
+        return self.posterior(effects).neg2_log_evidence + of_sense
 
 
-def diagnose_readout(reference: ReferencePhase) -> tuple[tuple[Finding, ...], Device]:
+def diagnose_readout(
+    reference: ReferencePhase, sense_evidence: SenseEvidence = lambda device: 0.0
+) -> tuple[tuple[Finding, ...], Device]:
     """Find the effects of the readout that the phase errors of a motion demand.
 
     Args:
         reference: the phase errors.
+        sense_evidence: compares devices that the picture does not tell apart.
 
     Returns:
         Findings in order of evidence, and the improved device, with their terms and calibrated corner frequencies;
@@ -118,7 +137,22 @@ def diagnose_readout(reference: ReferencePhase) -> tuple[tuple[Finding, ...], De
     selected = _select(data, candidates)
     if not any(effect.is_readout for effect in selected):  # calibration or the optics explain the phase errors
         return (), reference.device
+    near = {frozenset(one): one for one in (selected, *_near_exchanges(data, selected, candidates))}
+    if len(near) > 1:
+        sized = {key: _size_together(reference, data, one, scales)[1] for key, one in near.items()}
+        data = replace(data, sense={key: sense_evidence(device) for key, device in sized.items()})
+        selected = min(near.values(), key=data.neg2_log_evidence)
     return _report(reference, data, selected, candidates, scales)
+
+
+def _near_exchanges(
+    data: _Data, selected: Sequence[ReadoutEffect], candidates: Sequence[ReadoutEffect]
+) -> list[list[ReadoutEffect]]:
+    """Sets with one effect exchanged for another of the readout, which the picture does not exclude."""
+    limit = data.neg2_log_evidence(selected) + DETECTION_THRESHOLD
+    others = [each for each in candidates if each.is_readout and each not in selected]
+    sets = [[*(e for e in selected if e is not removed), other] for removed in selected for other in others]
+    return [one for one in sets if data.neg2_log_evidence(one) < limit]
 
 
 def _linearise(
@@ -157,6 +191,21 @@ def _select(data: _Data, candidates: Sequence[ReadoutEffect]) -> list[ReadoutEff
     return selected
 
 
+def _size_together(
+    reference: ReferencePhase,
+    data: _Data,
+    selected: Sequence[ReadoutEffect],
+    scales: Mapping[str, NaturalScales],
+) -> tuple[_Data, Device]:
+    """The data corrected for what effects change together beyond the sum of each, and the device with their sizes."""
+    everything = [*data.calibrations, *selected]
+    sizes = data.posterior(selected).sizes
+    changed = improved_device(reference.device, everything, sizes, scales)
+    predicted = sum((e.change(x) for e, x in zip(everything, sizes, strict=True) if e.is_in_device), np.zeros(2))
+    joint = replace(data, value=data.value - (phase_change(reference, changed) - predicted))
+    return joint, improved_device(reference.device, everything, joint.posterior(selected).sizes, scales)
+
+
 def _report(
     reference: ReferencePhase,
     data: _Data,
@@ -166,13 +215,8 @@ def _report(
 ) -> tuple[tuple[Finding, ...], Device]:
     """Findings of the selected effects of the readout, and the improved device."""
     everything = [*data.calibrations, *selected]
-    sizes = data.posterior(selected).sizes
-    changed = improved_device(reference.device, everything, sizes, scales)
-    # what acts on the estimate together, as against the sum of the effects by themselves
-    predicted = sum((e.change(x) for e, x in zip(everything, sizes, strict=True) if e.is_in_device), np.zeros(2))
-    joint = replace(data, value=data.value - (phase_change(reference, changed) - predicted))
+    joint, device = _size_together(reference, data, selected, scales)
     posterior = joint.posterior(selected)
-    device = improved_device(reference.device, everything, posterior.sizes, scales)
     heldout = _heldout(reference, joint, selected)
     explained = [e.change(x) for e, x in zip(everything, posterior.sizes, strict=True)]
     left = joint.value - sum(explained, np.zeros(2))

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.diagnosis.data import MIN_SAMPLES_PER_PERIOD
+from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD
+from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.diagnosis.diagnose import Diagnosis, Finding, ParameterEstimate, Rival
 from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE
-from estimation.diagnosis.open_loop import OpenLoop, is_worse
 from estimation.lock_in_channels import lock_in_amplitude
 from estimation.slow.decay import LAWS, Law
 from estimation.slow.selection import (

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from estimation.diagnosis.open_loop import OpenLoop, is_worse
+from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.slow.response import (
     FEEDTHROUGH,
     SECOND_MODE,

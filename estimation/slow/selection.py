@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.diagnosis.open_loop import OpenLoop
+from estimation.device_fit.open_loop import OpenLoop
 from estimation.slow.decay import LAWS, Decay, Law, log_amplitude
 from scanner.arrays import Array
 from scanner.errors import BadInput

@@ -39,7 +39,7 @@ def predict_file(
     """
     import numpy as np
 
-    from estimation.diagnosis.predict import beyond_measured_laws, predict
+    from estimation.device_fit.predict import beyond_measured_laws, predict
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder, write_json
     from scanner import devices

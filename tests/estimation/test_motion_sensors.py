@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.diagnosis.data import prepare_run
-from estimation.diagnosis.open_loop import fit_start_only
-from estimation.diagnosis.predict import predict
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.open_loop import fit_start_only
+from estimation.device_fit.predict import predict
 from estimation.estimate import default_estimator, estimate
 from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant, Sine

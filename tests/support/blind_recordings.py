@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from benchmarks.blind.generator import BlindRecording, Case, generate_recording, write
-from estimation.diagnosis.data import prepare_run
+from estimation.device_fit.data import prepare_run
 from estimation.diagnosis.selection import SelectionResult, select_terms
 from scanner.recording import Recording
 from scanner.terms import catalogue

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import linregress
 
-from estimation.diagnosis.data import prepare_run
-from estimation.diagnosis.model import Model
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.model import Model
 from estimation.diagnosis.screening import all_candidates
 from phantoms.experiment import Experiment, simulate_experiment
 from recon.evaluation import truth_from_simulation

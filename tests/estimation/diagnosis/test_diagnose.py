@@ -10,24 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimation.diagnosis.data import prepare_run
-from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.drive_lines import is_steady, strongest_line
-from estimation.diagnosis.fit import Likelihood, fit_model
-from estimation.diagnosis.initial import (
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.drive_lines import is_steady, strongest_line
+from estimation.device_fit.fit import Likelihood, fit_model
+from estimation.device_fit.initial import (
     estimate_whiteners,
     fit_initial_state,
     fit_progressively,
     flat_whiteners,
     window_schedule,
 )
-from estimation.diagnosis.interference import strongest_interfering_line
+from estimation.device_fit.interference import strongest_interfering_line
+from estimation.device_fit.model import Model
+from estimation.device_fit.noise import make_whitener, noise_psd
+from estimation.device_fit.parameters import Candidate
+from estimation.device_fit.resampling import decimate, resample_drive
+from estimation.diagnosis.diagnose import diagnose
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.linearisation import linear_model
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.noise import make_whitener, noise_psd
-from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.resampling import decimate, resample_drive
 from estimation.diagnosis.screening import all_candidates
 from recon.cli import main
 from scanner.device import Device
@@ -223,7 +223,7 @@ def test_a_pair_of_laws_is_selected_around_a_discrepancy() -> None:
     free_fit = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x), max_iterations=20)
     pool = all_candidates(DEVICE, nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
     linear = linear_model(likelihood, free_fit, [c for c in pool if not c.channel.startswith("angle")])
-    assert linear.effects(linear.select().laws) == {"cubic-stiffness", "gain-drift"}
+    assert linear.effects(linear.select().laws) == {("x", "cubic-stiffness"), ("x", "gain-drift")}
 
 
 def test_a_foreign_tone_among_the_lines_of_a_multisine_is_detected() -> None:

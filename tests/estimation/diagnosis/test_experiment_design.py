@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.diagnosis.data import prepare_run
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.fit import Fit, Likelihood, fit_model
+from estimation.device_fit.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
+from estimation.device_fit.model import Model
+from estimation.device_fit.parameters import Candidate
+from estimation.device_fit.profile_likelihood import Z_95, profile_interval
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals, rank_experiments
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model
-from estimation.diagnosis.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.profile_likelihood import Z_95, profile_interval
 from scanner.terms import catalogue
 from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import diagnose as diagnosing
-from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.gain_drift import may_be_gain_drift
-from estimation.diagnosis.parameters import Candidate
 from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, simulate_axis, stated_terms
 from scanner.recording import Recording

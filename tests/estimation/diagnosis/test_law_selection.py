@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.linear_model import LinearModel, LinearTerm
-from estimation.diagnosis.parameters import Candidate
 from scanner.device import Axis, Device
 from scanner.recording import Recording
 from scanner.stages import Mechanics

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.predict import predict
 from estimation.diagnosis import selection as searching
-from estimation.diagnosis.data import prepare_run
 from estimation.diagnosis.diagnose import Diagnosis, build_diagnosis
-from estimation.diagnosis.predict import predict
 from recon.io.convert import convert
 from scanner.device import Axis, Device
 from scanner.recording import Recording

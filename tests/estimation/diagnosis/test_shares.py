@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.fit import Likelihood, fit_model
+from estimation.device_fit.initial import flat_whiteners
+from estimation.device_fit.model import Model
+from estimation.device_fit.open_loop import OpenLoop, is_worse, open_loop
 from estimation.diagnosis.clipping import find_rail
-from estimation.diagnosis.data import prepare_run
-from estimation.diagnosis.fit import Likelihood, fit_model
 from estimation.diagnosis.identifiability import determined_parameters
-from estimation.diagnosis.initial import flat_whiteners
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.open_loop import OpenLoop, is_worse, open_loop
 from estimation.diagnosis.shares import explained_share, remaining_share
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
@@ -79,11 +79,11 @@ def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
 def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> None:
     """A pendulum let go at 45 degrees: whatever its law is called, the device that has it predicts its swing."""
     from benchmarks.measured import ROWS
+    from estimation.device_fit.fit import Fit
+    from estimation.device_fit.initial import estimate_whiteners, fit_initial_state, fit_progressively, window_schedule
+    from estimation.device_fit.parameters import Candidate
     from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-    from estimation.diagnosis.fit import Fit
     from estimation.diagnosis.improvement import improve
-    from estimation.diagnosis.initial import estimate_whiteners, fit_initial_state, fit_progressively, window_schedule
-    from estimation.diagnosis.parameters import Candidate
     from estimation.diagnosis.selection import SelectionResult, SelectionStep
 
     (recording,), _, device = ROWS["pendulum-45"](measured_data)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from estimation.device_fit.data import Run, prepare_run
 from estimation.diagnosis import diagnose as diagnosing
-from estimation.diagnosis.data import Run, prepare_run
 from estimation.diagnosis.structure import find_modes, with_driven_modes
 from recon.report.conclusions import conclude_diagnosis
 from scanner.arrays import Array

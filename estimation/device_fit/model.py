@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.diagnosis.data import Output, Run, readout_of
-from estimation.diagnosis.mains import HUM_RELATIVE_SD, NOMINAL_MAINS, Mains, hum_quadratures
-from estimation.diagnosis.parameters import (
+from estimation.device_fit.data import Output, Run, readout_of
+from estimation.device_fit.mains import HUM_RELATIVE_SD, NOMINAL_MAINS, Mains, hum_quadratures
+from estimation.device_fit.parameters import (
     OFFSET_RELATIVE_SD,
     REFERENCE_GAIN_RELATIVE_SD,
     Candidate,

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimation.diagnosis.data import Output
-from estimation.diagnosis.fit import INITIAL_STEP, Fit, Likelihood, fit_model, fit_models
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.noise import Whitener, flat_psd, make_whitener, near_lines, noise_psd
+from estimation.device_fit.data import Output
+from estimation.device_fit.fit import INITIAL_STEP, Fit, Likelihood, fit_model, fit_models
+from estimation.device_fit.model import Model
+from estimation.device_fit.noise import Whitener, flat_psd, make_whitener, near_lines, noise_psd
 from scanner.arrays import Array
 
 FIRST_WINDOW_PERIODS = 5

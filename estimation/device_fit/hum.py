@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model, fit_models
-from estimation.diagnosis.initial import estimate_whiteners
-from estimation.diagnosis.mains import HUM_HARMONICS, NOMINAL_MAINS, Mains, is_hum
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.noise import Whitener
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models
+from estimation.device_fit.initial import estimate_whiteners
+from estimation.device_fit.mains import HUM_HARMONICS, NOMINAL_MAINS, Mains, is_hum
+from estimation.device_fit.model import Model
+from estimation.device_fit.noise import Whitener
 from estimation.least_squares import regress
 from scanner.arrays import Array
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.diagnosis.noise import periodogram
+from estimation.device_fit.noise import periodogram
 from scanner.arrays import Array
 from scanner.forward_model import DriveInput
 

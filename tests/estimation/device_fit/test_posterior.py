@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.diagnosis.effect_curve import effect_curve
-from estimation.diagnosis.fit import Fit, Likelihood
-from estimation.diagnosis.identifiability import linearise_simulated, stated_whitener
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.parameters import Candidate
-from estimation.diagnosis.posterior import (
+from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.model import Model
+from estimation.device_fit.parameters import Candidate
+from estimation.device_fit.posterior import (
     PICTURE_HALF_WIDTH_PX,
     PORTRAIT_CELLS,
     axis_trajectories,
@@ -20,6 +18,8 @@ from estimation.diagnosis.posterior import (
     phase_portrait,
     waveform,
 )
+from estimation.diagnosis.effect_curve import effect_curve
+from estimation.diagnosis.identifiability import linearise_simulated, stated_whitener
 from phantoms.waveforms import Constant
 from recon.experiment_planning import Excitation, prepare_planned_run
 from scanner.terms import catalogue

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.blind.generator import Case
-from estimation.diagnosis.mains import Mains
+from estimation.device_fit.mains import Mains
 from tests.support.blind_recordings import search_blind_recording
 
 

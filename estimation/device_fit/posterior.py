@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.diagnosis.fit import Fit, Likelihood
+from estimation.device_fit.fit import Fit, Likelihood
 from scanner.arrays import Array
 from scanner.forward_model import AxisTrajectory
 

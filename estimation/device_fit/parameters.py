@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from estimation.diagnosis.data import readout_of
+from estimation.device_fit.data import readout_of
 from scanner.device import Device
 from scanner.stages import Amdm, MotionSensor, Readout
 from scanner.terms import Parameter, Term

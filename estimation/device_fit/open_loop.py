@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from estimation.diagnosis.data import Run
-from estimation.diagnosis.fit import TIME_BLOCKS, Likelihood, fit_model, held_out_samples
-from estimation.diagnosis.initial import fit_initial_state, flat_whiteners, window_schedule
-from estimation.diagnosis.model import Model
+from estimation.device_fit.data import Run
+from estimation.device_fit.fit import TIME_BLOCKS, Likelihood, fit_model, held_out_samples
+from estimation.device_fit.initial import fit_initial_state, flat_whiteners, window_schedule
+from estimation.device_fit.model import Model
 from scanner.arrays import Array
 from scanner.device import Device
 

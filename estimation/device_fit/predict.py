@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.diagnosis.data import Run, prepare_run
-from estimation.diagnosis.open_loop import fit_start_only
+from estimation.device_fit.data import Run, prepare_run
+from estimation.device_fit.open_loop import fit_start_only
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.recording import Recording

@@ -8,8 +8,8 @@ from math import ceil, floor
 
 import numpy as np
 
-from estimation.diagnosis.drive_lines import drive_lines, is_steady, strongest_line
-from estimation.diagnosis.resampling import decimate, fast_transform_length, resample_drive
+from estimation.device_fit.drive_lines import drive_lines, is_steady, strongest_line
+from estimation.device_fit.resampling import decimate, fast_transform_length, resample_drive
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
 from scanner.device import Axis, Device

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import percentile_filter
 
-from estimation.diagnosis.fit import Fit, Likelihood
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.noise import near_lines, noise_psd, periodogram
+from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.model import Model
+from estimation.device_fit.noise import near_lines, noise_psd, periodogram
 from scanner.arrays import Array
 
 LINE_DETECTION_RATIO = 30.0

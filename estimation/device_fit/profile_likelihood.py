@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.diagnosis.fit import Fit, Likelihood, fit_model
+from estimation.device_fit.fit import Fit, Likelihood, fit_model
 
 Z_95 = 1.96
 """Half-width of a 95 % interval in standard deviations. At its ends, -2 log posterior has risen by the square of

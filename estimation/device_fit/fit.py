@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.diagnosis.data import Run
-from estimation.diagnosis.model import Model
-from estimation.diagnosis.noise import Whitener
+from estimation.device_fit.data import Run
+from estimation.device_fit.model import Model
+from estimation.device_fit.noise import Whitener
 from estimation.least_squares import fit_levenberg_marquardt, laplace_neg2_log_evidence
 from scanner.arrays import Array, Mask
 
