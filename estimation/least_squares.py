@@ -25,19 +25,10 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e8
 """Below the first, damping is lost in rounding; above the second, a step is too short to change anything."""
 
 DAMPING_RAISE, DAMPING_LOWER = 6.0, 8.0
-"""Factors by which damping grows after a step that does not lower the misfit as predicted, and falls after one that
-does."""
-
-MIN_GAIN_RATIO = 0.25
-"""Fall of the misfit over the predicted one from which a step counts as predicted. With too large steps the fit would
-jump from one side of a minimum to the other. Source: Nocedal & Wright, Numerical Optimization, algorithm 4.1."""
+"""Factors by which damping grows after a step that raises the misfit and falls after one that lowers it."""
 
 JACOBIAN_REUSE_RATIO = 0.9
 """Share of the predicted fall in misfit from which the Jacobian is kept for one more step."""
-
-MAX_CORRECTION_RATIO = 0.375
-"""Largest length of the correction for the curvature over that of the step, each parameter in its standard deviation
-when the others are fixed: half the value of 0.75 that Transtrum and Sethna recommend for twice the correction."""
 
 DIVERGED_RATIO = 100.0
 """Misfit over ``abort_above`` from which a fit counts as diverged and gets 2 instead of 4 iterations to improve."""
@@ -125,11 +116,7 @@ def fit_levenberg_marquardt(
         tolerance: stop when a step lowers the misfit by less.
         abort_above: misfit of a competing fit. A fit above it that no longer approaches it is stopped early.
 
-    Where a step lowers the misfit by less than predicted, as in a curved valley, it is corrected for the second
-    derivative along it, which its own residual gives, if that lowers the misfit further.
-
-    Source: Marquardt, J. SIAM 11, 431 (1963), with damping relative to the diagonal; Transtrum & Sethna,
-    arXiv:1201.5885 (2012), geodesic acceleration.
+    Source: Marquardt, J. SIAM 11, 431 (1963), with damping relative to the diagonal.
     """
     x, current = np.array(x, np.float64), residual(x)
     used = np.ones(current.size, bool) if rows is None else rows
@@ -148,11 +135,9 @@ def fit_levenberg_marquardt(
         normal[held], normal[:, held], gradient[held] = 0.0, 0.0, 0.0
         normal[held, held] = 1.0
         gain = predicted = 0.0
-        before = damping
         while damping < MAX_DAMPING:
-            damped = normal + damping * np.diag(np.diag(normal))
             try:
-                step = -np.linalg.solve(damped, gradient)
+                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             except np.linalg.LinAlgError:  # a diverged model makes the normal matrix singular
                 damping *= DAMPING_RAISE
                 continue
@@ -160,26 +145,14 @@ def fit_levenberg_marquardt(
                 step = step / max(1.0, float(np.max(np.abs(step) / max_step, initial=0.0)))
             trial = residual(x + step)
             trial_value = misfit(x + step, trial)
-            predicted = -float(step @ (2.0 * gradient + normal @ step))
-            if fresh and value - trial_value < JACOBIAN_REUSE_RATIO * predicted:
-                slope = part.T @ (trial - current - slopes @ step)[used]
-                slope[held] = 0.0
-                correction, size = -np.linalg.solve(damped, slope), np.sqrt(np.diag(normal))
-                if np.linalg.norm(size * correction) < MAX_CORRECTION_RATIO * np.linalg.norm(size * step):
-                    corrected = residual(x + step + correction)
-                    corrected_value = misfit(x + step + correction, corrected)
-                    if corrected_value < trial_value:
-                        step, trial, trial_value = step + correction, corrected, corrected_value
             if trial_value < value:
                 gain, value, current, x = value - trial_value, trial_value, trial, x + step
-                is_linear = gain > MIN_GAIN_RATIO * predicted
-                damping = max(damping / DAMPING_LOWER, MIN_DAMPING) if is_linear else damping * DAMPING_RAISE
+                predicted = -float(step @ (2.0 * gradient + normal @ step))
+                damping = max(damping / DAMPING_LOWER, MIN_DAMPING)
                 break
             if gradient @ -step < 0.1 * tolerance:  # even the linear model promises no more than that
                 break
             damping *= DAMPING_RAISE
-        if not fresh:  # that an old linear model fails says nothing about the next one
-            damping = min(damping, before)
         if fresh and gain < tolerance and iteration > 0:
             break
         fresh = gain <= JACOBIAN_REUSE_RATIO * predicted or gain <= tolerance

@@ -109,7 +109,7 @@ def fit_optics(
     parameters: OpticsParameters,
     variances: CellVariances,
     cells: int,
-    max_iterations: int = 12,
+    max_iterations: int = 6,
 ) -> OpticsFit:
     """Fit optics parameters to the intensity, with the scene eliminated at every step.
 
