@@ -248,6 +248,7 @@ class LinearModel:
         return laws
 
     def _without_discrepancy(self, laws: Sequence[int]) -> Hypothesis:
+        """The laws without a discrepancy."""
         return self.hypothesis(laws, without=range(len(self.discrepancies)))
 
     def _misfit(self, laws: Sequence[int]) -> float:
@@ -301,9 +302,10 @@ class LinearModel:
         while len(laws) < MAX_LAWS:
             taken = self.effects(laws)
             more = [(*laws, i) for i in range(len(self.laws)) if not self.effects([i]) & taken]
-            improved = {m: e for m in more if (e := self._without_discrepancy(m).neg2_log_evidence) < lowest}
+            limit = lowest - MIN_SCORE_GAIN
+            improved = {m: e for m in more if (e := self._without_discrepancy(m).neg2_log_evidence) < limit}
             best = next((m for m in sorted(improved, key=improved.__getitem__) if self._is_possible(m)), None)
-            if best is None or improved[best] > lowest - MIN_SCORE_GAIN:
+            if best is None:
                 break
             laws, lowest = best, improved[best]
         return laws
