@@ -20,7 +20,12 @@ from estimation.tracker.block_tracking import average_over_noise, track_blocks
 from estimation.tracker.cramer_rao import phase_sd_bounds
 from estimation.tracker.initial_state import initial_estimate, resolve_signs
 from estimation.tracker.observations import BlockObservations, demodulate_blocks, lay_out_blocks
-from estimation.tracker.process_noise import noise_posterior, tune_process_noise, tuning_parts
+from estimation.tracker.process_noise import (
+    noise_posterior,
+    tune_process_noise,
+    tuning_parts,
+    with_offset_density,
+)
 from estimation.tracker.state_space import AXIS_STATES, PHASE
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
@@ -101,7 +106,9 @@ def track_phase(observations: BlockObservations, device: Device) -> tuple[Array,
     """Tracked phases and their standard deviations, each of shape (blocks, axes) [rad]."""
     start, _ = resolve_signs(observations, initial_estimate(observations, device))
     parts = tuning_parts(observations.signal)
-    posterior = noise_posterior(observations, start, parts, tune_process_noise(observations, start, parts))
+    densities, offset_density = tune_process_noise(observations, start, parts)
+    observations, parts = observations.with_offset_density(offset_density), with_offset_density(parts, offset_density)
+    posterior = noise_posterior(observations, start, parts, densities)
     track = average_over_noise(observations, start, posterior)
     phases = [axis * AXIS_STATES + PHASE for axis in range(len(observations.parameters))]
     return track.states[:, phases], track.sds[:, phases]

@@ -7,7 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.tracker.demodulation import NoiseSpectrum
 from scanner.arrays import Array, Complex
+
+MIN_OFFSET_DENSITY_V2_PER_S = 1e-8
+"""Least spectral density of the random walk of the readout's offset [V^2/s]: 0.1 mV in 1 s, a thermal drift."""
 
 
 class BlockSignal(NamedTuple):
@@ -27,10 +31,13 @@ class BlockSignal(NamedTuple):
             angular frequency [s].
         mean_gain: readout response at 0 Hz, 0 where it has no DC response. mean_delay: response to the mean's rate [s].
         table_w: angular frequency of the projections' tables, shape (blocks, axes) [rad/s].
-        whitened: R'B'y of each block, R R' being the inverse of the Gram matrix B'B, shape (blocks, m) [V].
-        whitened_moments: R'B'T^nB for n = 0, 1, 2 of each geometry, shape (geometries, 3, m, m).
-        whiteners: R of each geometry, shape (geometries, m, m). geometry: index of each block's, shape (blocks,).
+        spectrum: of the noise.
+        whitened: W B'y of each block, shape (blocks, m) [V], with W of ``demodulation.whiten_projections``.
+        whitened_moments: W B'T^nB for n = 0, 1, 2 of each geometry, shape (geometries, 3, m, m).
+        solvers: least-squares coefficients from ``whitened``, shape (geometries, m, m). geometry: index of each
+            block's, shape (blocks,).
         noise_var: variance of a block's samples, shape (blocks,) [V^2].
+        offset_density: spectral density of the random walk of the readout's offset [V^2/s].
         external_phase: phase measured by other means, shape (blocks, axes) [rad]. external_var: its variance, infinite
             where there is none [rad^2].
         amplitude_table: amplitudes [rad] and the magnitude of the main line of C or theta, shape (axes, 2, size).
@@ -48,17 +55,19 @@ class BlockSignal(NamedTuple):
     mean_gain: float
     mean_delay: float
     table_w: Array
+    spectrum: NoiseSpectrum
     whitened: Array
     whitened_moments: Array
-    whiteners: Array
+    solvers: Array
     geometry: NDArray[np.int64]
     noise_var: Array
+    offset_density: float
     external_phase: Array
     external_var: Array
     amplitude_table: Array
     main_order: int
 
-    def with_blocks(self, block: NDArray[np.int64], whitened: Array, moments: Array, whiteners: Array) -> BlockSignal:
+    def with_blocks(self, block: NDArray[np.int64], whitened: Array, moments: Array, solvers: Array) -> BlockSignal:
         """The signal with other projections of the blocks ``block``, each with its own geometry."""
         shared = 1 + np.delete(self.geometry, block).max(initial=-1)
         geometry, projections = self.geometry.copy(), self.whitened.copy()
@@ -67,5 +76,5 @@ class BlockSignal(NamedTuple):
             geometry=geometry,
             whitened=projections,
             whitened_moments=np.concatenate([self.whitened_moments[:shared], moments]),
-            whiteners=np.concatenate([self.whiteners[:shared], whiteners]),
+            solvers=np.concatenate([self.solvers[:shared], solvers]),
         )

@@ -127,8 +127,8 @@ def linearise_clipped_blocks(observations: BlockObservations, states: Array) -> 
         expansions.append(project_expansion(values[used], rails, table[:, used], offset[used], expected, sd))
     sums, moments, gradients, variance = (np.array(field) for field in zip(*expansions, strict=True))
     variance[clipped.rails[:, 0] == clipped.rails[:, 1]] = observations.noise_var  # a comparator has no residuals
-    white, roots, whiteners = whiten_projections(sums, moments, np.arange(len(sums)))
-    misfit = np.mean(np.einsum("kij,ki->kj", whiteners, gradients) ** 2, axis=1) / observations.noise_var
+    white, roots, whiteners, solvers = whiten_projections(sums, moments, np.arange(len(sums)), signal.spectrum)
+    misfit = np.mean(np.einsum("kij,kj->ki", whiteners, gradients) ** 2, axis=1) / observations.noise_var
     noise = signal.noise_var.copy()
     noise[clipped.block] = variance
     typical = float(np.median(noise))
@@ -136,5 +136,5 @@ def linearise_clipped_blocks(observations: BlockObservations, states: Array) -> 
         np.where(variance > DISTURBED_VARIANCE_RATIO * typical, variance, typical),
         np.where(misfit > JUMP_NIS, misfit * typical, 0.0),
     )
-    signal = signal.with_blocks(clipped.block, white, roots, whiteners)
+    signal = signal.with_blocks(clipped.block, white, roots, solvers)
     return replace(observations, signal=signal._replace(noise_var=noise), noise_var=typical)

@@ -33,11 +33,13 @@ class Tuning(NamedTuple):
     Attributes:
         densities, posterior: of the process noise.
         noise_scale: factor on the noise variance of the blocks.
+        offset_density: of the random walk of the readout's offset [V^2/s].
     """
 
     densities: Array
     posterior: NoisePosterior
     noise_scale: float
+    offset_density: float
 
 
 class TrackEnd(NamedTuple):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -55,6 +56,19 @@ class Projections:
     table_w: Array
     rails: Array
     clipped_counts: Index
+
+
+class NoiseSpectrum(NamedTuple):
+    """Noise of a block's projections, relative to the variance of the samples.
+
+    Attributes:
+        white: variance of the white part.
+        excess: variances of a line's coefficients in a block by the noise near it that exceeds the white part,
+            shape (m,).
+    """
+
+    white: float
+    excess: Array
 
 
 def harmonic_basis(length: int, rate: float, lines: Index, table_w: Array) -> Array:
@@ -180,26 +194,37 @@ def residual_variance(projections: Projections) -> Array:
     return np.where(freedom > 0, np.maximum(rest, 0.0) / np.maximum(freedom, 1), np.nan)
 
 
-def whiten_projections(sums: Array, grams: Array, geometry: Index) -> tuple[Array, Array, Array]:
-    """Whiten projections by their Gram matrices, so that their errors are independent and of the samples' variance.
+def whiten_projections(
+    sums: Array, grams: Array, geometry: Index, spectrum: NoiseSpectrum
+) -> tuple[Array, Array, Array, Array]:
+    """Whiten projections by their noise, so that their errors are independent and of the samples' variance.
 
-    R = V diag(1/sqrt(lambda)) with the eigenvalues and eigenvectors of G, so that R'GR = 1. Directions without samples
-    are zero.
+    White noise of variance c gives the projections the covariance c G with the Gram matrix G. With its eigenvalues and
+    eigenvectors, R = V diag(1/sqrt(lambda)) satisfies R'GR = 1; directions without samples are zero. Noise near a line
+    that exceeds the white noise acts as random coefficients of the line, of variances E in a block: the covariance is
+    c G + G E G. With the eigenvectors U and eigenvalues S of c + R'G E G R, W = S^-1/2 U'R' whitens it.
 
     Args:
         sums, grams, geometry: as in ``Projections``.
+        spectrum: c and E relative to the variance of the samples.
 
     Returns:
-        (R's, shape (blocks, m); R'B'T^nB, shape (geometries, 3, m, m); R, shape (geometries, m, m)).
+        (W s, shape (blocks, m); W B'T^nB, shape (geometries, 3, m, m); W, shape (geometries, m, m); the matrix that
+        gives the least-squares coefficients from W s, shape (geometries, m, m)).
     """
     values, vectors = np.linalg.eigh(grams[:, 0])
     valid = values > 1e-9 * np.maximum(values[:, -1:], 1.0)
-    whiteners = vectors * np.where(valid, 1.0 / np.sqrt(np.where(valid, values, 1.0)), 0.0)[:, None, :]
+    roots = vectors * np.where(valid, 1.0 / np.sqrt(np.where(valid, values, 1.0)), 0.0)[:, None, :]
+    projected = np.sqrt(spectrum.excess)[:, None] * (grams[:, 0] @ roots)
+    scales, turns = np.linalg.eigh(spectrum.white * np.eye(values.shape[1]) + np.swapaxes(projected, 1, 2) @ projected)
+    turned = roots @ turns
+    whiteners = np.swapaxes(turned / np.sqrt(scales)[:, None, :], 1, 2)
     out = np.empty_like(sums)
     for g, whitener in enumerate(whiteners):
         mine = geometry == g
-        out[mine] = sums[mine] @ whitener
-    return out, np.swapaxes(whiteners, 1, 2)[:, None] @ grams, np.ascontiguousarray(whiteners)
+        out[mine] = sums[mine] @ whitener.T
+    solvers = np.ascontiguousarray(turned * np.sqrt(scales)[:, None, :])
+    return out, whiteners[:, None] @ grams, whiteners, solvers
 
 
 def _frequency_groups(omega: Array, max_range: float) -> Iterator[slice]:

@@ -12,13 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.signals import SenseChannel, drive_channel, intensity_clock, phase_reference
+from estimation.tracker.amplitude_table import MAX_AMPLITUDE_THETA0
 from estimation.tracker.averaged_dynamics import average_cycle, axis_parameters, unpack_parameters
-from estimation.tracker.block_signal import BlockSignal
+from estimation.tracker.block_signal import MIN_OFFSET_DENSITY_V2_PER_S, BlockSignal
 from estimation.tracker.block_tracking import track_blocks
+from estimation.tracker.demodulation import NoiseSpectrum
 from estimation.tracker.drive_blocks import BlockDrive, demodulate_drive
 from estimation.tracker.initial_state import RELATIVE_STIFFNESS_SD, STIFFNESS_RATE_SD_PER_S
 from estimation.tracker.kalman_filter import StateEstimate
-from estimation.tracker.observations import MAX_AMPLITUDE_THETA0, MIN_BLOCKS, NO_CLIPPED_BLOCKS, BlockObservations
+from estimation.tracker.observations import MIN_BLOCKS, NO_CLIPPED_BLOCKS, BlockObservations
 from estimation.tracker.phase_measurements import PhaseMeasurement, with_phase_measurements
 from estimation.tracker.process_noise import MIN_DENSITIES
 from estimation.tracker.state_space import AXIS_STATES, DAMPING, LOG_AMPLITUDE, PHASE, STIFFNESS, STIFFNESS_RATE
@@ -140,11 +142,13 @@ def _signal_without_lines(drive: BlockDrive, step: float, main_order: int, max_a
         mean_gain=0.0,
         mean_delay=0.0,
         table_w=drive.w[:, None],
+        spectrum=NoiseSpectrum(1.0, np.zeros(1)),
         whitened=zeros,
         whitened_moments=np.zeros((1, 3, 1, 1)),
-        whiteners=np.zeros((1, 1, 1)),
+        solvers=np.zeros((1, 1, 1)),
         geometry=np.zeros(blocks, np.int64),
         noise_var=np.ones(blocks),
+        offset_density=MIN_OFFSET_DENSITY_V2_PER_S,
         external_phase=zeros.copy(),
         external_var=np.full((blocks, 1), np.inf),
         amplitude_table=np.array([[[0.0, max_amplitude], [0.0, max_amplitude]]]),

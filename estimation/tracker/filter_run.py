@@ -14,9 +14,6 @@ from estimation.tracker.observations import BlockObservations
 from estimation.tracker.state_space import padded_size
 from scanner.arrays import Array
 
-OFFSET_DENSITY_V2_PER_S = 1e-8
-"""Spectral density of the readout offset's random walk [V^2/s]: 0.1 mV in 1 s. Not tuned."""
-
 
 class FilterRun(NamedTuple):
     """Result of a filter's run over a signal.
@@ -46,7 +43,7 @@ def filter_blocks(
     x, P = np.zeros(padded_size(n)), np.zeros((padded_size(n), padded_size(n)))
     x[:n], P[:n, :n] = start.mean, start.covariance
     history = empty_history(len(signal.whitened), len(observations.parameters))
-    args = x, P, acquired, densities, OFFSET_DENSITY_V2_PER_S, linear, history
+    args = x, P, acquired, densities, signal.offset_density, linear, history
     log_likelihood, nis, measurements = run_filter(observations.parameter_rows, signal, *args)
     return FilterRun(log_likelihood, nis, measurements, acquired, history)
 

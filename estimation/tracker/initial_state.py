@@ -76,11 +76,11 @@ def _detect_motion(signal: BlockSignal, a: int, x: Array) -> bool:
     """
     (i,) = np.flatnonzero((signal.lines[:, 0] == a) & (signal.lines[:, 1] == signal.main_order))
     count = min(MAX_ACQUISITION_BLOCKS, len(signal.whitened))
-    whiteners = signal.whiteners[signal.geometry[:count]]
-    fitted = np.einsum("kij,kj->ki", whiteners, signal.whitened[:count])
+    solvers = signal.solvers[signal.geometry[:count]]
+    fitted = np.einsum("kij,kj->ki", solvers, signal.whitened[:count])
     to_reference = np.exp(-1j * signal.main_order * signal.psi[:count, a]) / signal.response[:count, i]
     lines = (fitted[:, 1 + 2 * i] - 1j * fitted[:, 2 + 2 * i]) * to_reference
-    variances = signal.noise_var[:count] * (whiteners[:, 1 + 2 * i] ** 2).sum(axis=1) * np.abs(to_reference) ** 2
+    variances = signal.noise_var[:count] * (solvers[:, 1 + 2 * i] ** 2).sum(axis=1) * np.abs(to_reference) ** 2
     measured = variances > 0.0
     blocks = 1
     while blocks <= count:

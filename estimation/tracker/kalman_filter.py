@@ -56,8 +56,13 @@ REACQUIRE_NIS = 100.0
 MAX_REUSE_DISTANCE = 0.5
 """``state_distance`` beyond which a stored linearisation is no starting point for the iterated update."""
 
-JUMP_SD = (0.02, 3.0)
-"""Largest standard deviations of stiffness [1] and its rate [1/s] that a jump may cause: 2 %, or 2 % in 7 ms."""
+JUMP_SD = (0.02, 3.0, 0.5)
+"""Largest standard deviations of stiffness [1], its rate [1/s] and damping [1] that a jump may cause: 2 %, 2 % in 7 ms,
+and half of the damping, so that it is positive within two standard deviations.
+
+A phase that the device file misses by 37 degrees, as by filters behind the demodulator, needs another ratio of damping
+to drive as well as another resonance: with the damping fixed, the phase would be biased by one to two degrees.
+"""
 
 
 @dataclass(frozen=True)
@@ -104,13 +109,13 @@ def empty_history(blocks: int, axes: int) -> FilterHistory:
 @njit(cache=True, error_model="numpy")
 def _acquire(signal, k, a, x, P):  # type: ignore[no-untyped-def]
     """Set phase and amplitude of axis ``a`` from block k's main line alone; False where the line is not significant."""
-    moments, whitener = signal.whitened_moments[signal.geometry[k], 0], signal.whiteners[signal.geometry[k]]
-    fitted = whitener @ signal.whitened[k]
+    moments, solver = signal.whitened_moments[signal.geometry[k], 0], signal.solvers[signal.geometry[k]]
+    fitted = solver @ signal.whitened[k]
     at = a * AXIS_STATES
     for i in range(signal.lines.shape[0]):
         if signal.lines[i, 0] == a and signal.lines[i, 1] == signal.main_order:
             line = complex(fitted[1 + 2 * i], -fitted[2 + 2 * i])
-            var = signal.noise_var[k] * max((whitener[1 + 2 * i] ** 2).sum(), (whitener[2 + 2 * i] ** 2).sum())
+            var = signal.noise_var[k] * max((solver[1 + 2 * i] ** 2).sum(), (solver[2 + 2 * i] ** 2).sum())
             missing = (moments[:, 1 + 2 * i] ** 2).sum() <= 0.0
             if missing or abs(line) < DETECTION_SIGMA * np.sqrt(var):
                 return False
@@ -232,7 +237,7 @@ def _update_iterated(laws, signal, k, predicted, P_predicted, linear, noise_var)
 
 @njit(cache=True, error_model="numpy")
 def _inflate_covariance(laws, signal, k, x, P, transitions, mean_nis):  # type: ignore[no-untyped-def]
-    """Admit a jump: scale the variances of phase, ln A and stiffness by the mean NIS, or acquire the motion again."""
+    """Admit a jump: scale the variances of all states but the gain by the mean NIS, or acquire the motion again."""
     scale = min(mean_nis, REACQUIRE_NIS)
     for a in range(len(laws)):
         at = a * AXIS_STATES
@@ -241,7 +246,7 @@ def _inflate_covariance(laws, signal, k, x, P, transitions, mean_nis):  # type: 
         else:
             P[at + PHASE, at + PHASE] *= scale
             P[at + LOG_AMPLITUDE, at + LOG_AMPLITUDE] *= scale
-        for i, sd in ((at + STIFFNESS, JUMP_SD[0]), (at + STIFFNESS_RATE, JUMP_SD[1])):
+        for i, sd in ((at + STIFFNESS, JUMP_SD[0]), (at + STIFFNESS_RATE, JUMP_SD[1]), (at + DAMPING, JUMP_SD[2])):
             P[i, i] = max(P[i, i], min(P[i, i] * scale, sd * sd))
 
 

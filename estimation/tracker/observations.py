@@ -7,7 +7,7 @@ the samples of some of the blocks, because the samples of a long recording do no
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import NamedTuple
 
@@ -15,24 +15,18 @@ import numpy as np
 
 from estimation.reference import PhaseReference
 from estimation.signals import SenseChannel, drive_channel, is_capacitive
-from estimation.tracker.averaged_dynamics import (
-    COS,
-    MAX_READOUT_HARMONIC,
-    POINTS_PER_CYCLE,
-    SIN,
-    AxisParameters,
-    axis_parameters,
-)
+from estimation.tracker.amplitude_table import amplitude_table
+from estimation.tracker.averaged_dynamics import MAX_READOUT_HARMONIC, AxisParameters, axis_parameters
 from estimation.tracker.block_signal import BlockSignal
 from estimation.tracker.change_points import block_pieces, project_block, project_cut_blocks
 from estimation.tracker.demodulation import Projections, project_blocks, residual_variance, whiten_projections
 from estimation.tracker.drive_blocks import MAX_LINE_RATE_RATIO, demodulate_drive
+from estimation.tracker.line_noise import initial_offset_density, line_noise_variance, noise_spectrum
 from scanner.arrays import Array, Complex, Index
 from scanner.channel import Channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.harmonics import readout_response
-from scanner.laws import capacitance
 from scanner.recording import Recording
 from scanner.stages import Amdm
 
@@ -66,12 +60,6 @@ SETTLING_TIME_CONSTANTS = 15.0
 
 DELAY_FREQUENCY_HZ = 1.0
 """Frequency at which the readout's delay of slow changes is evaluated [Hz]; far below every scan frequency."""
-
-AMPLITUDE_TABLE_SIZE = 400
-"""Entries of the table from line magnitude to amplitude. It gives start values only."""
-
-MAX_AMPLITUDE_THETA0 = 1.6
-"""Largest amplitude of the table in units of theta0; the second line of a Gaussian comb has its maximum before it."""
 
 MOTION_SENSOR_HARMONICS = 3
 """Harmonics used of a sensor of the motion: the fundamental, and the next two, which a nonlinear suspension adds."""
@@ -130,6 +118,10 @@ class BlockObservations:
     def parameter_rows(self) -> Array:
         """The parameters as numbers, one axis a row, for compiled code, shape (axes, 11)."""
         return np.array(self.parameters, dtype=np.float64)
+
+    def with_offset_density(self, density: float) -> BlockObservations:
+        """The observations with another spectral density of the readout's offset [V^2/s]."""
+        return replace(self, signal=self.signal._replace(offset_density=density))
 
 
 @dataclass(frozen=True)
@@ -234,8 +226,16 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
     if layout.switches.size:
         projections = project_cut_blocks(projections, channel, starts, pieces, lines, w)
     response, response_slope = _line_response(sense, lines, w)
-    whitened, moments, whiteners = whiten_projections(projections.sums, projections.grams, projections.geometry)
-    noise, median_noise = _noise_variance(projections, channel, starts, pieces, lines, w, sense.readout.noise_sd)
+    model_error = _model_error_variance(projections)
+    noise, median_noise = _noise_variance(
+        projections, channel, starts, pieces, lines, w, sense.readout.noise_sd, model_error
+    )
+    line_noise = line_noise_variance(projections, channel, starts, length, lines, median_noise)
+    line_noise = np.fmax(line_noise, model_error)
+    spectrum = noise_spectrum(line_noise, median_noise, length)
+    whitened, moments, _, solvers = whiten_projections(
+        projections.sums, projections.grams, projections.geometry, spectrum
+    )
     signal = BlockSignal(
         psi=layout.psi[part],
         w=w,
@@ -248,14 +248,16 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
         mean_gain=float(readout_response(sense.readout, 0.0).real),
         mean_delay=float(readout_response(sense.readout, DELAY_FREQUENCY_HZ).imag / (2 * np.pi * DELAY_FREQUENCY_HZ)),
         table_w=np.ascontiguousarray(projections.table_w),
+        spectrum=spectrum,
         whitened=whitened,
         whitened_moments=np.ascontiguousarray(moments),
-        whiteners=whiteners,
+        solvers=solvers,
         geometry=projections.geometry,
         noise_var=noise,
+        offset_density=initial_offset_density(projections, line_noise[0], length / channel.sample_rate),
         external_phase=np.zeros(w.shape),
         external_var=np.full(w.shape, np.inf),
-        amplitude_table=np.stack([_amplitude_table(axis, sense) for axis in layout.axes]),
+        amplitude_table=np.stack([amplitude_table(axis, sense.readout) for axis in layout.axes]),
         main_order=2 if is_capacitive(sense.readout) else 1,
     )
     used = float((projections.counts - projections.clipped_counts).sum()) / (starts.size * length)
@@ -305,7 +307,14 @@ def _line_response(sense: SenseChannel, lines: Index, w: Array) -> tuple[Complex
 
 
 def _noise_variance(
-    projections: Projections, channel: Channel, starts: Index, pieces: Index, lines: Index, w: Array, noise_sd: float
+    projections: Projections,
+    channel: Channel,
+    starts: Index,
+    pieces: Index,
+    lines: Index,
+    w: Array,
+    noise_sd: float,
+    model_error: float,
 ) -> tuple[Array, float]:
     """Variance of each block's samples, shape (blocks,), and the typical one [V^2].
 
@@ -317,9 +326,7 @@ def _noise_variance(
         return np.ones(starts.size), np.nan
     variance = residual_variance(projections)
     variance[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator has no residuals
-    samples = np.maximum(projections.counts, 1)
-    signal_var = float(np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2))
-    typical = max(float(np.nanmedian(variance)), MODEL_ERROR_RATIO**2 * signal_var)
+    typical = max(float(np.nanmedian(variance)), model_error)
     length = int(pieces[:, 1].max())
     sideband = channel.sample_rate / length  # [rad/s]: a slip of 1 rad over the block
     axes = w.shape[1]
@@ -331,17 +338,8 @@ def _noise_variance(
     return np.where(variance > DISTURBED_VARIANCE_RATIO * typical, variance, typical), typical
 
 
-def _amplitude_table(axis: Axis, sense: SenseChannel) -> Array:
-    """Amplitudes [rad] and magnitudes of their main line, shape (2, AMPLITUDE_TABLE_SIZE).
-
-    Beyond the largest magnitude, where a larger motion has a smaller line, the table is constant.
-    """
-    if not is_capacitive(sense.readout):
-        amplitudes = np.linspace(0.0, 2.0, AMPLITUDE_TABLE_SIZE)
-        return np.stack([amplitudes, amplitudes])
-    comb = axis.require_capacitance()
-    amplitudes = np.linspace(1e-4, MAX_AMPLITUDE_THETA0, AMPLITUDE_TABLE_SIZE) * comb.theta0
-    values = capacitance(amplitudes[:, None] * SIN[1], comb.C0, comb.Cb, comb.theta0, comb.theta_th)
-    sizes = np.abs(values @ COS[2]) * (2.0 / POINTS_PER_CYCLE)
-    top = int(sizes.argmax())
-    return np.stack([np.minimum(amplitudes, amplitudes[top]), np.maximum.accumulate(sizes)])
+def _model_error_variance(projections: Projections) -> float:
+    """Variance of the model error within a block [V^2]."""
+    samples = np.maximum(projections.counts, 1)
+    signal_var = np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2)
+    return MODEL_ERROR_RATIO**2 * float(signal_var)

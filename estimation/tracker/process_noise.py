@@ -1,7 +1,9 @@
 """Process noise: how fast the resonance drifts, estimated from the recording itself, and its posterior distribution.
 
 Four spectral densities of each axis are tuned: of white noise on the rates of phase and ln A [rad^2/s], of the
-stiffness's rate [1/s^3], of the damping [1/s] and of the logarithm of the readout gain [1/s].
+stiffness's rate [1/s^3], of the damping [1/s] and of the logarithm of the readout gain [1/s]. A fifth one is that of
+the readout's offset [V^2/s]. The mean of the signal depends on the amplitude of a comb's motion: hum or 1/f noise that
+the offset may not follow would be attributed to the amplitude.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.tracker import rts_smoother
-from estimation.tracker.block_signal import BlockSignal
+from estimation.tracker.block_signal import MIN_OFFSET_DENSITY_V2_PER_S, BlockSignal
 from estimation.tracker.filter_run import filter_blocks, select_blocks
 from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.linearisation import Linearisation, empty_linearisation
@@ -42,6 +44,10 @@ MIN_INFORMATIVE_DOF = 1e-3
 
 PRIOR_DOF = (0.0, 1.0, 0.0, 0.0)
 """Degrees of freedom that the prior adds to each density's score: one for a prior that is flat in the square root."""
+
+OFFSET_PRIOR_DOF = 1.0
+"""Degrees of freedom of the prior of the offset's density, about the thermal drift MIN_OFFSET_DENSITY_V2_PER_S: as many
+as the prior of the stiffness rate has. Without it, noise would be attributed to an offset that is at rest."""
 
 MAX_DENSITY_GROWTH = 10.0
 """Largest factor by which a density grows in a round; keeps the fixed-point iteration stable."""
@@ -85,14 +91,17 @@ class NoisePosterior(NamedTuple):
 
 def tune_process_noise(
     observations: BlockObservations, start: StateEstimate, parts: list[TuningPart], densities: Array | None = None
-) -> Array:
-    """Most probable spectral densities of the process noise, shape (axes, 4).
+) -> tuple[Array, float]:
+    """Most probable spectral densities of the process noise, shape (axes, 4), and of the offset [V^2/s].
 
     For a density q, step h and the sums R = sum of r^2 and N of ``disturbance_scores``, the derivative of the
-    log-posterior by ln q is (q h R + dof_prior - q h N) / 2. The iteration q <- (q R + dof_prior / h) / N has its fixed
-    point where this vanishes. A density with less than one degree of freedom q h N in the data does not delay the end.
-    The prior is flat in the standard deviation of the stiffness rate (Gelman, Bayesian Analysis 1, 515, 2006). Without
-    it, a likelihood that is flat towards zero drift would often yield none.
+    log-likelihood by ln q is (q h R - q h N) / 2. The prior adds (a - b) / 2. The iteration q <- q (q h R + a) /
+    (q h N + b) has its fixed point where the sum vanishes. A density with less than one degree of freedom q h N in the
+    data and no prior does not delay the end.
+    The prior of the stiffness rate is flat in its standard deviation: a = 1, b = 0 (Gelman, Bayesian Analysis 1, 515,
+    2006). Without it, a likelihood that is flat towards zero drift would often yield none. That of the offset is a
+    scaled inverse chi-square distribution with OFFSET_PRIOR_DOF degrees of freedom n about the thermal drift q0:
+    a = n q0 / q, b = n.
 
     Args:
         start: estimate before the first block of each part. parts: blocks to tune on.
@@ -100,25 +109,40 @@ def tune_process_noise(
     """
     step, axes = observations.signal.step, len(observations.parameters)
     densities = np.tile(INITIAL_DENSITIES, (axes, 1)) if densities is None else densities
+    added, removed = np.append(np.tile(PRIOR_DOF, axes), 0.0), np.append(np.zeros(4 * axes), OFFSET_PRIOR_DOF)
+    idle = added == 0.0  # densities that the prior does not keep from their least value
+    idle[-1] = True
+    low, high = (
+        np.append(np.tile(limits, axes), offset)
+        for limits, offset in ((MIN_DENSITIES, MIN_OFFSET_DENSITY_V2_PER_S), (MAX_DENSITIES, np.inf))
+    )
+    q = np.append(densities, observations.signal.offset_density)
     for _ in range(MAX_TUNING_ROUNDS):
-        squares, information = _score_terms(observations, parts, start, densities)
-        dof = information * densities * step
-        informative = dof > MIN_INFORMATIVE_DOF
-        fixed_point = (densities * squares + np.array(PRIOR_DOF) / step) / np.where(informative, information, 1.0)
-        limited = np.clip(np.minimum(fixed_point, MAX_DENSITY_GROWTH * densities), MIN_DENSITIES, MAX_DENSITIES)
-        new = np.where(informative, limited, densities)
-        converged = np.abs(np.log(new / densities)) < LOG_DENSITY_TOLERANCE
-        converged |= (dof < 1.0) & (np.array(PRIOR_DOF) == 0.0)
-        densities = new
+        parts = with_offset_density(parts, q[-1])
+        added[-1] = OFFSET_PRIOR_DOF * MIN_OFFSET_DENSITY_V2_PER_S / q[-1]
+        squares, information = _score_terms(observations, parts, start, q[:-1].reshape(axes, -1))
+        dof = information * q * step
+        informative = dof + removed > MIN_INFORMATIVE_DOF
+        fixed_point = q * (squares * q * step + added) / np.where(informative, dof + removed, 1.0)
+        limited = np.clip(np.minimum(fixed_point, MAX_DENSITY_GROWTH * q), low, high)
+        new = np.where(informative, limited, q)
+        converged = np.abs(np.log(new / q)) < LOG_DENSITY_TOLERANCE
+        converged |= (dof < 1.0) & idle
+        q = new
         if converged.all():
             break
-    return densities
+    return q[:-1].reshape(axes, -1), float(q[-1])
+
+
+def with_offset_density(parts: list[TuningPart], density: float) -> list[TuningPart]:
+    """The parts with another spectral density of the readout's offset [V^2/s]."""
+    return [part._replace(signal=part.signal._replace(offset_density=float(density))) for part in parts]
 
 
 def _score_terms(
     observations: BlockObservations, parts: list[TuningPart], start: StateEstimate, densities: Array
 ) -> tuple[Array, Array]:
-    """Sums of r^2 and of N by density, see ``rts_smoother.disturbance_scores``, each of shape (axes, 4)."""
+    """Sums of r^2 and of N by density, see ``rts_smoother.disturbance_scores``, each of shape (4 axes + 1,)."""
     squares, information = np.zeros((2, padded_size(start.mean.size)))
     for part in parts:
         run = filter_blocks(observations, *part, start, densities)
@@ -149,7 +173,8 @@ def noise_posterior(
     by_node[:, :, STIFFNESS_RATE_COLUMN] *= np.exp(nodes)[:, None]
     squares, information = np.empty((2, *by_node.shape))
     for i in (1, 0, 2):  # the middle one first: if the density is known, the others are not needed
-        squares[i], information[i] = _score_terms(observations, parts, start, by_node[i])
+        terms = _score_terms(observations, parts, start, by_node[i])
+        squares[i], information[i] = (term[:-1].reshape(by_node[i].shape) for term in terms)
         dof = (information * by_node * observations.signal.step)[:, :, STIFFNESS_RATE_COLUMN]
         if i == 1 and (dof[1] > MIN_KNOWN_DOF).all():
             axes = len(densities)
@@ -168,10 +193,14 @@ def noise_posterior(
 
 
 def _sum_by_density(sums: Array, axes: int) -> Array:
-    """Sums by state as sums by density, shape (axes, 4): phase and ln A together, stiffness rate, damping, gain."""
+    """Sums by state as sums by density, shape (4 axes + 1,).
+
+    Of each axis phase and ln A together, stiffness rate, damping and gain; then the offset.
+    """
     by_state = sums[: axes * AXIS_STATES].reshape(axes, AXIS_STATES)
     phase_and_log = by_state[:, PHASE] + by_state[:, LOG_AMPLITUDE]
-    return np.stack([phase_and_log, *by_state[:, [STIFFNESS_RATE, DAMPING, GAIN]].T], axis=1)
+    of_axes = np.stack([phase_and_log, *by_state[:, [STIFFNESS_RATE, DAMPING, GAIN]].T], axis=1)
+    return np.append(of_axes, sums[axes * AXIS_STATES])
 
 
 def tuning_parts(signal: BlockSignal) -> list[TuningPart]:

@@ -22,6 +22,7 @@ from estimation.tracker.process_noise import (
     noise_posterior,
     tune_process_noise,
     tuning_parts,
+    with_offset_density,
 )
 from estimation.tracker.to_motion import AxisKnots, axis_knots, join_knots, motion_of_knots
 from scanner.arrays import Array
@@ -82,6 +83,7 @@ def track(
         layout = lay_out_blocks(recording, device, sense, references, end and (end.start, end.length))
         signs, prior = (list(end.signs), continued_prior(end, layout)) if end else ([], None)
         densities = _previous_densities(previous, sense)
+        offset_density = _previous_offset_density(previous, sense)
         knots: list[list[AxisKnots]] = [[] for _ in sense.axes]
         acquired = np.zeros(len(sense.axes), bool)
         results: list[SectionResult] = []
@@ -91,8 +93,11 @@ def track(
             if inherited and prior:
                 section = inherit_tuning(observations, prior, signs, inherited, causal)
             else:
+                if offset_density is not None:
+                    observations = observations.with_offset_density(offset_density)
                 section = tune_section(observations, device, prior, densities, causal)
             observations, densities = section.observations, section.tuning.densities
+            offset_density = section.tuning.offset_density
             signs = signs or section.signs
             measured = with_phase_measurements(observations, phases or {})
             states = average_over_noise(measured, section.prior, section.tuning.posterior, causal, stop - first)
@@ -113,7 +118,7 @@ def track(
                     hint="the resonance did not start; check drive voltage and frequency",
                 )
             axes[name] = motion_of_knots(layout.references[name], join_knots(knots[a]), clock, signs[a])
-        info[sense.channel.name] = _summarise(layout, results, densities)
+        info[sense.channel.name] = _summarise(layout, results, densities, offset_density)
         ends[sense.channel.name] = end_of_track(layout, states.next_prior, signs, section.tuning)
     return Motion(axes, "tracker-causal" if causal else "tracker", info, ends=ends)
 
@@ -197,7 +202,9 @@ def tune_section(
     for _ in range(MAX_NOISE_ROUNDS):
         observations = expand_clipped_blocks(observations, prior or start, densities, causal)
         parts = tuning_parts(observations.signal)
-        densities = tune_process_noise(observations, start, parts, densities)
+        densities, offset_density = tune_process_noise(observations, start, parts, densities)
+        observations = observations.with_offset_density(offset_density)
+        parts = with_offset_density(parts, offset_density)
         found = max(1.0, scale * mean_nis(observations, start, parts, densities))
         if abs(np.log(found / scale)) < LOG_NOISE_TOLERANCE:
             break
@@ -207,7 +214,7 @@ def tune_section(
         observations = expand_clipped_blocks(observations, prior or start, densities, causal)
         parts = tuning_parts(observations.signal)
     posterior = noise_posterior(observations, start, parts, densities)
-    return TunedSection(observations, prior or start, signs, Tuning(densities, posterior, scale))
+    return TunedSection(observations, prior or start, signs, Tuning(densities, posterior, scale, offset_density))
 
 
 def inherit_tuning(
@@ -216,6 +223,7 @@ def inherit_tuning(
     """A section with the process noise and the noise level of an earlier one."""
     noise_var = tuning.noise_scale * observations.signal.noise_var
     observations = replace(observations, signal=observations.signal._replace(noise_var=noise_var))
+    observations = observations.with_offset_density(tuning.offset_density)
     observations = expand_clipped_blocks(observations, prior, tuning.densities, causal)
     return TunedSection(observations, prior, signs, tuning)
 
@@ -229,8 +237,19 @@ def _previous_densities(motion: Motion | None, sense: SenseChannel) -> Array:
     return np.array([list(by_axis[axis].values()) for axis in sense.axes])
 
 
-def _summarise(layout: BlockLayout, results: Sequence[SectionResult], densities: Array) -> dict[str, object]:
-    """Quality figures of one channel; ``walk`` has the process noise of its last section by axis."""
+def _previous_offset_density(motion: Motion | None, sense: SenseChannel) -> float | None:
+    """Density of the readout's offset [V^2/s] of one channel in an earlier motion; None if there is none."""
+    channel_info = {} if motion is None else motion.info.get(sense.channel.name, {})
+    return channel_info.get("offset_walk") if isinstance(channel_info, Mapping) else None
+
+
+def _summarise(
+    layout: BlockLayout, results: Sequence[SectionResult], densities: Array, offset_density: float | None
+) -> dict[str, object]:
+    """Quality figures of one channel; ``walk`` has the process noise of its last section by axis.
+
+    ``offset_walk`` is that of the readout's offset.
+    """
     blocks, used_fraction, noise_var, mean_nis, log_likelihood = np.array(results).T
     names = ("white_phase", "stiffness_trend", "damping", "gain")
     return {
@@ -243,4 +262,5 @@ def _summarise(layout: BlockLayout, results: Sequence[SectionResult], densities:
             axis: dict(zip(names, row.tolist(), strict=True))
             for axis, row in zip(layout.sense.axes, densities, strict=True)
         },
+        "offset_walk": offset_density,
     }

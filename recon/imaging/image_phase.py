@@ -2,13 +2,15 @@
 
 Grid the intensity with the current motion, measure the remaining phase error in each time slice
 (``bidirectional_phase``: least squares over all samples of one place), give phase plus error to the smoother as
-measurements, and repeat. Each round replaces all measurements by those around the improved motion, so no measurement
-counts twice. The derivation is in docs/explanation/image_phase.md.
+measurements, and repeat. Each round replaces the measurements by those around the improved motion, so no measurement
+counts twice. A slice that the improved picture does not determine keeps the measurement of the round before: without
+it the motion would drift away, the next picture would determine the slice again, and the rounds would alternate. The
+derivation is in docs/explanation/image_phase.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -74,19 +76,24 @@ def refine_motion(
     if not smoothers:
         return motion, []
     initial_sd = {name: _rms(motion.axes[name].phase_sd) for name in refined}
-    rounds, converged = 0, False
+    rounds, ended = 0, False
     smoothed_with: dict[str, str] = {}
-    while rounds < MAX_ROUNDS and not converged:
+    phases: dict[str, PhaseMeasurement] = {}
+    before = motion
+    while rounds < MAX_ROUNDS and not ended:
         # In the first round amplitudes are wrong too and change, so slices far apart in time share no picture.
         windows = registration_windows(motion, intensity, PERIODS_PER_PICTURE if rounds else PERIODS_PER_SLICE)
         errors = measure_motion_phase_errors(beam_motion(motion, device, recording.start), intensity, grid, windows)
-        phases = {name: _measured_phase(errors, motion.axes[name], name, flips.get(name, False)) for name in refined}
+        found = {name: _measured_phase(errors, motion.axes[name], name, flips.get(name, False)) for name in refined}
+        # The first round compares each slice with a picture of its own.
+        phases = {name: keep_determined(phases[name], found[name]) for name in refined} if rounds > 1 else found
         smoothed = {way: _smooth(recording, device, smooth, phases, flips) for way, smooth in smoothers.items()}
-        smoothed_with = {name: _better_smoother(smoothed, name, initial_sd[name]) for name in refined}
-        axes = {name: smoothed[smoothed_with[name]].axes[name] for name in refined}
-        converged = all(_has_converged(motion.axes[name], axes[name]) for name in refined)
-        motion = replace(motion, axes={**motion.axes, **axes})
-        rounds += 1
+        ways = {name: _better_smoother(smoothed, name, initial_sd[name]) for name in refined}
+        axes = {name: smoothed[ways[name]].axes[name] for name in refined}
+        improved = replace(motion, axes={**motion.axes, **axes})
+        ended, chosen = end_of_rounds(before, motion, improved, refined)
+        smoothed_with = ways if chosen is improved else smoothed_with
+        before, motion, rounds = motion, chosen, rounds + 1
     measured = {name: int(np.isfinite(phases[name].sd).sum()) for name in refined}
     info = {"rounds": rounds, "slices": len(errors), "told": measured, "smoothed_with": smoothed_with}
     notes = [_note(name, measured[name], len(errors), smoothed_with[name] != motion.estimator) for name in refined]
@@ -153,6 +160,32 @@ def _measured_phase(errors: list[PhaseError], axis: AxisMotion, name: str, flipp
     value, sd = np.array([getattr(error, name) for error in errors]).T
     phase = axis.phase[nearest] - (np.pi if flipped else 0.0)  # smoothing happens before the user's flips
     return PhaseMeasurement(axis.time[nearest], phase + value, sd)
+
+
+def keep_determined(earlier: PhaseMeasurement, found: PhaseMeasurement) -> PhaseMeasurement:
+    """Measurements of this round, and where they determine nothing those of the round before of the same slices."""
+    if earlier.time.size != found.time.size:
+        return found
+    determined = np.isfinite(found.sd)
+    return PhaseMeasurement(*(np.where(determined, new, old) for new, old in zip(found, earlier, strict=True)))
+
+
+def end_of_rounds(before: Motion, motion: Motion, improved: Motion, names: Sequence[str]) -> tuple[bool, Motion]:
+    """Whether the rounds end, and the motion to go on with.
+
+    They end when the motion has converged. They also end when it is again that of two rounds before: each of the two is
+    consistent with the measurements about the other, and the one with the smaller stated phase error is used.
+
+    Args:
+        before, motion, improved: of three consecutive rounds.
+        names: of the refined axes.
+    """
+    if all(_has_converged(motion.axes[name], improved.axes[name]) for name in names):
+        return True, improved
+    if before is motion or not all(_has_converged(before.axes[name], improved.axes[name]) for name in names):
+        return False, improved
+    variances = [sum(_rms(each.axes[name].phase_sd) ** 2 for name in names) for each in (motion, improved)]
+    return True, motion if variances[0] < variances[1] else improved
 
 
 def _better_smoother(smoothed: Mapping[str, Motion], name: str, initial_sd: float) -> str:

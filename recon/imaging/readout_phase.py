@@ -52,7 +52,7 @@ UNDESCRIBED_DELAY_SD_S = 0.5e-6
 """Standard deviation of the delay of electronics that no device file describes, where no picture measures it: cables,
 converters and amplifiers are late by up to a microsecond."""
 REPORTED_SDS = 3.0
-"""Number of standard deviations from which a phase error is reported in a note: 0.3 % of correct readouts exceed it."""
+"""Standard deviations from which a phase error is reported, or a growing change refutes it: 0.3 % of noise exceeds."""
 MAX_SLICE_SPREAD_RAD = 2.0 * DRIFT_SDS_RAD[-1]
 """Largest difference between the phase errors of two slices: two standard deviations of the largest drift. In a pattern
 that repeats within the reach of the registration, slices agree on no period."""
@@ -157,6 +157,9 @@ def remove_readout_phase(
 ) -> tuple[Motion, list[PhaseError], Mapping[str, ReadoutPhase]]:
     """Correct a motion by the phase error of its readout that the picture shows.
 
+    A picture about the corrected motion that determines no phase, or a larger change than the round before, refutes the
+    correction: the axis then counts as undetermined. A pattern that repeats would else alternate between two phases.
+
     Args:
         motion: of both axes.
         errors: its phase errors.
@@ -168,24 +171,29 @@ def remove_readout_phase(
         for electronics that nobody described.
     """
     corrected, found = motion, dict[str, ReadoutPhase]()
+    changes: dict[str, list[float]] = {name: [] for name in AXES}
+    refuted: set[str] = set()
     for last in (False,) * (MAX_ROUNDS - 1) + (True,):
-        change, axes = 0.0, dict(motion.axes)
+        axes = dict(motion.axes)
         for column, name in enumerate(AXES):
             axis = motion.axes[name]
             measured = measured_phase_error(errors, column, axis, corrected.axes[name])
             times = _posterior_times(axis, measured[0])
             sense_sd = np.interp(times, axis.time, axis.phase_sd)
             estimate = estimate_readout_phase(*measured, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
-            if estimate is None:
-                found.pop(name, None)  # an earlier round may have determined one
+            if estimate is not None:
+                axes[name] = advance_axis(axis, estimate)
+                moved = axes[name].phase - corrected.axes[name].phase
+                changes[name].append(float(np.max(np.abs(moved) / axes[name].phase_sd)))
+            if name in found and (estimate is None or changes[name][-1] > max(changes[name][-2], REPORTED_SDS)):
+                refuted.add(name)  # rounds that converge change less and less, down to their noise
+            if estimate is None or name in refuted:
+                found.pop(name, None)
                 axes[name] = widen_undetermined(axis)
             else:
                 found[name] = estimate
-                axes[name] = advance_axis(axis, estimate)
-                moved = axes[name].phase - corrected.axes[name].phase
-                change = max(change, float(np.max(np.abs(moved) / axes[name].phase_sd)))
         before, corrected = corrected, replace(motion, axes=axes)
-        if last or change < CONVERGENCE_SD:
+        if last or all(changes[name][-1] < CONVERGENCE_SD for name in found):
             break
         errors = register(corrected)
     return corrected, _errors_after(errors, before, corrected), found

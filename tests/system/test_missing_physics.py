@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import linregress
 
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.model import Model
@@ -64,7 +65,13 @@ def test_the_demodulator_lag_changes_over_a_sweep() -> None:
     nominal = example["without_filters"](true)
     axis = nominal.axis("x")
     improved = replace(nominal, axes={"x": replace(axis, terms={"demodulator-lag": {"f_c": 40950.0}})})
-    sweep = (31440.0, 31540.0)
-    without, with_term = (example["phase_over_sweep"](true, device, sweep) for device in (nominal, improved))
-    assert np.ptp(without) > 0.1
+    sweep = np.arange(31400.0, 31541.0, 8.0)
+    lag = example["lag_of_filters"](true, nominal, sweep)
+    assert np.ptp(lag) == pytest.approx(0.12, abs=0.01)
+    without, sd = example["phase_over_sweep"](true, nominal, sweep)
+    assert np.all(np.abs(without - lag) < 1.96 * sd)
+    fit = linregress(lag, without)  # the standard error is that of the scatter over independent recordings
+    assert fit.slope > 3.0 * fit.stderr
+    assert abs(fit.slope - 1.0) < 3.0 * fit.stderr
+    with_term, _ = example["phase_over_sweep"](true, improved, (31440.0, 31540.0))
     assert np.max(np.abs(with_term)) < 0.03

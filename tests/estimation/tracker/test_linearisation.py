@@ -9,7 +9,7 @@ from benchmarks.clipped import simulate_transimpedance
 from estimation.tracker import block_tracking, observations, rts_smoother, track
 from estimation.tracker.averaged_dynamics import average_cycle, axis_parameters
 from estimation.tracker.block_tracking import track_blocks
-from estimation.tracker.filter_run import OFFSET_DENSITY_V2_PER_S, FilterRun, filter_blocks
+from estimation.tracker.filter_run import FilterRun, filter_blocks
 from estimation.tracker.initial_state import initial_estimate, resolve_signs
 from estimation.tracker.linearisation import empty_linearisation, expected_projections, predict
 from estimation.tracker.observations import BlockObservations
@@ -51,7 +51,7 @@ def rauch_tung_striebel(prepared: BlockObservations, linear, run: FilterRun) -> 
             x,
             P,
             WALK,
-            OFFSET_DENSITY_V2_PER_S,
+            prepared.signal.offset_density,
             linear,
             taken,
         )
@@ -185,7 +185,7 @@ def test_score_is_the_derivative_of_the_likelihood() -> None:
 def test_windows_give_the_result_of_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = prepared_of(8)
     start, _ = resolve_signs(prepared, initial_estimate(prepared, devices.load("imaging")))
-    walk = tune_process_noise(prepared, start, tuning_parts(prepared.signal))[None]
+    walk = tune_process_noise(prepared, start, tuning_parts(prepared.signal))[0][None]
     (whole,) = track_blocks(prepared, start, walk)
     monkeypatch.setattr(block_tracking, "WINDOW_BLOCKS", 10)
     monkeypatch.setattr(block_tracking, "LOOKAHEAD_BLOCKS", 35)

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from estimation.estimate import default_estimator, estimate
-from estimation.tracker import track
+from estimation.tracker import PhaseMeasurement, track
 from estimation.tracker.averaged_dynamics import axis_parameters
 from estimation.tracker.drive_only import NO_READOUT, drive_only_observations, find_steady_motion, track_drive_only
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis, truth_from_simulation
-from recon.imaging.image_phase import refine_motion
+from recon.imaging.image_phase import end_of_rounds, keep_determined, refine_motion
 from recon.imaging.picture import Grid
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
@@ -170,6 +170,48 @@ def test_the_picture_improves_a_poor_sense_signal_and_does_not_change_a_good_one
     for name in "xy":
         assert after[name] < 0.5 * before[name]
         assert after[name] < 0.15
+
+
+def test_rounds_do_not_alternate_where_a_slice_is_hardly_determined() -> None:
+    # About the improved motion the picture does not determine the last slice of y; about a motion without it, it does.
+    drift = {"x": 0.00183, "y": -0.00168}
+    recording, truth = simulate_experiment(
+        Experiment(target="cell", duration=0.02, sample_rate=SAMPLE_RATE_HZ, drift=drift, drift_tau=0.01), seed=104
+    )
+    noise = np.random.default_rng(0).normal(0.0, 1.0, recording["sense"].size)
+    poor = without(recording, sense=recording["sense"].read() + noise)
+    motion, _ = refine_motion(poor, poor.device, track(poor, poor.device), poor["intensity"], GRID, {})
+    assert max(rmse(motion, truth).values()) < 0.15
+    assert motion.info["picture"]["rounds"] < 6  # type: ignore[index]
+
+
+def test_an_undetermined_slice_keeps_its_earlier_measurement() -> None:
+    time = np.array([1.0, 2.0])
+    earlier = PhaseMeasurement(time, np.array([0.1, 0.2]), np.array([0.01, 0.02]))
+    found = PhaseMeasurement(time, np.array([0.15, np.nan]), np.array([0.03, np.inf]))
+    kept = keep_determined(earlier, found)
+    np.testing.assert_array_equal(kept.phase, [0.15, 0.2])
+    np.testing.assert_array_equal(kept.sd, [0.03, 0.02])
+    other = PhaseMeasurement(time[:1], found.phase[1:], found.sd[1:])
+    assert keep_determined(earlier, other) is other
+
+
+def test_rounds_end_where_two_motions_alternate_with_the_smaller_stated_error() -> None:
+    recording, _ = shared_electrode()
+    start = track(recording, recording.device)
+
+    def moved(by: float, sd: float) -> Motion:
+        axes = {
+            name: replace(axis, phase=axis.phase + by, phase_sd=np.full(axis.time.size, sd))
+            for name, axis in start.axes.items()
+        }
+        return replace(start, axes=axes)
+
+    first, second, third = moved(0.0, 0.01), moved(0.1, 0.02), moved(1e-4, 0.01)
+    assert end_of_rounds(first, second, third, "xy") == (True, third)
+    assert end_of_rounds(second, third, second, "xy") == (True, third)
+    assert end_of_rounds(moved(-0.1, 0.01), second, third, "xy") == (False, third)  # still moving
+    assert end_of_rounds(second, first, third, "xy") == (True, third)  # converged
 
 
 def test_a_flipped_axis_has_the_same_phase_plus_pi() -> None:

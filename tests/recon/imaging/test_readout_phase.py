@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimation.tracker import track
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.targets import make_target
 from recon.evaluation import truth_from_simulation
-from recon.imaging.readout_phase import correlate_matern32, estimate_readout_phase
+from recon.imaging.bidirectional_phase import PhaseError, PhaseErrorParts, PhaseEstimate
+from recon.imaging.readout_phase import correlate_matern32, estimate_readout_phase, remove_readout_phase
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
 from scanner.recording import Recording
@@ -122,6 +124,32 @@ def test_a_correctly_stated_readout_keeps_its_precision() -> None:
     for axis in "xy":
         assert result.evaluation[axis].phase_rmse < 1.1 * alone.evaluation[axis].phase_rmse + np.radians(0.002)
     assert not any("late" in note or "early" in note for note in result.notes)
+
+
+def phase_errors(x: float, y: float) -> list[PhaseError]:
+    """Errors of three slices [deg] with standard deviations of 0.05 degrees; NaN determines none."""
+    time, sd = 1e-3 * np.arange(16.0), float(np.radians(0.05))
+    pair = [PhaseEstimate(float(np.radians(v)), float("inf") if np.isnan(v) else sd) for v in (x, y)]
+    value, sds = np.tile(np.array(pair).T[:, None], (1, 16, 1))
+    return [PhaseError(start + 8e-3, *pair, PhaseErrorParts(start + time, value, sds)) for start in (0.0, 0.02, 0.04)]
+
+
+@pytest.mark.parametrize(("second", "third"), [(float("nan"), 1.0), (2.0, 1.0)])
+def test_a_correction_that_the_next_picture_refutes_is_not_applied(second: float, third: float) -> None:
+    motion = track(imaging()[0], imaging()[0].device)
+    rounds = iter([phase_errors(second, 0.0), phase_errors(third, 0.0), phase_errors(third, 0.0)])
+    corrected, _, found = remove_readout_phase(motion, phase_errors(1.0, 0.5), lambda _: next(rounds))
+    assert set(found) == {"y"}
+    np.testing.assert_array_equal(corrected.axes["x"].phase, motion.axes["x"].phase)
+    assert np.all(corrected.axes["x"].phase_sd > 5.0 * motion.axes["x"].phase_sd)
+    assert found["y"].value == pytest.approx(np.radians(0.5), abs=np.radians(0.05))
+
+
+def test_a_correction_that_the_next_picture_confirms_is_applied() -> None:
+    motion = track(imaging()[0], imaging()[0].device)
+    rounds = iter([phase_errors(0.1, 0.0), phase_errors(0.0, 0.0)])
+    _, _, found = remove_readout_phase(motion, phase_errors(1.0, 0.5), lambda _: next(rounds))
+    assert found["x"].value == pytest.approx(np.radians(1.1), abs=np.radians(0.05))
 
 
 def test_a_specimen_without_detail_gives_a_wide_interval_and_a_note() -> None:
