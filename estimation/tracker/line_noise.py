@@ -75,17 +75,29 @@ def line_noise_variance(
         return np.full(1 + len(lines), noise_var)
     chosen = regular[np.linspace(0, regular.size - 1, min(regular.size, MAX_SPECTRUM_BLOCKS)).astype(int)]
     tables, group = np.unique(projections.table_w[chosen], axis=0, return_inverse=True)
-    powers: list[list[Array]] = [[] for _ in range(1 + len(lines))]
+    values: list[list[Array]] = [[] for _ in range(1 + len(lines))]
+    weights: list[list[Array]] = [[] for _ in range(1 + len(lines))]
     for i, table_w in enumerate(tables):
         samples = np.stack([channel.read(int(starts[k]), int(starts[k]) + length) for k in chosen[group.ravel() == i]])
-        for values, found in zip(powers, _periodograms(samples, channel.sample_rate, lines, table_w), strict=True):
-            values.append(found.ravel())
-    padded = _padded_length(length)
-    counts = np.array([sum(map(np.size, values)) for values in powers])
-    medians = np.array([np.median(np.concatenate(values)) for values in powers])
-    log_ratio = np.log(np.maximum(medians / (np.log(2.0) * noise_var), np.finfo(float).tiny))
-    variance = LOG_MEDIAN_SD**2 * HANN_BANDWIDTH_BINS * padded / length / counts
+        for j, (power, share) in enumerate(_periodograms(samples, channel.sample_rate, lines, table_w)):
+            values[j].append(power.ravel())
+            weights[j].append(np.broadcast_to(share, power.shape).ravel())
+    medians, sums = np.array(
+        [_weighted_median(np.concatenate(v), np.concatenate(w)) for v, w in zip(values, weights, strict=True)]
+    ).T
+    known = sums > 0.0
+    log_ratio = np.zeros(sums.size)
+    log_ratio[known] = np.log(np.maximum(medians[known] / (np.log(2.0) * noise_var), np.finfo(float).tiny))
+    counts = sums * length / (HANN_BANDWIDTH_BINS * _padded_length(length))
+    variance = LOG_MEDIAN_SD**2 / np.maximum(counts, np.finfo(float).eps)
     return noise_var * np.exp(shrink_to_white(log_ratio, variance))
+
+
+def _weighted_median(values: Array, weights: Array) -> tuple[float, float]:
+    """Value below which half of the weight lies, and the sum of the weights."""
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(below, 0.5 * below[-1])]]), float(below[-1])
 
 
 def _padded_length(length: int) -> int:
@@ -94,7 +106,7 @@ def _padded_length(length: int) -> int:
     return -(-length // step) * step
 
 
-def _periodograms(samples: Array, rate: float, lines: Index, table_w: Array) -> list[Array]:
+def _periodograms(samples: Array, rate: float, lines: Index, table_w: Array) -> list[tuple[Array, Array]]:
     """Powers near the constant and each line, of the residuals about the fit of lines and slips [V^2].
 
     The transform of the residuals is that of the samples minus the fit's coefficients times those of its rows.
@@ -104,7 +116,8 @@ def _periodograms(samples: Array, rate: float, lines: Index, table_w: Array) -> 
         lines: (reference, order) of each line, shape (lines, 2). table_w: shape (references,) [rad/s].
 
     Returns:
-        Arrays of shape (blocks, bins). The mean of white noise is its variance.
+        By line: powers, shape (blocks, bins), of which the mean of white noise is its variance, and the part of white
+        noise that the fit leaves in each bin, divided among the lines that use the bin, shape (bins,).
     """
     length = samples.shape[1]
     position, padded = sample_offsets(length, rate) * (rate / length), _padded_length(length)
@@ -114,11 +127,15 @@ def _periodograms(samples: Array, rate: float, lines: Index, table_w: Array) -> 
     inverse_gram = np.linalg.pinv(rows @ rows.T, hermitian=True)
     line_bins = np.append(0.0, table_w[lines[:, 0]] * lines[:, 1]) / (2.0 * np.pi) * length / rate
     distance = np.abs(np.arange(padded // 2 + 1) * length / padded - line_bins[:, None])
-    near = [np.flatnonzero((d >= MIN_DISTANCE_BINS) & (d <= MAX_DISTANCE_BINS)) for d in distance]
-    of_rows, of_samples = (np.fft.rfft(window * each, padded)[:, np.concatenate(near)] for each in (rows, samples))
-    power = np.abs(of_samples - samples @ rows.T @ inverse_gram @ of_rows) ** 2
-    white = np.sum(window**2) - np.einsum("ib,ij,jb->b", of_rows.conj(), inverse_gram, of_rows).real
-    return np.split(power / white, np.cumsum([bins.size for bins in near])[:-1], axis=1)
+    near = (distance >= MIN_DISTANCE_BINS) & (distance <= MAX_DISTANCE_BINS)
+    used = np.flatnonzero(near.any(axis=0))
+    of_rows, of_samples = (np.fft.rfft(window * each, padded)[:, used] for each in (rows, samples))
+    residual = of_samples - samples @ rows.T @ inverse_gram @ of_rows
+    fitted = np.einsum("ib,ij,jb->b", of_rows.conj(), inverse_gram, of_rows).real / np.sum(window**2)
+    left = np.maximum(1.0 - fitted, np.finfo(float).eps)
+    power = np.abs(residual) ** 2 / (left * np.sum(window**2))
+    share = left / near.sum(axis=0)[used]
+    return [(power[:, mine], share[mine]) for mine in near[:, used]]
 
 
 def shrink_to_white(log_ratio: Array, variance: Array) -> Array:
