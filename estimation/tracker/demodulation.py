@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import accumulate, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -78,11 +79,14 @@ def harmonic_basis(length: int, rate: float, lines: Index, table_w: Array) -> Ar
         lines: (reference, order) of each line, shape (lines, 2).
         table_w: angular frequency of each reference, shape (references,) [rad/s].
     """
-    fundamental = np.exp(1j * np.outer(table_w, sample_offsets(length, rate)))
-    powers = np.cumprod(np.broadcast_to(fundamental, (lines[:, 1].max(initial=1), *fundamental.shape)), axis=0)
-    phasors = powers[lines[:, 1] - 1, lines[:, 0]]
-    rows = np.stack([phasors.real, phasors.imag], axis=1).reshape(-1, length)
-    return np.concatenate([np.ones((1, length)), rows])
+    lowest = max(int(np.gcd.reduce(lines[:, 1])), 1)  # all orders are multiples of it
+    first = np.exp(1j * np.outer(lowest * table_w, sample_offsets(length, rate)))
+    powers = list(accumulate(repeat(first, lines[:, 1].max(initial=1) // lowest), np.multiply))
+    out = np.ones((1 + 2 * len(lines), length))
+    for row, (reference, order) in zip(range(1, len(out), 2), lines, strict=True):
+        phasor = powers[order // lowest - 1][reference]
+        out[row], out[row + 1] = phasor.real, phasor.imag
+    return out
 
 
 def project_blocks(

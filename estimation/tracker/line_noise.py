@@ -14,15 +14,14 @@ from estimation.tracker.demodulation import (
     NoiseSpectrum,
     Projections,
     harmonic_basis,
-    least_squares_coefficients,
     sample_offsets,
 )
 from scanner.arrays import Array, Index
 from scanner.channel import Channel
 
-MAX_SPECTRUM_BLOCKS = 24
+MAX_SPECTRUM_BLOCKS = 12
 """Blocks from which the noise near the lines is estimated, spread over the section: with some four independent values
-each they determine a variance to 15 %. More would slow the tracker down."""
+each they determine a variance to 21 %. More would slow the tracker down."""
 
 MIN_DISTANCE_BINS, MAX_DISTANCE_BINS = 2.0, 5.0
 """Distances from a line at which the noise is measured, in units of the inverse length of a block: beyond what the fit
@@ -74,12 +73,14 @@ def line_noise_variance(
     if not regular.size or not noise_var > 0.0:
         return np.full(1 + len(lines), noise_var)
     chosen = regular[np.linspace(0, regular.size - 1, min(regular.size, MAX_SPECTRUM_BLOCKS)).astype(int)]
-    tables, group = np.unique(projections.table_w[chosen], axis=0, return_inverse=True)
+    geometry = projections.geometry[chosen]
     values: list[list[Array]] = [[] for _ in range(1 + len(lines))]
     weights: list[list[Array]] = [[] for _ in range(1 + len(lines))]
-    for i, table_w in enumerate(tables):
-        samples = np.stack([channel.read(int(starts[k]), int(starts[k]) + length) for k in chosen[group.ravel() == i]])
-        for j, (power, share) in enumerate(_periodograms(samples, channel.sample_rate, lines, table_w)):
+    for g in np.unique(geometry):
+        mine = chosen[geometry == g]
+        samples = np.stack([channel.read(int(starts[k]), int(starts[k]) + length) for k in mine])
+        table_w, moments = projections.table_w[mine[0]], projections.grams[g]
+        for j, (power, share) in enumerate(_periodograms(samples, channel.sample_rate, lines, table_w, moments)):
             values[j].append(power.ravel())
             weights[j].append(np.broadcast_to(share, power.shape).ravel())
     medians, sums = np.array(
@@ -106,7 +107,9 @@ def _padded_length(length: int) -> int:
     return -(-length // step) * step
 
 
-def _periodograms(samples: Array, rate: float, lines: Index, table_w: Array) -> list[tuple[Array, Array]]:
+def _periodograms(
+    samples: Array, rate: float, lines: Index, table_w: Array, moments: Array
+) -> list[tuple[Array, Array]]:
     """Powers near the constant and each line, of the residuals about the fit of lines and slips [V^2].
 
     The transform of the residuals is that of the samples minus the fit's coefficients times those of its rows.
@@ -114,24 +117,29 @@ def _periodograms(samples: Array, rate: float, lines: Index, table_w: Array) -> 
     Args:
         samples: of the blocks, shape (blocks, length) [V].
         lines: (reference, order) of each line, shape (lines, 2). table_w: shape (references,) [rad/s].
+        moments: of the blocks, see ``Projections.grams``, shape (3, m, m).
 
     Returns:
         By line: powers, shape (blocks, bins), of which the mean of white noise is its variance, and the part of white
         noise that the fit leaves in each bin, divided among the lines that use the bin, shape (bins,).
     """
     length = samples.shape[1]
-    position, padded = sample_offsets(length, rate) * (rate / length), _padded_length(length)
+    per_second, padded = rate / length, _padded_length(length)
+    position = sample_offsets(length, rate) * per_second
     window = np.cos(np.pi * position) ** 2
     table = harmonic_basis(length, rate, lines, table_w)
-    rows = np.concatenate([table, table * position])
-    inverse_gram = np.linalg.pinv(rows @ rows.T, hermitian=True)
+    rows = table, table * position
+    plain, slope, square = moments * per_second ** np.arange(3)[:, None, None]
+    inverse_gram = np.linalg.pinv(np.block([[plain, slope], [slope, square]]), hermitian=True)
     line_bins = np.append(0.0, table_w[lines[:, 0]] * lines[:, 1]) / (2.0 * np.pi) * length / rate
     distance = np.abs(np.arange(padded // 2 + 1) * length / padded - line_bins[:, None])
     near = (distance >= MIN_DISTANCE_BINS) & (distance <= MAX_DISTANCE_BINS)
     used = np.flatnonzero(near.any(axis=0))
-    of_rows, of_samples = (np.fft.rfft(window * each, padded)[:, used] for each in (rows, samples))
-    residual = of_samples - samples @ rows.T @ inverse_gram @ of_rows
-    fitted = np.einsum("ib,ij,jb->b", of_rows.conj(), inverse_gram, of_rows).real / np.sum(window**2)
+    *of_rows, of_samples = (np.fft.rfft(window * each, padded)[:, used] for each in (*rows, samples))
+    transformed = np.concatenate(of_rows)
+    solved = inverse_gram @ transformed
+    residual = of_samples - np.concatenate([samples @ each.T for each in rows], axis=1) @ solved
+    fitted = np.sum(transformed.conj() * solved, axis=0).real / np.sum(window**2)
     left = np.maximum(1.0 - fitted, np.finfo(float).eps)
     power = np.abs(residual) ** 2 / (left * np.sum(window**2))
     share = left / near.sum(axis=0)[used]
@@ -173,22 +181,20 @@ def noise_spectrum(line_noise: Array, noise_var: float, length: int) -> NoiseSpe
     return NoiseSpectrum(white / noise_var, excess / noise_var)
 
 
-def initial_offset_density(projections: Projections, noise_var: float, step: float) -> float:
+def initial_offset_density(means: Array, samples: float, noise_var: float, step: float) -> float:
     """Density of a random walk of the offset whose increments are as large as those of the blocks' means [V^2/s].
 
     The tuning starts from it. From a small density it would first attribute hum to the motion, and end there. The
     median of the increments is removed, because a steady drift of the amplitude changes the mean as well.
 
     Args:
-        projections: of consecutive blocks.
+        means: of consecutive blocks, shape (blocks,) [V]. samples: typical number in a block.
         noise_var: variance of white noise as dense as the noise near the constant [V^2].
         step: from block to block [s].
     """
-    used = projections.counts > projections.sums.shape[1]
-    mean, counts = least_squares_coefficients(projections)[used, 0], projections.counts[used]
-    if mean.size < 2:
+    if means.size < 2:
         return MIN_OFFSET_DENSITY_V2_PER_S
-    increments, noise = np.diff(mean), 2.0 * noise_var / float(np.median(counts))
+    increments, noise = np.diff(means), 2.0 * noise_var / samples
     variance = float(np.median((increments - np.median(increments)) ** 2)) / MEDIAN_CHI_SQUARE
     error = noise * CHI_SQUARE_MEDIAN_SD / MEDIAN_CHI_SQUARE / np.sqrt(increments.size)
     if variance - noise < MIN_INCREMENT_SDS * error:

@@ -236,6 +236,9 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
     whitened, moments, _, solvers = whiten_projections(
         projections.sums, projections.grams, projections.geometry, spectrum
     )
+    enough = projections.counts > projections.sums.shape[1]
+    means = np.einsum("kj,kj->k", solvers[projections.geometry[enough], 0], whitened[enough])
+    samples = float(np.median(projections.counts[enough])) if enough.any() else 0.0
     signal = BlockSignal(
         psi=layout.psi[part],
         w=w,
@@ -254,7 +257,7 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
         solvers=solvers,
         geometry=projections.geometry,
         noise_var=noise,
-        offset_density=initial_offset_density(projections, line_noise[0], length / channel.sample_rate),
+        offset_density=initial_offset_density(means, samples, line_noise[0], length / channel.sample_rate),
         external_phase=np.zeros(w.shape),
         external_var=np.full(w.shape, np.inf),
         amplitude_table=np.stack([amplitude_table(axis, sense.readout) for axis in layout.axes]),
