@@ -82,6 +82,19 @@ def test_bleaching_is_a_gain() -> None:
     assert mean_error(pixel, corrected, clean) <= 1.02 * mean_error(pixel, best, clean)
 
 
+@pytest.mark.parametrize("noise_sd", [0.02, NOISE_SD])
+def test_the_error_of_a_slow_gain_is_as_stated(noise_sd: float) -> None:
+    """The pattern of the crossings modulates the gain, which does not count as noise."""
+    pixel, clean = crossing_scan(0.02)
+    gain = np.linspace(1.0, 0.6, clean.size)
+    for seed in range(3):
+        noise = noise_sd * np.random.default_rng(seed).standard_normal(clean.size)
+        found = estimate(pixel, clean * gain + noise, PIXELS**2, RATE, "gain")
+        assert found is not None
+        error = found.values[: clean.size // found.block] - block_means(gain / gain.mean() - 1.0, found.block)
+        assert 0.6 < np.std(error) / found.sd < 1.5
+
+
 def test_a_steady_detector_stays_as_it_is() -> None:
     pixel, clean = crossing_scan(0.02)
     values = clean + NOISE_SD * np.random.default_rng(3).standard_normal(clean.size)
