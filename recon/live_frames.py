@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from estimation.tracker import track_end
+from recon.estimated_motion import EstimatedMotion
 from recon.imaging.bidirectional_phase import slow_period
 from recon.imaging.intensity_gridding import add_pictures, grid_intensity
 from recon.imaging.picture import Grid, Picture
@@ -26,7 +27,8 @@ from recon.imaging.picture_estimate import (
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
 from recon.imaging.readout_phase import ReadoutPhase, apply_readout_phase, update_readout_phase
 from recon.io.output import write_tiff
-from recon.pipeline import EstimatedMotion, estimate_motion, measure_phase_errors, wants_readout_phase
+from recon.phase_and_drift import measure_phase_errors, wants_readout_phase
+from recon.pipeline import estimate_motion
 from recon.preparation import prepare_frame, select_device
 from recon.quality.defects import unrecoverable_intervals
 from recon.quality.sensor_noise import check_sensor_noise

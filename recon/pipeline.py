@@ -1,4 +1,4 @@
-"""From a recording to a picture: prepare, estimate, grid, assess.
+"""From a recording to a picture: prepare, estimate, correct, grid, assess.
 
 Each step is a function that takes what the step before returned (:func:`reconstruct` lists them).
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,20 +15,15 @@ from tqdm import tqdm
 
 from estimation.amplitude_calibration import motion_calibration_sd
 from estimation.estimate import default_estimator, estimate
-from estimation.optics.correction import beam_motion
+from recon.estimated_motion import EstimatedMotion
 from recon.evaluation import Truth, evaluate_axis
 from recon.field_check import check_field, check_units, own_half_angle
-from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors
 from recon.imaging.image_phase import refine_motion
-from recon.imaging.intensity_correction import correct_drift, describe_drift, measure_intensity_drift
-from recon.imaging.intensity_drift import IntensityDrift
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
 from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.picture_estimate import estimate_picture
 from recon.imaging.pixel_noise import measure_noise
-from recon.imaging.readout_phase import ReadoutPhase, describe_readout_phase, remove_readout_phase
-from recon.imaging.sample_motion import SampleMotion
-from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion, relative_to_sample
+from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.notes import (
     describe_clock_jumps,
@@ -38,10 +32,11 @@ from recon.notes import (
     describe_long_frames,
     describe_motion,
 )
+from recon.phase_and_drift import correct_phase_and_drift
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
-from recon.quality.dropped_samples import find_timing_break, first_late_slice, restore_timing, slices_aligned
+from recon.quality.dropped_samples import find_timing_break, restore_timing, slices_aligned
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
 from recon.reconstruction import Options, Reconstruction
@@ -51,40 +46,6 @@ from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
-
-ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor")
-"""Estimators whose motion is corrected by the phase error that the picture shows. ``picture`` has its phase from the
-picture already; the other estimators serve for comparison, as their papers describe them."""
-
-
-@dataclass(frozen=True)
-class EstimatedMotion:
-    """The motion of a prepared recording, and the pixels that it is mapped to.
-
-    Attributes:
-        prepared: the recording.
-        motion: of the mirror.
-        grid: the pixels over the device's field of view, else over the range of the motion.
-        field_notes, motion_notes: what a reader has to know of the field and of the motion, a line each.
-        phase_errors: of the motion, as the picture shows them; None where they were not measured.
-        readout_phase, intensity_drift, sample_motion: as in ``Reconstruction``.
-    """
-
-    prepared: PreparedRecording
-    motion: Motion
-    grid: Grid
-    field_notes: list[str]
-    motion_notes: list[str]
-    phase_errors: list[PhaseError] | None = None
-    readout_phase: Mapping[str, ReadoutPhase] = field(default_factory=dict)
-    intensity_drift: Sequence[IntensityDrift | None] = ()
-    sample_motion: SampleMotion | None = None
-
-    @property
-    def beam(self) -> Motion:
-        """Motion of the beam over the sample: the mirror's, corrected for the optics and for a motion of the sample."""
-        beam = beam_motion(self.motion, self.prepared.device, self.prepared.origin)
-        return relative_to_sample(beam, self.sample_motion, self.grid)
 
 
 @dataclass(frozen=True)
@@ -141,10 +102,9 @@ def _reconstruct_prepared(
         progress.update()
         progress.set_postfix_str("registration")
         # The sample's motion does not depend on phase errors, which a moving sample would disturb: it comes first.
-        estimated = correct_readout_phase(correct_sample_motion(estimated, options), options)
+        estimated = correct_phase_and_drift(correct_sample_motion(estimated, options), options)
         progress.update()
         progress.set_postfix_str("gridding")
-        estimated = correct_intensity_drift(estimated, options)
         gridded = grid_scan(estimated, options)
         progress.update()
         progress.set_postfix_str("assessment")
@@ -180,36 +140,6 @@ def estimate_motion(
     return EstimatedMotion(prepared, motion, grid, field_notes, notes)
 
 
-def wants_readout_phase(motion: Motion, options: Options) -> bool:
-    """Return whether the motion is to be corrected by the phase error that the picture shows."""
-    return motion.estimator in ESTIMATORS_WITH_READOUT_PHASE and not options.sense_only
-
-
-def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
-    """Return the phase errors that forward and backward half-periods show in slices of the scan."""
-    intensity, position_z = estimated.prepared.intensity, estimated.prepared.position_z
-    segments = registration_segments(estimated.motion, intensity, position_z)
-    return measure_motion_phase_errors(estimated.beam, intensity, estimated.grid, segments)
-
-
-def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
-    """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
-
-    A picture that changes its timing at some moment is left as it is, because dropped samples are to be restored first.
-    """
-    motion = estimated.motion
-
-    def register(corrected: Motion) -> list[PhaseError]:
-        return measure_phase_errors(replace(estimated, motion=corrected))
-
-    errors = register(motion)
-    if not wants_readout_phase(motion, options) or first_late_slice(errors, motion) is not None:
-        return replace(estimated, phase_errors=errors)
-    motion, errors, readout_phase = remove_readout_phase(motion, errors, register)
-    notes = [*describe_readout_phase(motion, readout_phase), *estimated.motion_notes]
-    return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
-
-
 def correct_sample_motion(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
     """Take the motion of the sample out of the beam's positions if it is asked for."""
     if not options.sample_motion:
@@ -218,20 +148,6 @@ def correct_sample_motion(estimated: EstimatedMotion, options: Options) -> Estim
     found = measure_sample_motion(estimated.beam, intensity, estimated.grid, _unlocated(estimated))
     notes = [*estimated.motion_notes, describe_sample_motion(found)]
     return replace(estimated, sample_motion=found, motion_notes=notes)
-
-
-def correct_intensity_drift(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
-    """Remove the drift of the detectors from the intensity if it is asked for."""
-    if options.intensity_drift is None:
-        return estimated
-    prepared = estimated.prepared
-    drifts = measure_intensity_drift(estimated.beam, prepared.intensity, estimated.grid, options.intensity_drift)
-    intensity = correct_drift(prepared.intensity, drifts)
-    recording = prepared.recording.with_channel(intensity)
-    notes = [*estimated.motion_notes, *describe_drift(drifts, intensity.unit)]
-    return replace(
-        estimated, prepared=replace(prepared, recording=recording), intensity_drift=drifts, motion_notes=notes
-    )
 
 
 def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:

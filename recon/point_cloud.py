@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.pipeline import EstimatedMotion, correct_readout_phase, estimate_motion
+from recon.estimated_motion import EstimatedMotion
+from recon.phase_and_drift import correct_readout_phase
+from recon.pipeline import estimate_motion
 from recon.preparation import prepare
 from recon.quality.defects import unrecoverable_intervals
 from recon.quality.sensor_noise import check_sensor_noise

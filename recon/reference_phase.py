@@ -6,7 +6,8 @@ import numpy as np
 
 from estimation.optics.readout_effects import ReferencePhase
 from recon.imaging.readout_phase import measured_phase_error
-from recon.pipeline import correct_readout_phase, estimate_motion
+from recon.phase_and_drift import correct_readout_phase
+from recon.pipeline import estimate_motion
 from recon.preparation import prepare
 from recon.reconstruction import Options
 from scanner.device import AXES, Device

@@ -1,0 +1,85 @@
+"""The phase error of the readout and the drift of the detector, each measured in the picture without the other.
+
+A drift of the detector makes samples of one place at two times differ, as a phase error does. The phase measured beside
+a drift is less accurate or refuted, so it is measured again in the intensity without the drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from recon.estimated_motion import EstimatedMotion
+from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors
+from recon.imaging.intensity_correction import (
+    correct_drift,
+    describe_drift,
+    exceeds_uncertainty,
+    measure_intensity_drift,
+)
+from recon.imaging.readout_phase import describe_readout_phase, remove_readout_phase
+from recon.quality.dropped_samples import first_late_slice
+from recon.reconstruction import Options
+from recon.registration_segments import registration_segments
+from scanner.motion import Motion
+
+ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor")
+"""Estimators whose motion is corrected by the phase error that the picture shows. ``picture`` has its phase from the
+picture already; the other estimators serve for comparison, as their papers describe them."""
+
+
+def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
+    """Remove the phase error of the readout, and the drift of the detectors if it is asked for.
+
+    If there is a drift, the phase is estimated again, from the uncorrected motion and the intensity without the drift.
+    The drift is then measured again in the intensity as recorded, at the corrected positions. Without a drift the first
+    phase is kept.
+    """
+    corrected = correct_intensity_drift(correct_readout_phase(estimated, options), options)
+    if not exceeds_uncertainty(corrected.intensity_drift):
+        return corrected
+    without_drift = correct_readout_phase(replace(estimated, prepared=corrected.prepared), options)
+    return correct_intensity_drift(replace(without_drift, prepared=estimated.prepared), options)
+
+
+def wants_readout_phase(motion: Motion, options: Options) -> bool:
+    """Return whether the motion is to be corrected by the phase error that the picture shows."""
+    return motion.estimator in ESTIMATORS_WITH_READOUT_PHASE and not options.sense_only
+
+
+def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
+    """Return the phase errors that forward and backward half-periods show in slices of the scan."""
+    intensity, position_z = estimated.prepared.intensity, estimated.prepared.position_z
+    segments = registration_segments(estimated.motion, intensity, position_z)
+    return measure_motion_phase_errors(estimated.beam, intensity, estimated.grid, segments)
+
+
+def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
+    """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
+
+    A picture that changes its timing at some moment is left as it is, because dropped samples are to be restored first.
+    """
+    motion = estimated.motion
+
+    def register(corrected: Motion) -> list[PhaseError]:
+        return measure_phase_errors(replace(estimated, motion=corrected))
+
+    errors = register(motion)
+    if not wants_readout_phase(motion, options) or first_late_slice(errors, motion) is not None:
+        return replace(estimated, phase_errors=errors)
+    motion, errors, readout_phase = remove_readout_phase(motion, errors, register)
+    notes = [*describe_readout_phase(motion, readout_phase), *estimated.motion_notes]
+    return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
+
+
+def correct_intensity_drift(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
+    """Remove the drift of the detectors from the intensity if it is asked for."""
+    if options.intensity_drift is None:
+        return estimated
+    prepared = estimated.prepared
+    drifts = measure_intensity_drift(estimated.beam, prepared.intensity, estimated.grid, options.intensity_drift)
+    intensity = correct_drift(prepared.intensity, drifts)
+    recording = prepared.recording.with_channel(intensity)
+    notes = [*estimated.motion_notes, *describe_drift(drifts, intensity.unit)]
+    return replace(
+        estimated, prepared=replace(prepared, recording=recording), intensity_drift=drifts, motion_notes=notes
+    )
