@@ -4,7 +4,8 @@
 
 Every scan is the demo's (60 ms, 400 x 400 pixels, 5 MS/s) of one of four tissues. The intensity has white noise of 100
 photons a sample, and in addition 1/f noise whose knee is ten times the frequency of the slow axis, or a gain that falls
-to half (bleaching). The error of the picture against the scene is divided by that with white noise alone.
+to half (bleaching). The error of the picture against the scene is divided by that with white noise alone, and so is the
+standard deviation of the phase beside the gain.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector
 from recon.imaging.intensity_drift import DriftKind
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.reconstruction import Options, Reconstruction
+from scanner.arrays import Array
+from scanner.device import AXES
 from scanner.recording import Recording
 
 SCENES = ("immunohistochemistry", "retina", "cell", "microaneurysms")
@@ -45,8 +48,15 @@ def flicker_noise(samples: int, rate: float, knee: float, rng: np.random.Generat
     return np.fft.irfft(np.fft.rfft(rng.standard_normal(2 * samples)) * factor)[:samples]
 
 
-def picture(recording: Recording, kind: DriftKind | None) -> NDArray[np.float32]:
-    return reconstruct(recording, Options(intensity_drift=kind), quiet=True).picture.image
+def reconstruct_values(recording: Recording, values: Array, kind: DriftKind | None) -> Reconstruction:
+    """Reconstruct a recording with other values of the intensity, shape (samples,), and that drift removed."""
+    recording = recording.with_channel(replace(recording["intensity"], raw=values))
+    return reconstruct(recording, Options(intensity_drift=kind), quiet=True)
+
+
+def phase_sd(result: Reconstruction, axis: str) -> float:
+    """Root mean square of the stated standard deviation of a phase [rad]."""
+    return float(np.sqrt(np.mean(result.motion.axes[axis].phase_sd ** 2)))
 
 
 def rms_error(image: NDArray[np.float32], reference: NDArray[np.float32]) -> float:
@@ -57,7 +67,7 @@ def rms_error(image: NDArray[np.float32], reference: NDArray[np.float32]) -> flo
 
 
 def measure_scan(seed: int) -> dict[str, list[float]]:
-    """Errors over that with white noise alone, by drift: as recorded, and with the drift removed."""
+    """Errors and phase sd over those with white noise alone, by drift: as recorded, and with the drift removed."""
     rng = np.random.default_rng([seed, 1])
     bright = Experiment(target=SCENES[seed % len(SCENES)], detector=Detector(gain=1e-3, photons_per_sample=1e6))
     recording, _ = simulate_experiment(bright, seed)
@@ -67,16 +77,18 @@ def measure_scan(seed: int) -> dict[str, list[float]]:
     flicker = flicker_noise(light.size, intensity.sample_rate, KNEE_OVER_SLOW_AXIS * SLOW_AXIS_HZ, rng)
     gain = np.linspace(1.0, BLEACHED_TO, light.size)
     sd = float(np.sqrt(np.mean(light) / PHOTONS))
-    reference = picture(recording.with_channel(replace(intensity, raw=light)), None)
+    reference = reconstruct_values(recording, light, None).picture.image
 
-    def error(values: NDArray[np.float64], kind: DriftKind | None) -> float:
-        return rms_error(picture(recording.with_channel(replace(intensity, raw=values)), kind), reference)
+    def error(values: Array, kind: DriftKind | None) -> float:
+        return rms_error(reconstruct_values(recording, values, kind).picture.image, reference)
 
-    white, bleached = error(light + noise, None), error(light + noise / gain, None)
-    with_flicker, with_bleaching = light + noise + sd * flicker, light * gain + noise
+    white, best = error(light + noise, None), reconstruct_values(recording, light + noise / gain, None)
+    bleached = [reconstruct_values(recording, light * gain + noise, kind) for kind in (None, "gain")]
+    best_error = rms_error(best.picture.image, reference)
     return {
-        "1/f noise": [error(with_flicker, kind) / white for kind in (None, "offset")],
-        "bleaching": [error(with_bleaching, kind) / bleached for kind in (None, "gain")],
+        "1/f noise": [error(light + noise + sd * flicker, kind) / white for kind in (None, "offset")],
+        "bleaching": [rms_error(result.picture.image, reference) / best_error for result in bleached],
+        **{f"phase {axis}": [phase_sd(result, axis) / phase_sd(best, axis) for result in bleached] for axis in AXES},
         "steady": [error(light + noise, kind) / white for kind in ("offset", "gain")],
     }
 
@@ -89,7 +101,7 @@ def main() -> None:
     scans = [measure_scan(seed) for seed in range(arguments.first, arguments.first + arguments.scans)]
     for drift, columns in (
         ("1/f noise", ("as recorded", "--intensity-drift offset")),
-        ("bleaching", ("as recorded", "--intensity-drift gain")),
+        *((name, ("as recorded", "--intensity-drift gain")) for name in ("bleaching", "phase x", "phase y")),
         ("steady", ("--intensity-drift offset", "--intensity-drift gain")),
     ):
         ratios = np.array([scan[drift] for scan in scans])
