@@ -21,6 +21,9 @@ from scanner.recording import Recording
 MAX_FRAME_EXCESS = 1e-3
 """Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""
 
+MAX_UNLOCATED_SHARE = 0.05
+"""Share of samples at an unknown angle from which a note says so; the transients at both ends of a scan are shorter."""
+
 COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative."""
 
@@ -48,6 +51,18 @@ def describe_limits(beam: Motion, intensity: Channel, grid: Grid, unlocated: Sam
         *describe_saturation(intensity),
         *describe_lower_rail(intensity),
         *describe_detector_gaps(beam, intensity, grid, unlocated),
+    ]
+
+
+def describe_unlocated(unlocated: SampleRanges, intensity: Channel) -> list[str]:
+    """A line if many samples are not mapped because the angle of the mirror is not known when they were taken."""
+    share = sum(stop - first for first, stop in unlocated) / max(intensity.size, 1)
+    if share <= MAX_UNLOCATED_SHARE:
+        return []
+    first = intensity.start + unlocated[0][0] / intensity.sample_rate
+    return [
+        f"intensity: {share:.0%} of the samples, the first at {first:.4g} s, are not mapped, because the angle is not "
+        "known at their times; check sample_rate and start of the channels, and the gaps of the sensors"
     ]
 
 

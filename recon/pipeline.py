@@ -37,6 +37,7 @@ from recon.notes import (
     describe_limits,
     describe_long_frames,
     describe_motion,
+    describe_unlocated,
 )
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
@@ -46,10 +47,10 @@ from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
 from recon.reconstruction import Options, Reconstruction
 from recon.registration_segments import registration_segments
-from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
+from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true, subtract_ranges, to_sample_ranges
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
-from scanner.motion import Motion
+from scanner.motion import Motion, SampledAngle
 from scanner.recording import Recording
 
 ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor")
@@ -294,6 +295,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_intensity(intensity),
             *estimate.notes,
             *describe_long_frames(options.frame_time, intensity),
+            *describe_unlocated(gridded.unlocated, intensity),
         ],
         intensity=intensity,
         position_z=prepared.position_z,
@@ -334,8 +336,11 @@ def _repair_dropped_samples(
 
 def _unlocated(estimated: EstimatedMotion) -> SampleRanges:
     """Samples of the intensity during which the mirror's angle is unknown."""
-    prepared = estimated.prepared
-    return to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
+    prepared, axes = estimated.prepared, estimated.beam.axes.values()
+    unknown = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
+    stored = [axis.angle.values for axis in axes if isinstance(axis.angle, SampledAngle)]
+    unknown += [each for values in stored for each in runs_of_true(np.isnan(values))]
+    return [(first, stop) for first, stop in merge_ranges(sorted(unknown), 0)]
 
 
 def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:

@@ -46,6 +46,10 @@ MAX_DECAY_TIMES = 30.0
 STEP_DECAY_TIMES = 0.1
 """Step of that integration in decay times: small enough for the explicit Euler method."""
 
+MAX_STEP_CHANGE = 1.0
+"""Largest change of phase [rad] and ln A in one step. Under a linear drive both rates grow as 1/A while the motion passes
+a small amplitude. The limit changes the way to the steady motion, not the steady motion."""
+
 MAX_STEADY_CHANGE = 1e-5
 """Change of phase [rad] and ln A over the last step at which the motion counts as steady."""
 
@@ -195,7 +199,8 @@ def find_steady_motion(observations: BlockObservations) -> SteadyMotion | None:
         log = float(np.log(START_AMPLITUDE_THETA0 * law.theta0))
         for _ in range(round(MAX_DECAY_TIMES / STEP_DECAY_TIMES)):
             rate = average_cycle(law, np.exp(log), phase, w, law.k, law.b, force).rate
-            phase, log = phase + step * rate.imag, min(log + step * rate.real, log_limit)
+            turn, growth = np.clip((step * rate.imag, step * rate.real), -MAX_STEP_CHANGE, MAX_STEP_CHANGE).tolist()
+            phase, log = phase + turn, min(log + growth, log_limit)
         cycle = average_cycle(law, np.exp(log), phase, w, law.k, law.b, force)
         if abs(cycle.rate) * step < MAX_STEADY_CHANGE and (best is None or log > best.log_amplitude):
             by_state = _phase_and_log_rows(cycle.by_phase, cycle.by_log)
