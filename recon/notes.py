@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from estimation.rail import upper_rail
@@ -11,6 +13,7 @@ from recon.imaging.picture import Grid
 from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
+from recon.quality.defects import Defect, describe_clipped_positions
 from recon.quality.detector_gaps import describe_detector_gaps
 from recon.sample_ranges import SampleRanges
 from scanner.channel import Channel
@@ -39,14 +42,18 @@ MIN_RISES = 1000
 """Changes of an intensity, all in one direction, from which it is a running sum: noise alone has as many of either."""
 
 
-def describe_limits(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> list[str]:
+def describe_limits(
+    beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges, defects: Sequence[Defect] = ()
+) -> list[str]:
     """What the picture does not show, a line each.
 
     Args:
         beam, intensity, grid, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
+        defects: of the recording.
     """
     sums = describe_running_sums(intensity)
     return [
+        *describe_clipped_positions(defects, beam, intensity.size / intensity.sample_rate),
         *(sums or describe_doubled_axes(beam, intensity) or describe_contradictions(beam, intensity)),
         *describe_saturation(intensity),
         *describe_lower_rail(intensity),

@@ -41,16 +41,16 @@ from recon.notes import (
 )
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
-from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
+from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
 from recon.quality.dropped_samples import find_timing_break, first_late_slice, restore_timing, slices_aligned
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
 from recon.reconstruction import Options, Reconstruction
 from recon.registration_segments import registration_segments
-from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true, subtract_ranges, to_sample_ranges
+from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
-from scanner.motion import Motion, SampledAngle
+from scanner.motion import Motion
 from scanner.recording import Recording
 
 ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor")
@@ -284,7 +284,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         defects=list(prepared.defects),
         unlocated_samples=sum(stop - first for first, stop in gridded.unlocated),
         affected=gridded.affected,
-        limits=[*describe_limits(*samples), *estimate.limits],
+        limits=[*describe_limits(*samples, prepared.defects), *estimate.limits],
         notes=[
             *estimated.field_notes,
             *gridded.field_notes,
@@ -336,11 +336,8 @@ def _repair_dropped_samples(
 
 def _unlocated(estimated: EstimatedMotion) -> SampleRanges:
     """Samples of the intensity during which the mirror's angle is unknown."""
-    prepared, axes = estimated.prepared, estimated.beam.axes.values()
-    unknown = to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
-    stored = [axis.angle.values for axis in axes if isinstance(axis.angle, SampledAngle)]
-    unknown += [each for values in stored for each in runs_of_true(np.isnan(values))]
-    return [(first, stop) for first, stop in merge_ranges(sorted(unknown), 0)]
+    prepared = estimated.prepared
+    return unlocated_samples(estimated.motion, estimated.beam, prepared.defects, prepared.intensity)
 
 
 def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:

@@ -101,7 +101,9 @@ def number_edges(edges: Edges) -> NumberedEdges:
         raise bad(what, "check the detector's threshold, and that the motion was on all the time")
     if missing > MAX_MISSING_FRACTION * (missing + used.sum()):
         what = f"{missing} of {missing + used.sum()} edges of a motion at {1.0 / length:.4g} Hz are missing"
-        hint = f"edges lie {length / kinds:.3g} s apart: keep one of those that belong together, and check the threshold"
+        hint = (
+            f"edges lie {length / kinds:.3g} s apart: keep one of those that belong together, and check the threshold"
+        )
         raise bad(what, hint)
     return NumberedEdges(times[first:][used], numbered[used], period[used], length, dwell, missing, doubled, stray)
 

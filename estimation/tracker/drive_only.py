@@ -47,8 +47,8 @@ STEP_DECAY_TIMES = 0.1
 """Step of that integration in decay times: small enough for the explicit Euler method."""
 
 MAX_STEP_CHANGE = 1.0
-"""Largest change of phase [rad] and ln A in one step. Under a linear drive both rates grow as 1/A while the motion passes
-a small amplitude. The limit changes the way to the steady motion, not the steady motion."""
+"""Largest change of phase [rad] and ln A in one step. Under a linear drive both rates grow as 1/A while the motion
+passes a small amplitude. The limit changes the way to the steady motion, not the steady motion."""
 
 MAX_STEADY_CHANGE = 1e-5
 """Change of phase [rad] and ln A over the last step at which the motion counts as steady."""

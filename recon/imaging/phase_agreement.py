@@ -156,9 +156,9 @@ def describe_contradictions(beam: Motion, intensity: Channel) -> list[str]:
     elif not found and 2 * sum(_disagrees_at_one_place(match) for match in slices) > len(slices) > 0:
         alike, shown = (float(np.median([each(match) for match in slices])) for each in (_alike, _shown))
         lines.append(
-            f"intensity: successive samples agree (correlation {alike:.2f}), and those of one place at different times do "
-            f"not ({shown:.2f}), so that the picture is wrong or shows the noise of a slow detector: check sample_rate "
-            "and start of intensity and sensors, and that they were recorded together"
+            f"intensity: successive samples agree (correlation {alike:.2f}), and those of one place at different times "
+            f"do not ({shown:.2f}), so that the picture is wrong or shows the noise of a slow detector: check "
+            "sample_rate and start of intensity and sensors, and that they were recorded together"
         )
     if beam.estimator == "picture" and not lines:
         for column, name in enumerate(AXES):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -69,7 +70,8 @@ class Film:
                     reason = " ".join(str(error).split()) or type(error).__name__
                     raise BadInput(f"frame {index} is damaged: {reason}", file=self.path) from None
                 if not np.isfinite(frame).all():
-                    raise BadInput(f"frame {index} holds pixels that are not finite numbers", file=self.path)
+                    hint = "replace them by the values around, or leave the frame out"
+                    raise BadInput(f"frame {index} holds pixels that are not finite", file=self.path, hint=hint)
                 yield frame
 
     def _plane(self, file: Any, pages: Any, index: int) -> NDArray[Any]:
@@ -89,6 +91,7 @@ def open_film(path: Path) -> Film:
     """
     import tifffile
 
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what is damaged is said in one line
     try:
         with tifffile.TiffFile(path) as file:
             series, page = file.series[0], file.series[0].keyframe
@@ -101,7 +104,11 @@ def open_film(path: Path) -> Film:
         reason = " ".join(str(error).split())
         raise BadInput(f"is no TIFF file that can be read: {reason}", file=path, hint="name a film (TIFF)") from None
     if colour:
-        raise BadInput("is a colour picture", file=path, hint="give the detectors as channels (axis C), not as RGB")
+        hint = (
+            "give the detectors as channels (axis C), not as RGB; tifffile.imwrite needs photometric='minisblack' for "
+        )
+        hint += "a film of 3 or 4 frames"
+        raise BadInput("is a colour picture", file=path, hint=hint)
     if film.axes[-2:] != "YX":
         raise BadInput(f"has the axes {film.axes}", file=path, hint="lines and columns have to be the last two")
     if film.dtype.kind not in "iuf":
