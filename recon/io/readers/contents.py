@@ -145,19 +145,25 @@ def infer_clock(times: SampleSource) -> tuple[float | None, float | None, str]:
 
 
 def _find_jump(times: SampleSource, size: int) -> str:
-    """Where successive times first fall, or else jump, in words; empty if no single step differs from the usual one."""
+    """Where times first fall, or else jump, for good, in words; empty where single times are off or none is."""
     usual = float(np.median(np.diff(np.asarray(times[: min(size, READ_CHUNK_SAMPLES)], np.float64))))
     if not usual > 0.0:
         return "most of them are equal to the one before, because they are stated with too few digits"
     jump = ""
     for low in range(0, size - 1, READ_CHUNK_SAMPLES):
-        steps = np.diff(np.asarray(times[low : low + READ_CHUNK_SAMPLES + 1], np.float64))
-        if (steps < 0.0).any():
-            at = int(np.argmax(steps < 0.0))
-            return f"sample {low + at + 1} is {-steps[at]:.4g} s earlier than the one before; remove what is repeated"
-        if not jump and (steps > MIN_JUMP_STEPS * usual).any():
-            at = int(np.argmax(steps > MIN_JUMP_STEPS * usual))
-            jump = f"sample {low + at + 1} is {steps[at]:.4g} s later than the one before, not {usual:.4g} s"
+        begin = max(low - 1, 0)
+        block = np.asarray(times[begin : low + READ_CHUNK_SAMPLES + 2], np.float64)
+        steps, pairs = np.diff(block), np.full(block.size + 1, np.inf)
+        pairs[1:-2] = block[2:] - block[:-2]  # over a time that alone is off, two steps together are as usual
+        lasting = (np.abs(pairs[:-2] - 2.0 * usual) > usual / 2) & (np.abs(pairs[1:-1] - 2.0 * usual) > usual / 2)
+        falls = np.flatnonzero(lasting & (steps < 0.0))
+        if falls.size:
+            at = int(falls[0])
+            return f"sample {begin + at + 1} is {-steps[at]:.4g} s earlier than the one before; remove what is repeated"
+        rises = np.flatnonzero(lasting & (steps > MIN_JUMP_STEPS * usual))
+        if rises.size and not jump:
+            at = int(rises[0])
+            jump = f"sample {begin + at + 1} is {steps[at]:.4g} s later than the one before, not {usual:.4g} s"
     return jump
 
 
