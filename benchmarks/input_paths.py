@@ -4,7 +4,8 @@
 
 Two sines of 1870 and 733 Hz whose phases drift by 9 and 6 degrees in 0.1 s, at 1 MS/s, over a specimen of 60 spots
 with 60 photons a sample beside them and 150 to 360 in their middles. Each row is one recording with its own seed: the
-channels named, in noise, and the intensity. The errors are those of the angle at the samples of the intensity, against the sines, as a phase.
+channels named, in noise, and the intensity. The errors are those of the angle at the samples of the intensity, against
+the sines, as a phase.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import numpy as np
 from estimation.rail import upper_rail
 from recon.imaging.doubled_frequency import describe_doubled_axes
 from recon.imaging.phase_agreement import describe_contradictions
-from recon.imaging.picture import Grid
+from recon.imaging.picture import Grid, detector_names
 from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
@@ -37,6 +37,9 @@ without its mean has about a half."""
 
 MAX_SCANNER_HZ = 1e5
 """Frequency above which a motion is doubted: mirrors, fibres and stages that scan light resonate below 0.1 MHz."""
+
+MIN_SCANNER_HZ = 0.01
+"""Frequency below which a motion is doubted: a raster of an atomic-force microscope takes minutes."""
 
 MIN_RISES = 1000
 """Changes of an intensity, all in one direction, from which it is a running sum: noise alone has as many of either."""
@@ -145,9 +148,7 @@ def describe_polarity(intensity: Channel) -> list[str]:
 
 def _detector_names(intensity: Channel) -> list[str]:
     """Name of each detector in messages."""
-    count = intensity.shape[1] if len(intensity.shape) == 2 else 1
-    several = intensity.detectors or [f"detector {number}" for number in range(count)]
-    return [f"intensity, {name}" for name in several] if count > 1 else ["intensity"]
+    return detector_names(intensity.detectors, intensity.shape[1] if len(intensity.shape) == 2 else 1)
 
 
 def describe_intensity(intensity: Channel) -> list[str]:
@@ -192,12 +193,12 @@ def describe_ambiguous_signs(motion: Motion) -> list[str]:
 
 
 def describe_fast_axes(motion: Motion, intensity: Channel) -> list[str]:
-    """A line for each axis that moves faster than scanners do, as where times in ms are stated for seconds."""
+    """A line for each axis that moves faster or slower than scanners do, as where the unit of time is wrong."""
     return [
-        f"{name} moves at {frequency:.4g} Hz, and mirrors, fibres and stages move below {MAX_SCANNER_HZ:.0e} Hz: "
-        f"check the unit of time and sample_rate, {intensity.sample_rate:.4g} Hz"
+        f"{name} moves at {frequency:.4g} Hz, and mirrors, fibres and stages move at {MIN_SCANNER_HZ:g} to "
+        f"{MAX_SCANNER_HZ:.0e} Hz: check the unit of time and sample_rate, {intensity.sample_rate:.4g} Hz"
         for name, frequency in ((name, float(np.median(axis.frequency))) for name, axis in motion.axes.items())
-        if frequency > MAX_SCANNER_HZ
+        if not MIN_SCANNER_HZ < frequency < MAX_SCANNER_HZ
     ]
 
 

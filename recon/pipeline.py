@@ -307,9 +307,8 @@ def _repair_dropped_samples(
     prepared: PreparedRecording, result: Reconstruction, options: Options, truth: Truth | None, quiet: bool
 ) -> Reconstruction:
     """Reconstruct again with the timing restored if the picture shows that samples of the intensity were dropped."""
-    if (
-        len(registration_segments(result.motion, result.intensity, result.position_z)) > 1
-    ):  # the slices do not cover the whole scan
+    segments = registration_segments(result.motion, result.intensity, result.position_z)
+    if len(segments) > 1:  # the slices do not cover the whole scan
         return result
     timing_break = find_timing_break(result.phase_errors, result.motion, result.intensity, result.picture.grid)
     if timing_break is None:

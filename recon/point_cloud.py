@@ -15,7 +15,7 @@ from recon.quality.defects import unlocated_samples
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.reconstruction import Options
 from scanner.arrays import Array
-from scanner.channel import Channel
+from scanner.channel import Channel, check_signal
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.geometry import Geometry, locate_points, trace_rays
@@ -96,6 +96,8 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     if not _returned(shots.read()).any():
         raise BadInput("holds no usable return", channel="range", hint="ranges are positive numbers in metres")
     stated = recording.channels.get("intensity")
+    if stated is None:
+        check_signal(shots, gaps_ok=True)
     channels = {**recording.channels, "intensity": replace(shots, name="intensity")}
     if stated is not None and _same_clock(stated, shots):
         channels["intensity"] = stated

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,8 @@ class Film:
         import tifffile
 
         with tifffile.TiffFile(self.path) as file:
-            pages = file.series[0].pages
+            series = _full_series(file)
+            pages = series[0].pages if len(series) == 1 else [page for each in series for page in each.pages]
             for index in indices:
                 planes = range(index * self.channels, (index + 1) * self.channels)
                 try:
@@ -94,10 +95,13 @@ def open_film(path: Path) -> Film:
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what is damaged is said in one line
     try:
         with tifffile.TiffFile(path) as file:
-            series, page = file.series[0], file.series[0].keyframe
+            several = _full_series(file)
+            series, page = several[0], several[0].keyframe
             film = Film(path, series.axes, series.shape, series.dtype, series.dataoffset, _description(file, page))
             colour = "S" in series.axes or page.photometric in COLOURS
             planes, size = len(series.pages), path.stat().st_size
+            if len(several) > 1:
+                film, planes = _join_series(film, several), len(several)
     except OSError as error:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name a film (TIFF)") from None
     except (tifffile.TiffFileError, ValueError, IndexError, KeyError, AttributeError) as error:
@@ -119,6 +123,24 @@ def open_film(path: Path) -> Film:
     if film.offset is None and planes != film.frames * film.channels:
         raise BadInput(f"states {film.frames * film.channels} planes and holds {planes}", file=path)
     return film
+
+
+def _full_series(file: Any) -> list[Any]:
+    """Series of an open TIFF file, without thumbnails."""
+    return [each for each in file.series if not each.keyframe.is_reduced] or list(file.series[:1])
+
+
+def _join_series(film: Film, series: Sequence[Any]) -> Film:
+    """The film whose frames were written one by one, so that the file lists each as a series of its own.
+
+    Raises:
+        BadInput: they are no single planes of one size and type.
+    """
+    shapes = {f"{'x'.join(map(str, each.shape))} {each.axes} {each.dtype}" for each in series}
+    if len(shapes) > 1 or film.axes != "YX":
+        what = f"holds {len(series)} series ({', '.join(sorted(shapes))})"
+        raise BadInput(what, file=film.path, hint="write the film that is meant into a file of its own")
+    return replace(film, axes="TYX", shape=(len(series), *film.shape), offset=None)
 
 
 def write_film(path: Path, film: Film, planes: Iterable[NDArray[Any]]) -> None:

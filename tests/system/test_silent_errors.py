@@ -256,3 +256,61 @@ def test_a_killed_run_leaves_nothing_half_written(tmp_path: Path, capsys: pytest
     assert (tmp_path / "out" / "a" / "image.tif").exists()
     assert not unfinished.exists()
     assert foreign.exists()
+
+
+def test_frames_that_were_written_one_by_one_are_one_film(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    tifffile.imwrite(tmp_path / "whole.tif", film(3.0), photometric="minisblack")
+    with tifffile.TiffWriter(tmp_path / "single.tif") as file:
+        for frame in film(3.0):
+            file.write(frame, photometric="minisblack", contiguous=False)
+    shifts = []
+    for name in ("whole", "single"):
+        code, out, _ = run(["bidirectional", tmp_path / f"{name}.tif", "-o", tmp_path / name, "--json"], capsys)
+        assert code == 0
+        shifts.append(json.loads(out)["shift_px"]["median"])
+        assert tifffile.imread(tmp_path / name / "corrected.tif").shape == film(3.0).shape
+    assert shifts[0] == shifts[1]
+
+
+def test_frames_of_different_sizes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    with tifffile.TiffWriter(tmp_path / "film.tif") as file:
+        for side in (64, 64, 60):
+            file.write(film(3.0, 1, side)[0], photometric="minisblack", contiguous=False)
+    code, _, err = run(["bidirectional", tmp_path / "film.tif", "-o", tmp_path / "out"], capsys)
+    assert code == 2
+    assert "holds 3 series (60x60 YX int16, 64x64 YX int16)" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_detector_that_shows_nothing_is_named() -> None:
+    counts = light(772012)
+    two = Recording.from_arrays(
+        {**sensors(772012), "intensity": (np.column_stack([counts, 0.0 * counts]), "V", RATE_HZ)},
+        Device.from_toml(READOUTS + FIELD),
+        detectors=("PMT1", "PMT2"),
+    )
+    limits = lissajous.reconstruct(two, pixels=(40, 40)).limits
+    assert limits == ["intensity, PMT2: every sample is 0: the picture shows nothing; check the detector"]
+
+
+def test_a_constant_range_is_named_as_range(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    channels = {**sensors(772013), "range": (np.full(SAMPLES, 8.0), "m", RATE_HZ)}
+    Recording.from_arrays(channels, Device.from_toml(READOUTS + FIELD)).write(tmp_path / "scan.h5")
+    code, _, err = run(["point-cloud", tmp_path / "scan.h5", "-o", tmp_path / "out"], capsys)
+    assert code == 2
+    assert "range: is constant, 8 m" in err
+
+
+def test_a_hysteresis_in_degrees_is_refused() -> None:
+    angle = angles()["x"] - 0.03
+    at = np.flatnonzero(angle[:-1] * angle[1:] < 0.0)
+    times = (at - angle[at] / (angle[at + 1] - angle[at])) / RATE_HZ
+    stated = {"sync_x": (times, "s", {"angle": 0.03, "hysteresis": 1.5})}
+    with pytest.raises(BadInput, match=r"hysteresis is 1\.5 rad, more than the amplitude"):
+        reconstruct(edges(crossings("x"), crossings("y")) | stated, EDGES)
+
+
+def test_a_rate_in_megahertz_is_noted() -> None:
+    channels = {name: (values, unit, 1.0) for name, (values, unit, _) in sensors(772014).items()}
+    notes = reconstruct({**channels, "intensity": (light(772014), "V", 1.0)}, READOUTS + FIELD).notes
+    assert sum("check the unit of time and sample_rate, 1 Hz" in note for note in notes) == 2
