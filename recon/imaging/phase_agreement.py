@@ -280,11 +280,9 @@ def _contradicts(match: PhaseMatches, repeated: float) -> bool:
     if not repeated > 0.0 or at == match.best:
         return False
     fewer, more = sorted((match.common_cells[at], match.common_cells[match.best]))
-    by_band = match.by_band[:, match.best] - match.by_band[:, at]
     return bool(
         fewer >= max(MIN_COMMON_CELLS, MIN_COMMON_SHARE * more)
-        and by_band.mean() > MIN_BAND_SDS * by_band.std(ddof=1) / np.sqrt(BANDS)
-        and np.sum(by_band > 0.0) >= MIN_BANDS
+        and _differs_in_bands(match, at)
         and MIN_CORRELATION_RATIO * repeated <= best <= match.same_cell / MIN_CORRELATION_RATIO
         and agreement < MAX_AGREEMENT_RATIO * best
         and best - agreement > MIN_CONTRADICTION_SD * sd
@@ -299,10 +297,19 @@ def _is_doubled(match: PhaseMatches, repeated: float) -> bool:
 
 
 def _is_folded(match: PhaseMatches, repeated: float) -> bool:
-    """Whether samples agree as well for a phase a quarter of a turn away: the picture equals its mirror image."""
-    best, quarter = match.reflected[match.best], match.reflected[(match.best + PHASE_CELLS // 2) % PHASE_CELLS]
-    clear = max(MIN_CORRELATION_RATIO * repeated, MIN_CORRELATION_SD * match.noise_sd[match.best])
-    return bool(repeated > 0.0 and best >= clear and quarter >= MAX_AGREEMENT_RATIO * best)
+    """Whether samples agree as well for a phase a quarter of a turn away, but for noise: the picture is symmetric."""
+    at = (match.best + PHASE_CELLS // 2) % PHASE_CELLS
+    noise = MIN_CORRELATION_SD * float(np.hypot(match.noise_sd[match.best], match.noise_sd[at]))
+    best, quarter = float(match.reflected[match.best]), float(match.reflected[at])
+    is_clear = best >= max(MIN_CORRELATION_RATIO * repeated, noise) and repeated > 0.0
+    return is_clear and best - quarter < noise and not _differs_in_bands(match, at)
+
+
+def _differs_in_bands(match: PhaseMatches, at: int) -> bool:
+    """Whether the correlation at the best phase exceeds that at another one in nearly all bands of the other axis."""
+    by_band = match.by_band[:, match.best] - match.by_band[:, at]
+    is_significant = by_band.mean() > MIN_BAND_SDS * by_band.std(ddof=1) / np.sqrt(BANDS)
+    return bool(is_significant and np.sum(by_band > 0.0) >= MIN_BANDS)
 
 
 def _alike(match: SliceMatches) -> float:
