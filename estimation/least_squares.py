@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from scipy.linalg.lapack import dtrtri
 
 from scanner.arrays import Array, Mask
 
@@ -276,6 +277,11 @@ class Regression(NamedTuple):
     def log_determinant(self) -> float:
         """Of the inverse of the posterior covariance."""
         return 2.0 * float(np.log(np.abs(np.diag(self.factor))).sum())
+
+    @property
+    def inverse_factor(self) -> Array:
+        """Inverse of ``factor``, shape (q, q); the posterior covariance is its product with its transpose."""
+        return np.asarray(dtrtri(self.factor)[0]) if self.factor.size else self.factor
 
 
 def triangular_factor(columns: Array) -> Array:

@@ -23,8 +23,12 @@ MAX_CENTRE_FRACTION = 0.2
 """Distance of a motion's centre from that of the field, over its amplitude, above which a note says so: a fifth of the
 field is then empty on one side. Scans that are centred on purpose are within a tenth."""
 
-MIN_AMPLITUDE_FRACTION = 0.2
-"""Amplitude over half angle below which a note says that the motion covers little of the field."""
+MIN_AMPLITUDE_FRACTION = 0.75
+"""Amplitude over half angle below which a note says so: a half of the pixels is then never visited, however long the
+scan. Fields are stated to a few percent; a wrong constant of the readout or an optical angle changes more."""
+
+MAX_MIRROR_ANGLE_RAD = pi / 2
+"""Amplitude above which a unit is wrong: no mirror turns further."""
 
 OTHER_UNITS = {"degrees": pi / 180.0, "mrad": 1e-3}
 """Units of angle that half angles are stated in by mistake, in rad."""
@@ -73,15 +77,19 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[s
     if share > MAX_OUTSIDE_FRACTION:
         what = f"{share:.0%} of the samples lie outside the field of view ({sizes}; {grid.angle} angles)"
         if share > MAX_OUTSIDE_FRACTION_ALLOWED and not allow_outside:
-            hint = (
-                "correct half_angle_x and half_angle_y, or angle, in [scan]; --allow-outside makes the picture anyway"
-            )
+            fields = "half_angle_x and half_angle_y, or angle, in [scan]"
+            hint = f"correct {fields}; --allow-outside makes the picture anyway"
+            if max(amplitude) > MAX_MIRROR_ANGLE_RAD:
+                hint = (
+                    f"no mirror turns so far: check gain in [x.readout], in V/rad, or the unit of the angles; or {hint}"
+                )
             raise DeviceInvalid(what, channel="scan", hint=hint)
         notes.append(f"{what}; check [scan] of the device")
     notes += _describe_centres(grid, motion)
     if any(a < MIN_AMPLITUDE_FRACTION * h for a, h in zip(amplitude, half, strict=True)):
         notes.append(
-            f"the motion covers little of the field of view ({sizes}; {grid.angle} angles); check [scan] of the device"
+            f"the motion covers little of the field of view ({sizes}; {grid.angle} angles); check [scan] and the "
+            "readout's constants in the device"
         )
     return notes
 

@@ -31,6 +31,10 @@ REFERENCE_FRAMES = 64
 """Frames, spread over the film, whose mean is the reference. It has 1/64 of the noise of a frame, so that at 20 photons
 a pixel its gradient adds less than 2 % to the standard error."""
 
+MAX_ROWS_GROWTH = 1.01
+"""Difference of lines and their neighbours, corrected over recorded, from which a note says that the correction made it
+larger. Without a shift the two are equal."""
+
 Item = TypeVar("Item")
 
 MIN_SIDE_PX = 2 * BLOCKS_ACROSS
@@ -131,6 +135,11 @@ class CorrectedFilm:
             notes.append(
                 f"{self.undetermined} of {self.film.frames} frames do not determine their own phase to "
                 f"{MAX_SHIFT_SD_PX} pixels; they are corrected by that of the frames around them"
+            )
+        if self.rows_rms[1] > MAX_ROWS_GROWTH * self.rows_rms[0]:
+            notes.append(
+                "the lines differ more after the correction: these values are no counts, but lie on a baseline or are "
+                "means; use --values means, or subtract the baseline"
             )
         if self.clipped:
             notes.append(

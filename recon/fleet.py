@@ -5,10 +5,13 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +128,7 @@ def run_fleet(
     """
     from tqdm import tqdm
 
+    began = time.time()
     failures: dict[Path, Failure] = {}
     left = [path for path in fleet.folders if path not in fleet.done]
     with tqdm(total=len(fleet.folders), initial=len(fleet.done), desc=title, unit="recording", file=sys.stderr) as bar:
@@ -138,7 +142,16 @@ def run_fleet(
         except KeyboardInterrupt:
             reason = f"interrupted; {bar.n} of {len(fleet.folders)} recordings are done, the same command continues"
             raise InterruptedError(errno.EINTR, reason, str(next(iter(fleet.folders.values())).parent)) from None
+    _remove_unfinished(fleet, began)
     return failures
+
+
+def _remove_unfinished(fleet: Fleet, began: float) -> None:
+    """Delete what an earlier run that was killed has left: temporary folders not touched since ``began`` [s]."""
+    for folder in fleet.folders.values():
+        for path in folder.parent.glob(f".{escape(folder.name)}.*.part"):
+            if path.is_dir() and path.stat().st_mtime < began:
+                shutil.rmtree(path, ignore_errors=True)
 
 
 def _run_round(

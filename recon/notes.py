@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from estimation.rail import upper_rail
 from recon.imaging.doubled_frequency import describe_doubled_axes
 from recon.imaging.phase_agreement import describe_contradictions
-from recon.imaging.picture import Grid
+from recon.imaging.picture import Grid, detector_names
 from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
+from recon.quality.defects import Defect, describe_clipped_positions
 from recon.quality.detector_gaps import describe_detector_gaps
 from recon.sample_ranges import SampleRanges
 from scanner.channel import Channel
@@ -20,6 +23,9 @@ from scanner.recording import Recording
 
 MAX_FRAME_EXCESS = 1e-3
 """Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""
+
+MAX_UNLOCATED_SHARE = 0.05
+"""Share of samples at an unknown angle from which a note says so; the transients at both ends of a scan are shorter."""
 
 COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative."""
@@ -32,22 +38,41 @@ without its mean has about a half."""
 MAX_SCANNER_HZ = 1e5
 """Frequency above which a motion is doubted: mirrors, fibres and stages that scan light resonate below 0.1 MHz."""
 
+MIN_SCANNER_HZ = 0.01
+"""Frequency below which a motion is doubted: a raster of an atomic-force microscope takes minutes."""
+
 MIN_RISES = 1000
 """Changes of an intensity, all in one direction, from which it is a running sum: noise alone has as many of either."""
 
 
-def describe_limits(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> list[str]:
+def describe_limits(
+    beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges, defects: Sequence[Defect] = ()
+) -> list[str]:
     """What the picture does not show, a line each.
 
     Args:
         beam, intensity, grid, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
+        defects: of the recording.
     """
     sums = describe_running_sums(intensity)
     return [
+        *describe_clipped_positions(defects, beam, intensity.size / intensity.sample_rate),
         *(sums or describe_doubled_axes(beam, intensity) or describe_contradictions(beam, intensity)),
         *describe_saturation(intensity),
         *describe_lower_rail(intensity),
         *describe_detector_gaps(beam, intensity, grid, unlocated),
+    ]
+
+
+def describe_unlocated(unlocated: SampleRanges, intensity: Channel) -> list[str]:
+    """A line if many samples are not mapped because the angle of the mirror is not known when they were taken."""
+    share = sum(stop - first for first, stop in unlocated) / max(intensity.size, 1)
+    if share <= MAX_UNLOCATED_SHARE:
+        return []
+    first = intensity.start + unlocated[0][0] / intensity.sample_rate
+    return [
+        f"intensity: {share:.0%} of the samples, the first at {first:.4g} s, are not mapped, because the angle is not "
+        "known at their times; check sample_rate and start of the channels, and the gaps of the sensors"
     ]
 
 
@@ -123,9 +148,7 @@ def describe_polarity(intensity: Channel) -> list[str]:
 
 def _detector_names(intensity: Channel) -> list[str]:
     """Name of each detector in messages."""
-    count = intensity.shape[1] if len(intensity.shape) == 2 else 1
-    several = intensity.detectors or [f"detector {number}" for number in range(count)]
-    return [f"intensity, {name}" for name in several] if count > 1 else ["intensity"]
+    return detector_names(intensity.detectors, intensity.shape[1] if len(intensity.shape) == 2 else 1)
 
 
 def describe_intensity(intensity: Channel) -> list[str]:
@@ -170,12 +193,12 @@ def describe_ambiguous_signs(motion: Motion) -> list[str]:
 
 
 def describe_fast_axes(motion: Motion, intensity: Channel) -> list[str]:
-    """A line for each axis that moves faster than scanners do, as where times in ms are stated for seconds."""
+    """A line for each axis that moves faster or slower than scanners do, as where the unit of time is wrong."""
     return [
-        f"{name} moves at {frequency:.4g} Hz, and mirrors, fibres and stages move below {MAX_SCANNER_HZ:.0e} Hz: "
-        f"check the unit of time and sample_rate, {intensity.sample_rate:.4g} Hz"
+        f"{name} moves at {frequency:.4g} Hz, and mirrors, fibres and stages move at {MIN_SCANNER_HZ:g} to "
+        f"{MAX_SCANNER_HZ:.0e} Hz: check the unit of time and sample_rate, {intensity.sample_rate:.4g} Hz"
         for name, frequency in ((name, float(np.median(axis.frequency))) for name, axis in motion.axes.items())
-        if frequency > MAX_SCANNER_HZ
+        if not MIN_SCANNER_HZ < frequency < MAX_SCANNER_HZ
     ]
 
 

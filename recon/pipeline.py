@@ -31,11 +31,12 @@ from recon.notes import (
     describe_limits,
     describe_long_frames,
     describe_motion,
+    describe_unlocated,
 )
 from recon.phase_and_drift import correct_phase_and_drift
 from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
-from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unrecoverable_intervals
+from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
 from recon.quality.dropped_samples import find_timing_break, restore_timing, slices_aligned
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
@@ -199,7 +200,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         defects=list(prepared.defects),
         unlocated_samples=sum(stop - first for first, stop in gridded.unlocated),
         affected=gridded.affected,
-        limits=[*describe_limits(*samples), *estimate.limits],
+        limits=[*describe_limits(*samples, prepared.defects), *estimate.limits],
         notes=[
             *estimated.field_notes,
             *gridded.field_notes,
@@ -210,6 +211,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_intensity(intensity),
             *estimate.notes,
             *describe_long_frames(options.frame_time, intensity),
+            *describe_unlocated(gridded.unlocated, intensity),
         ],
         intensity=intensity,
         position_z=prepared.position_z,
@@ -221,9 +223,8 @@ def _repair_dropped_samples(
     prepared: PreparedRecording, result: Reconstruction, options: Options, truth: Truth | None, quiet: bool
 ) -> Reconstruction:
     """Reconstruct again with the timing restored if the picture shows that samples of the intensity were dropped."""
-    if (
-        len(registration_segments(result.motion, result.intensity, result.position_z)) > 1
-    ):  # the slices do not cover the whole scan
+    segments = registration_segments(result.motion, result.intensity, result.position_z)
+    if len(segments) > 1:  # the slices do not cover the whole scan
         return result
     timing_break = find_timing_break(result.phase_errors, result.motion, result.intensity, result.picture.grid)
     if timing_break is None:
@@ -251,7 +252,7 @@ def _repair_dropped_samples(
 def _unlocated(estimated: EstimatedMotion) -> SampleRanges:
     """Samples of the intensity during which the mirror's angle is unknown."""
     prepared = estimated.prepared
-    return to_sample_ranges(unrecoverable_intervals(estimated.motion, prepared.defects), prepared.intensity)
+    return unlocated_samples(estimated.motion, estimated.beam, prepared.defects, prepared.intensity)
 
 
 def _picture_grid(device: Device, motion: Motion, options: Options) -> tuple[Grid, list[str]]:

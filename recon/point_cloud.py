@@ -13,13 +13,11 @@ from recon.estimated_motion import EstimatedMotion
 from recon.phase_and_drift import correct_readout_phase
 from recon.pipeline import estimate_motion
 from recon.preparation import prepare
-from recon.quality.defects import unrecoverable_intervals
+from recon.quality.defects import unlocated_samples
 from recon.quality.sensor_noise import check_sensor_noise
-from recon.quality.sensor_sign import describe_inverted_sensors
 from recon.reconstruction import Options
-from recon.sample_ranges import to_sample_ranges
 from scanner.arrays import Array
-from scanner.channel import Channel
+from scanner.channel import Channel, check_signal
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.geometry import Geometry, locate_points, trace_rays
@@ -100,6 +98,8 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     if not _returned(shots.read()).any():
         raise BadInput("holds no usable return", channel="range", hint="ranges are positive numbers in metres")
     stated = recording.channels.get("intensity")
+    if stated is None:
+        check_signal(shots, gaps_ok=True)
     channels = {**recording.channels, "intensity": replace(shots, name="intensity")}
     if stated is not None and _same_clock(stated, shots):
         channels["intensity"] = stated
@@ -110,8 +110,7 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     distance = cut.read()
     returned = _returned(distance)
     located = np.ones(distance.size, bool)
-    unknown = unrecoverable_intervals(estimated.motion, prepared.defects)
-    for first, stop in to_sample_ranges(unknown, prepared.intensity):
+    for first, stop in unlocated_samples(estimated.motion, estimated.beam, prepared.defects, prepared.intensity):
         located[first:stop] = False
     kept = np.flatnonzero(returned & located)
     if not kept.size:
@@ -120,8 +119,8 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     geometry = prepared.device.geometry or Geometry()
     angles = {axis: estimated.beam.axes[axis].angle.read()[kept] for axis in AXES}
     when = cut.start + kept / cut.sample_rate
-    inverted = describe_inverted_sensors(prepared.recording, prepared.device)
-    notes = [*inverted, *sensor_notes, *estimated.motion_notes]
+    unknown_keys = [line for line in prepared.unknown_entries if not line.startswith("intensity:")]
+    notes = [*unknown_keys, *sensor_notes, *estimated.motion_notes]
     notes += _notes(geometry, prepared.device.geometry is None, distance, estimated)
     return PointCloud(
         time=when,

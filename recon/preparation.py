@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isclose
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,13 @@ DeviceSource = str | Path | Device
 
 MIN_INTENSITY_COVERAGE = 0.9
 """Part of a recording that an intensity covers without a note: triggers and filters cost less than a tenth."""
+
+
+MOTION_CHANNELS = ("sense", "angle_", "velocity_", "acceleration_", "drive_")
+"""Beginnings of the names of channels that determine the motion."""
+
+MAX_RATE_DIFFERENCE = 1e-4
+"""Relative difference of two sample rates that the crystals of two instruments may have."""
 
 
 @dataclass(frozen=True)
@@ -168,8 +176,29 @@ def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:
                 f"intensity: covers {covered:.0%} of the recording, {light.end - light.start:.4g} s of "
                 f"{recording.duration:.4g} s; if it was recorded throughout, check its sample_rate"
             )
+    yield from _describe_equal_sizes(recording)
     for key in _dotted_keys({**device.extra, **{name: axis.extra for name, axis in device.axes.items()}}):
         yield f"{key}: is no key of a device, and not used"
+
+
+def _describe_equal_sizes(recording: Recording) -> Iterator[str]:
+    """A line for the channels of motion that have as many samples as the intensity, and another rate."""
+    light = recording.channels.get("intensity")
+    if light is None:
+        return
+    others = {
+        name: channel.sample_rate
+        for name, channel in recording.channels.items()
+        if name.startswith(MOTION_CHANNELS)
+        and channel.size == light.size
+        and not isclose(channel.sample_rate, light.sample_rate, rel_tol=MAX_RATE_DIFFERENCE)
+    }
+    if others:
+        rates = " and ".join(f"{rate:.6g}" for rate in dict.fromkeys(others.values()))
+        yield (
+            f"intensity: has {light.size} samples at {light.sample_rate:.6g} Hz, and {', '.join(others)} as many at "
+            f"{rates} Hz; if they were recorded together, a sample_rate is wrong"
+        )
 
 
 def _dotted_keys(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

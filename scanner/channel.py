@@ -292,17 +292,14 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
         BadInput: a sample is not finite (the message states its time) or larger than ``MAX_MAGNITUDE``, no sample is
             finite, or the signal never changes.
     """
-    low, high = np.inf, -np.inf
+    low, high, missing, earliest = np.inf, -np.inf, 0, -1
     for first in range(0, signal.size, READ_CHUNK_SAMPLES):
         values = signal.stored(first, first + READ_CHUNK_SAMPLES)
         lowest, highest = float(values.min()), float(values.max())
         if not (isfinite(lowest) and isfinite(highest)):  # the minimum of samples with a NaN is NaN
             finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-            if not gaps_ok:
-                index = first + int(np.argmin(finite))
-                what = f"sample {index} at {signal.start + index / signal.sample_rate:.9g} s is not finite"
-                hint = "cut the recording there or repair the sample"
-                raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
+            earliest = earliest if missing else first + int(np.argmin(finite))
+            missing += int(np.sum(~finite))
             if not finite.any():
                 continue
             lowest, highest = float(values[finite].min()), float(values[finite].max())
@@ -310,6 +307,11 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
     if low > high:
         hint = "check that it was recorded"
         raise BadInput("holds no sample that can be used", file=signal.file, channel=signal.name, hint=hint)
+    if missing and not gaps_ok:
+        what = f"sample {earliest} at {signal.start + earliest / signal.sample_rate:.9g} s is not finite"
+        what += f", nor are {missing - 1} others of {signal.size}" if missing > 1 else ""
+        hint = "cut the recording there or repair the sample"
+        raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
     low, high = sorted((signal.gain * low + signal.offset, signal.gain * high + signal.offset))
     if max(-low, high) > MAX_MAGNITUDE:
         what = f"reaches {max(-low, high):.3g} {signal.unit}"

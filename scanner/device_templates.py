@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import hypot, pi, sqrt
+from math import hypot, pi, radians, sqrt
 
 from scanner.device import AXES
 from scanner.errors import BadInput
@@ -113,6 +113,13 @@ KINDS = {
 """Kinds of scanners by name. Typical values are those of the recipes."""
 
 
+MIRRORS = ("parametric", "electromagnetic", "piezo", "galvo")
+"""Kinds whose angles are those of a mirror; a fibre and a stage have others."""
+
+TYPICAL_SD = 0.3
+"""Relative standard uncertainty of a typical gain or torque: instruments of one kind differ by a factor of 2."""
+
+
 def new_device(
     kind: str, known: Mapping[str, KnownAxis], name: str | None = None, frequencies_only: bool = False
 ) -> str:
@@ -126,12 +133,17 @@ def new_device(
             from the picture.
 
     Raises:
-        BadInput: no such kind, or a drive frequency is missing.
+        BadInput: no such kind, a drive frequency is missing, or an amplitude is larger than any mirror's.
     """
     if kind not in KINDS:
         raise BadInput(f"no kind of scanner is named {kind!r}", hint=f"there are {', '.join(KINDS)}")
     scanner = KINDS[kind]
     axes = {axis: known.get(axis, KnownAxis()) for axis in AXES}
+    for axis, each in axes.items():
+        if kind in MIRRORS and each.amplitude and each.amplitude > pi / 2:
+            what = f"is {each.amplitude:g} rad, and no mirror turns so far"
+            hint = f"{each.amplitude:g} degrees are {radians(each.amplitude):.4g} rad"
+            raise BadInput(what, channel=f"--amplitude-{axis}", hint=hint)
     filled = {axis: _fill(scanner, getattr(scanner, axis), axes[axis]) for axis in AXES}
     parts = [_heading(kind, scanner, filled), f"name = {json.dumps(name or kind)}"]
     if frequencies_only:
@@ -228,6 +240,8 @@ def _linear_axis(scanner: ScannerKind, axis: str, known: KnownAxis, filled: Know
     torque = MIRROR_INERTIA * omega**2 * (filled.amplitude or 1.0) * response / LINEAR_VOLTS
     return f"""\
 {_mechanics(axis, known, filled, MIRROR_INERTIA)}
+torque_per_volt = {TYPICAL_SD}  # state a smaller one with a measured value
+gain = {TYPICAL_SD}  # the same
 
 [{axis}.drive]
 kind = "linear"  # torque = torque_per_volt V

@@ -39,12 +39,14 @@ class Choice(NamedTuple):
         likelihood: under the noise that they leave.
         before, fit: of the nominal device, and of the device with them.
         rivals: other laws in the place of each, by its key.
+        leaves_nothing: whether free corrections of all stages beside them have no evidence.
     """
 
     likelihood: Likelihood
     before: Fit
     fit: Fit
     rivals: dict[str, tuple[RivalFit, ...]]
+    leaves_nothing: bool
 
 
 def choose_laws(
@@ -107,7 +109,7 @@ def choose_laws(
         return None
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
-    return Choice(likelihood, before, fit, rivals)
+    return Choice(likelihood, before, fit, rivals, linear.leaves_nothing(present))
 
 
 def _evidence_of_discrepancy(likelihood: Likelihood, anchor: Fit, candidates: Sequence[Candidate]) -> float:

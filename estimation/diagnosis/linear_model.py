@@ -28,8 +28,12 @@ from scanner.arrays import Array
 Effects = frozenset[tuple[str, str]]
 """Effects of a set of laws: axis and name of each."""
 
-SCALE_ITERATIONS = 12
-"""Fixed-point iterations of the discrepancy's scales. They change a score by less than 1 afterwards."""
+SCALE_ITERATIONS, SCORE_TOLERANCE = 40, 0.05
+"""Largest number of fixed-point iterations of the discrepancy's scales, and the change of a score by the next one below
+which they end: half of the smallest difference on which a choice depends."""
+
+MIN_DETERMINED = 1e-3
+"""Least number of coefficients of a discrepancy term that count as determined: it keeps a scale finite."""
 
 MIN_SCALE, MAX_SCALE, INITIAL_SCALE = 1e-4, 1.0, 0.1
 """Bounds of a discrepancy's scale in units of its prior, and the first value."""
@@ -148,41 +152,43 @@ class LinearModel:
     def _groups(self) -> list[NDArray[np.intp]]:
         return [term.columns for term in self.discrepancies]
 
-    def hypothesis(self, laws: Sequence[int], scales: Array | None = None, iterations: int = SCALE_ITERATIONS,
-                   without: Collection[int] = (), max_scale: float = MAX_SCALE) -> Hypothesis:  # fmt: skip
+    def hypothesis(self, laws: Sequence[int], scales: Array | None = None, without: Collection[int] = (),
+                   max_scale: float = MAX_SCALE) -> Hypothesis:  # fmt: skip
         """The laws beside the discrepancy, its scales by maximum evidence from ``scales`` on.
 
         Args:
             without: discrepancy terms that are left out.
             max_scale: upper bound of the scales.
         """
-        groups = [group for i, group in enumerate(self._groups) if i not in without]
+        used = [i for i in range(len(self.discrepancies)) if i not in without]
         of_laws = [column for i in laws for column in self.laws[i].columns]
+        groups = [self._groups[i] for i in used]
         at = np.concatenate([np.array(of_laws, int), *groups])
         ends = len(of_laws) + np.cumsum([0, *(group.size for group in groups)])
         reduced = triangular_factor(self.factor[:, [*at, -1]])
         start = np.full(len(self._groups), INITIAL_SCALE**2) if scales is None else scales
-        values = np.array([v for i, v in enumerate(start) if i not in without])
-        for turn in range(iterations + 1):
+        values = np.clip(start[used], MIN_SCALE**2, max_scale**2)
+        for _ in range(SCALE_ITERATIONS):
             precision = np.ones(at.size)
             for value, (low, high) in zip(values, pairwise(ends), strict=True):
                 precision[low:high] = 1.0 / value
             regression = regress(reduced[:, :-1], reduced[:, -1:], precision)
-            inverse = np.linalg.inv(regression.factor)
+            inverse = regression.inverse_factor
             estimate = -inverse @ regression.projected[:, 0]
-            if turn == iterations:
-                break
             variance = np.einsum("ij,ij->i", inverse, inverse)
-            new = values.copy()
-            for i, (low, high) in enumerate(pairwise(ends)):
-                determined = (high - low) - float(variance[low:high].sum()) / values[i]
-                new[i] = float(estimate[low:high] @ estimate[low:high]) / max(determined, 1e-3)
-            values = np.clip(new, MIN_SCALE**2, max_scale**2)
+            power = np.array([estimate[low:high] @ estimate[low:high] for low, high in pairwise(ends)])
+            spread = np.array([variance[low:high].sum() for low, high in pairwise(ends)])
+            determined = np.maximum(np.diff(ends) - spread / values, MIN_DETERMINED)
+            new = np.clip(power / determined, MIN_SCALE**2, max_scale**2)
+            slope = determined - power / values  # of the score by the logarithm of a scale
+            if np.abs(slope * np.log(new / values)).sum() < SCORE_TOLERANCE:
+                break
+            values = new
         misfit = float(np.sum(regression.remainder**2))
         shapes = sum(self.laws[i].cost for i in laws)
         cost = regression.log_determinant - float(np.log(precision).sum())
-        all_scales = np.array(start, float)
-        all_scales[[i for i in range(len(self._groups)) if i not in without]] = values
+        all_scales = start.copy()
+        all_scales[used] = values
         return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes + self.cost, misfit)
 
     def select(self, laws: Sequence[int] = (), max_moves: int | None = None) -> Hypothesis:
@@ -219,9 +225,7 @@ class LinearModel:
         return min(without, beside) + MIN_SCORE_GAIN * len(laws)
 
     def _is_possible(self, laws: tuple[int, ...]) -> bool:
-        """Whether no law is an imitation, and all estimates have a physically possible sign."""
-        if self._without_imitations(laws) != laws:
-            return False
+        """Whether all estimates have a physically possible sign, and no law is an imitation."""
         estimates, first = self.estimate([self.laws[i] for i in laws]), 0
         for i in laws:
             candidate = self.laws[i].candidate
@@ -229,7 +233,7 @@ class LinearModel:
             if any(sign * estimates[first + j] < 0.0 for j, sign in enumerate(signs)):
                 return False
             first += self.laws[i].columns.size
-        return True
+        return self._without_imitations(laws) == laws
 
     def estimate(self, terms: Sequence[LinearTerm]) -> Array:
         """Estimates of terms without others, one after the other."""
@@ -377,6 +381,10 @@ class LinearModel:
             gain = np.einsum("id,id->d", projected, np.linalg.solve(normal, projected))
             largest = np.maximum(largest, gain - np.linalg.slogdet(normal)[1] - law.cost)
         return float(np.quantile(largest, 1.0 - probability)) if self.laws else 0.0
+
+    def leaves_nothing(self, laws: Sequence[int]) -> bool:
+        """Whether the discrepancy terms of all stages beside laws have no evidence at all."""
+        return self._without_discrepancy(laws).neg2_log_evidence < self.hypothesis(laws).neg2_log_evidence
 
     def gain_of_discrepancy(self, laws: Sequence[int]) -> float:
         """Fall of the misfit by the discrepancy terms of all stages beside laws."""

@@ -109,7 +109,7 @@ def common_parameters(fit: Fit) -> list[int]:
 def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequence[LinearTerm]) -> Fit:
     """The fit with these terms and no others, from their estimates in the linear model.
 
-    Where that fit loses the motion, it is repeated over windows of increasing length.
+    Where they do not follow the motion, it is made over windows of increasing length.
 
     Args:
         fit: around which the model is linear.
@@ -129,11 +129,10 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
                 x[i] = without[i] = term.test.x[term.test.model.index("term", f.owner, f.name)]
         set_amplitudes(x, model, term.candidate, estimates[low:high])
     start = damped_start(likelihood, fit, model, without, x - without)
-    fitted = fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
-    if fitted.chi2 < MAX_CHI2_RATIO * fit.chi2:
-        return fitted
-    grown = fit_growing(likelihood, model, x, window_schedule(model)[0])
-    return min(fitted, grown, key=lambda either: either.chi2)
+    residual = likelihood.residual(model, start)[fit.rows]
+    if residual @ residual < MAX_CHI2_RATIO * fit.chi2:
+        return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
+    return fit_growing(likelihood, model, x, window_schedule(model)[0])
 
 
 def fit_laws(

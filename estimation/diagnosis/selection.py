@@ -24,7 +24,7 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
-from estimation.diagnosis.pruning import drop_redundant, prune_by_evidence, refit_without
+from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import (
     ScoreTest,
     all_candidates,
@@ -49,11 +49,6 @@ and a damping that depend on the amplitude, a stiffness and a damping that drift
 MAX_NONLINEAR_STARTS = 8
 """Starts of a law that is linear in no amplitude that are fitted, those with the largest predicted gain. In five
 recordings of a mode that grows, of 3 to 82 starts, the best fit came from one of the first six."""
-
-NONLINEAR_ITERATIONS, NONLINEAR_TOLERANCE = 60, 1e-3
-"""Largest number of iterations of the fit with a law that is linear in no amplitude, and the fall of the misfit below
-which it ends: the values of a mode that grows lie in a curved valley, along which an ordinary fit left 15 % of an
-error."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +86,22 @@ class SelectionResult:
 
 @dataclass(frozen=True)
 class _Selected:
-    """Selected terms: the fit with them, the noise that it leaves, and the rivals of each by its key."""
+    """Selected terms.
+
+    Attributes:
+        likelihood: under the noise that they leave.
+        nominal, fit: without them, and with them.
+        without: fits without one of several terms, by its key.
+        rivals: of each by its key.
+        leaves_nothing: whether free corrections of all stages beside them have no evidence.
+    """
 
     likelihood: Likelihood
+    nominal: Fit
     fit: Fit
+    without: Mapping[str, Fit] = field(default_factory=dict)
     rivals: Mapping[str, tuple[RivalFit, ...]] = field(default_factory=dict)
+    leaves_nothing: bool = False
 
 
 def select_terms(
@@ -125,9 +131,8 @@ def select_terms(
     progress(f"{len(pool)} candidates")
     selected = _choose_around_nominal(likelihood, nominal, early, stops, pool, progress)
     selected = _with_nonlinear_term(selected, nominal, pool, progress)
-    nominal = fit_model(selected.likelihood, nominal.model, nominal.x)
-    steps = tuple(_step(selected, nominal, candidate) for candidate in selected.fit.model.candidates)
-    return SelectionResult(selected.likelihood, nominal, selected.fit, steps)
+    steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
+    return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps)
 
 
 def _choose_around_nominal(
@@ -148,7 +153,7 @@ def _choose_around_nominal(
     of_discrepancy = [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])]
     discrepancy = _choose_discrepancy(anchor, of_discrepancy, nominal, pool)
     if discrepancy is None:
-        return _Selected(likelihood, nominal)
+        return _Selected(likelihood, nominal, nominal)
     return _choose_laws(discrepancy.fit, nominal, pool, progress) or discrepancy
 
 
@@ -157,10 +162,10 @@ def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress:
     choice = choose_laws(anchor, nominal, pool, progress)
     if choice is None:
         return None
-    fit = drop_redundant(choice.likelihood, choice.fit)
+    fit, without = drop_redundant(choice.likelihood, choice.fit)
     if not evidence_gain(choice.likelihood, choice.before, fit):
         return None
-    return _Selected(choice.likelihood, fit, choice.rivals)
+    return _Selected(choice.likelihood, choice.before, fit, without, choice.rivals, choice.leaves_nothing)
 
 
 def _choose_discrepancy(
@@ -189,7 +194,7 @@ def _choose_discrepancy(
     likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
     best = fit_model(likelihood, best.model, best.x)
     before = fit_model(likelihood, nominal.model, nominal.x)
-    return _Selected(likelihood, best) if evidence_gain(likelihood, before, best) else None
+    return _Selected(likelihood, before, best) if evidence_gain(likelihood, before, best) else None
 
 
 def _nonlinear_starts(likelihood: Likelihood, base: Fit, pool: Sequence[Candidate]) -> list[ScoreTest]:
@@ -204,9 +209,12 @@ def _nonlinear_starts(likelihood: Likelihood, base: Fit, pool: Sequence[Candidat
 def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected:
     """The selection with a law that is linear in no amplitude, as a clip level or a mode that grows, where one gains.
 
-    The named laws are chosen again beside it.
+    The named laws are chosen again beside it. Where free corrections beside the selected laws have no evidence, such a
+    law has none either.
     """
-    bases = [fit_model(selected.likelihood, nominal.model, nominal.x)]
+    if selected.leaves_nothing:
+        return selected
+    bases = [selected.nominal]
     if uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates)):
         bases.append(selected.fit)
     scored = [(base, score) for base in bases for score in _nonlinear_starts(selected.likelihood, base, pool)]
@@ -222,20 +230,20 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
     laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
     if not beside.are_needed(laws, misfit(base) - misfit(best), alone):
         return selected
-    best = fit_model(
-        selected.likelihood, best.model, best.x, max_iterations=NONLINEAR_ITERATIONS, tolerance=NONLINEAR_TOLERANCE
-    )
+    best = fit_to_convergence(selected.likelihood, best.model, best.x)
     progress(f"laws beside {best.model.candidates[-1].key}")
     with_laws = _choose_laws(best, nominal, pool, progress)
     if with_laws is not None:
         return with_laws
     likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
-    return _Selected(likelihood, drop_redundant(likelihood, fit_model(likelihood, best.model, best.x)))
+    before = fit_model(likelihood, nominal.model, nominal.x)
+    return _Selected(likelihood, before, *drop_redundant(likelihood, fit_model(likelihood, best.model, best.x)))
 
 
-def _step(selected: _Selected, nominal: Fit, candidate: Candidate) -> SelectionStep:
+def _step(selected: _Selected, candidate: Candidate) -> SelectionStep:
     """The selection step of one term."""
-    fit, rivals = selected.fit, selected.rivals.get(candidate.key, ())
-    alone = len(fit.model.candidates) == 1 and bool(candidate.term.free_parameters)
-    before = nominal if alone else refit_without(selected.likelihood, fit, candidate)
-    return SelectionStep(candidate, before, fit, rivals)
+    fit, before = selected.fit, selected.without.get(candidate.key)
+    if before is None:
+        alone = len(fit.model.candidates) == 1 and bool(candidate.term.free_parameters)
+        before = selected.nominal if alone else refit_without(selected.likelihood, fit, candidate)
+    return SelectionStep(candidate, before, fit, selected.rivals.get(candidate.key, ()))

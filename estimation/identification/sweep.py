@@ -1,8 +1,10 @@
 """Mechanics from a drive whose frequency or amplitude changes: the equation of motion of the complex amplitude.
 
-With theta = Im(Z exp(i psi)) and the torque Im(T exp(i psi)), psi the phase of the reference and w its rate, the
-equation J theta'' + b theta' + k theta = torque becomes ((i w + D)^2 + (i w + D) b/J + k/J) Z = T/J, D = d/dt. It is
-linear in k/J, b/J and 1/J and holds in a transient, so that a sweep need not be slow against the decay time.
+With theta = Im(Z exp(i w t)) and the torque Im(T exp(i w t)), w a constant near the strongest motion, the equation
+J theta'' + b theta' + k theta = torque becomes ((i w + D)^2 + (i w + D) b/J + k/J) Z = T/J, D = d/dt. It is linear in
+k/J, b/J and 1/J and holds in a transient, so that a sweep need not be slow against the decay time. All its coefficients
+are constant, so that it also holds between averages of Z and T under one window, however fast the drive is swept: with
+the rate of a swept reference in place of w, the average of a product would be taken for the product of the averages.
 """
 
 from __future__ import annotations
@@ -25,8 +27,7 @@ WINDOW_CYCLES = 8.0
 frequency."""
 
 HOPS_PER_WINDOW = 16
-"""Points per window: the derivative D by central differences of fourth order is then exact to 1e-3 for everything that
-passes the window."""
+"""Points per window: the equation is taken at overlapping windows, whose dependence the covariance allows for."""
 
 MIN_INVERSE_INERTIA_SDS = 3.0
 """Estimate of 1/J over its standard deviation from which J is reported: below, its interval includes infinity."""
@@ -72,19 +73,24 @@ def _equations(axis: Axis, record: SweptRecord) -> tuple[Complex, Complex]:
     """Columns of k/J, b/J and 1/J, shape (points, 3), and the right-hand side of the equation, shape (points,)."""
     rate = record.driven.rate
     hop = max(1, round(WINDOW_CYCLES * rate / record.reference.frequency / HOPS_PER_WINDOW))
-    psi = record.reference.phase(record.time)
-    z, torque = (
-        _complex_amplitude(values, psi, hop) for values in (record.driven.angle, drive_torque(axis, record.driven))
+    w = 2.0 * np.pi * _strongest_frequency(record, hop)
+    carrier = 2j * np.exp(-1j * w * (record.time - record.time[0]))
+    angle, torque = (
+        (values - values.mean()) * carrier for values in (record.driven.angle, drive_torque(axis, record.driven))
     )
-    w = _smoothed(np.gradient(psi) * rate, hop)
-    step = hop / rate
-    first, second = _derivative(z, step), _derivative(_derivative(z, step), step)
-    turn = _derivative(w, step)
-    inner = slice(4, -4)
-    velocity = (1j * w * z)[2:-2] + first
-    acceleration = second + 2j * w[4:-4] * first[2:-2] + (1j * turn[2:-2] - w[4:-4] ** 2) * z[inner]
-    columns = np.stack([z[inner], velocity[2:-2], -torque[inner]], axis=1)
-    return columns, -acceleration
+    windows = _windows(hop, rate)
+    z, first, second = (_averaged(angle, window, hop) for window in windows)
+    velocity, acceleration = 1j * w * z + first, second + 2j * w * first - w**2 * z
+    return np.stack([z, velocity, -_averaged(torque, windows[0], hop)], axis=1), -acceleration
+
+
+def _strongest_frequency(record: SweptRecord, hop: int) -> float:
+    """Mean frequency of the reference, weighted with the square of the motion's amplitude [Hz]."""
+    psi = record.reference.phase(record.time)
+    window = _windows(hop, record.driven.rate)[0]
+    power = np.abs(_averaged(2j * (record.driven.angle - record.driven.angle.mean()) * np.exp(-1j * psi), window, hop))
+    rate = _averaged(np.gradient(psi) * record.driven.rate / (2.0 * np.pi), window, hop).real
+    return float(np.average(rate, weights=power**2))
 
 
 def _covariance(columns: Complex, residual: NDArray[Any]) -> Array:
@@ -103,20 +109,22 @@ def _covariance(columns: Complex, residual: NDArray[Any]) -> Array:
     return np.asarray(inverse @ spread @ inverse / np.outer(size, size))
 
 
-def _complex_amplitude(values: Array, psi: Array, hop: int) -> Complex:
-    """Z of Im(Z exp(i psi)) averaged under Hann windows, one every ``hop`` samples."""
-    mixed = 2j * (values - values.mean()) * np.exp(-1j * psi)
-    return _smoothed(mixed.real, hop) + 1j * _smoothed(mixed.imag, hop)
+def _windows(hop: int, rate: float) -> tuple[Array, Array, Array]:
+    """Hann window of ``HOPS_PER_WINDOW`` hops and its first and second derivative in time, of the sum 1.
+
+    The average under a derivative of the window is the derivative of the average under the window, because the window
+    and its first derivative are 0 at both ends.
+    """
+    size = HOPS_PER_WINDOW * hop
+    turn = 2.0 * np.pi * np.arange(size + 1) / size
+    w = 2.0 * np.pi * rate / size
+    curved = w**2 * np.cos(turn)
+    curved[[0, -1]] /= 2.0  # the trapezoidal rule, as the second derivative is not 0 at the ends
+    return tuple(each / size for each in (1.0 - np.cos(turn), w * np.sin(turn), curved))  # type: ignore[return-value]
 
 
-def _smoothed(values: Array, hop: int) -> Array:
-    """Hann-weighted means of ``HOPS_PER_WINDOW`` hops, one every ``hop`` samples."""
+def _averaged(values: Array | Complex, window: Array, hop: int) -> Complex:
+    """Averages under a window, one every ``hop`` samples."""
     from scipy.signal import oaconvolve
 
-    window = np.hanning(HOPS_PER_WINDOW * hop + 1)
-    return np.asarray(oaconvolve(values, window / window.sum(), mode="valid")[::hop])
-
-
-def _derivative(values: Complex | Array, step: float) -> Complex:
-    """Central differences of fourth order, two points shorter at either end."""
-    return np.asarray((values[:-4] - 8 * values[1:-3] + 8 * values[3:-1] - values[4:]) / (12 * step))
+    return np.asarray(oaconvolve(values, window, mode="valid")[::hop], np.complex128)

@@ -103,6 +103,9 @@ def axis_motion_from_edges(
         by_edges = None if measured is None else amplitude
         found, by_edges = _without_harmonics(edges, found, by_edges, harmonics.at(knots, found.time))
         amplitude = amplitude if by_edges is None else by_edges
+    if abs(edges.hysteresis) > float(np.median(amplitude)):
+        what = f"hysteresis is {edges.hysteresis:g} rad, more than the amplitude, {float(np.median(amplitude)):.4g} rad"
+        raise BadInput(what, file=edges.file, channel=edges.name, hint="state it in rad, as the mirror turns")
     if edges.hysteresis:
         lag = np.arcsin(np.clip(edges.hysteresis / (amplitude * np.cos(found.asymmetry)), -1.0, 1.0))
     else:

@@ -31,6 +31,9 @@ PERIOD_GAIN = 0.05
 MAX_STRAY_FRACTION = 0.2
 """Fraction of stray and doubled edges above which the list is refused."""
 
+MAX_MISSING_FRACTION = 0.8
+"""Fraction of missing edges above which the list is refused: the period is then that of a disturbance."""
+
 FIRST_EDGES = 12
 """Edges that are tried as the first one: a stray one would number all others wrongly."""
 
@@ -96,6 +99,12 @@ def number_edges(edges: Edges) -> NumberedEdges:
     if used.sum() < MIN_EDGES or stray + doubled > MAX_STRAY_FRACTION * times.size:
         what = f"is no regular sequence of edges: {stray} of {times.size} are out of place and {doubled} repeated"
         raise bad(what, "check the detector's threshold, and that the motion was on all the time")
+    if missing > MAX_MISSING_FRACTION * (missing + used.sum()):
+        what = f"{missing} of {missing + used.sum()} edges of a motion at {1.0 / length:.4g} Hz are missing"
+        hint = (
+            f"edges lie {length / kinds:.3g} s apart: keep one of those that belong together, and check the threshold"
+        )
+        raise bad(what, hint)
     return NumberedEdges(times[first:][used], numbered[used], period[used], length, dwell, missing, doubled, stray)
 
 

@@ -46,7 +46,12 @@ MAX_DECAY_TIMES = 30.0
 """Decay times over which the search for the steady motion is integrated: transients are then below 1e-13."""
 
 STEP_DECAY_TIMES = 0.1
-"""Step of that integration in decay times: small enough for the explicit Euler method."""
+"""Step of that integration in decay times. The linearly implicit Euler method follows growth and decay with it, and is
+stable for a drive beside the resonance, under which the phase turns many times in a decay time."""
+
+MAX_STEP_CHANGE = 1.0
+"""Largest change of phase [rad] and ln A in one step. Under a linear drive both rates grow as 1/A while the motion
+passes a small amplitude. The limit changes the way to the steady motion, not the steady motion."""
 
 MAX_STEADY_CHANGE = 1e-5
 """Change of phase [rad] and ln A over the last step at which the motion counts as steady."""
@@ -198,8 +203,11 @@ def find_steady_motion(observations: BlockObservations) -> SteadyMotion | None:
     for phase in np.pi * np.arange(4) / 4:
         log = float(np.log(START_AMPLITUDE_THETA0 * law.theta0))
         for _ in range(round(MAX_DECAY_TIMES / STEP_DECAY_TIMES)):
-            rate = average_cycle(law, np.exp(log), phase, w, law.k, law.b, force).rate
-            phase, log = phase + step * rate.imag, min(log + step * rate.real, log_limit)
+            cycle = average_cycle(law, np.exp(log), phase, w, law.k, law.b, force)
+            slope = np.eye(2) - step * _phase_and_log_rows(cycle.by_phase, cycle.by_log)
+            change = np.linalg.solve(slope, (step * cycle.rate.imag, step * cycle.rate.real))
+            turn, growth = np.clip(change, -MAX_STEP_CHANGE, MAX_STEP_CHANGE).tolist()
+            phase, log = phase + turn, min(log + growth, log_limit)
         cycle = average_cycle(law, np.exp(log), phase, w, law.k, law.b, force)
         if abs(cycle.rate) * step < MAX_STEADY_CHANGE and (best is None or log > best.log_amplitude):
             by_state = _phase_and_log_rows(cycle.by_phase, cycle.by_log)

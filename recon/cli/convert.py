@@ -67,7 +67,7 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
     if not channels:
         raise BadInput("no option assigns variables to channels", file=args.file, hint=f"assign them, {hint}")
     for option, (key, kind) in OPTIONS.items():
-        for text in getattr(args, option):
+        for text in sorted(getattr(args, option), key=lambda each: "=" in each):  # what one channel has overrides
             name, given, value = text.rpartition("=")
             if given and name not in channels:
                 raise BadInput(f"{name!r} is no channel named by --channel", channel=f"--{option}", hint=hint)

@@ -49,6 +49,9 @@ PERIODS_PER_SEARCH = 12
 """Periods of the slower axis in which the phases are searched at once: enough to cross most of the field, and half of a
 slice of the registration, within which the phase drifts less."""
 
+MAX_CLOSED_PERIODS = PERIODS_PER_SEARCH // 4
+"""Periods of the slower axis after which a figure that repeats is named as the cause of a failed search."""
+
 MIN_FOUND_FRACTION = 0.5
 """Fraction of the slices in which the search has to find the phase of an axis."""
 
@@ -196,7 +199,21 @@ def _describe_failure(
     return (
         f"forward and backward half-periods agree for no phase, with motions at {at} (best correlation "
         f"{min(best, 1.0):.2f}; frequencies have to be right within {0.1 / length:.2g} Hz)"
+        f"{_describe_closed_figure(references, length)}"
     )
+
+
+def _describe_closed_figure(references: Mapping[str, PhaseReference], length: float) -> str:
+    """Words for a figure that repeats within a slice of ``length`` [s], and so crosses little of the field."""
+    x, y = (references[name].frequency for name in AXES)
+    for q in range(1, MAX_CLOSED_PERIODS + 1):
+        p = round(q * max(x, y) / min(x, y))
+        if abs(q * max(x, y) - p * min(x, y)) * length < 1.0:
+            return (
+                f"; the frequencies are nearly {p} : {q}, so that the figure repeats itself {PERIODS_PER_SEARCH // q} "
+                "times while phases are searched, and crosses little of the field: choose others, see lissajous design"
+            )
+    return ""
 
 
 def _continue_phases(found: list[PhaseFound]) -> tuple[Array, bool]:

@@ -55,6 +55,10 @@ MAX_FILL_SQUARED = 0.98
 """Bound on fill²: at 1 the lag has an infinite slope at the border."""
 
 
+DIRECTIONS = (0, 1, 0)
+"""Gradient that belongs to shift, tilt and fill²: along the lines (0) or across them (1)."""
+
+
 class LinePhase(NamedTuple):
     """Distance between the lines of the two directions at the middle of the sweep, and its standard error [px].
 
@@ -126,22 +130,23 @@ def _interpolate_lines(lines, places, out):  # type: ignore[no-untyped-def]
     Cubic convolution moves detail by up to 0.016 f'' pixels, in opposite directions in the lines of the two directions.
     """
     columns = lines.shape[1]
-    index, weight = np.empty(6, np.int64), np.empty(6, np.float32)
+    index, weight = np.empty((6, columns), np.int64), np.empty((6, columns), np.float32)
     for j in range(columns):
         at = min(max(places[j], 0.0), columns - 1.0)
         low = min(int(at), columns - 2)
         t = at - low
         for k in range(6):
-            index[k] = min(max(low + k - 2, 0), columns - 1)
+            index[k, j] = min(max(low + k - 2, 0), columns - 1)
             product = 1.0
             for m in range(6):
                 if m != k:
                     product *= (t + 2.0 - m) / (k - m)
-            weight[k] = product
-        for i in range(lines.shape[0]):
+            weight[k, j] = product
+    for i in range(lines.shape[0]):
+        for j in range(columns):
             value = np.float32(0.0)
             for k in range(6):
-                value += weight[k] * lines[i, index[k]]
+                value += weight[k, j] * lines[i, index[k, j]]
             out[i, j] = value
 
 
@@ -179,56 +184,50 @@ def shift_equations(frame: NDArray[Any], shift: float, fill_squared: float, inst
         even, odd = (_smoothed_lines(moved, parity, instrument) for parity in (0, 1))
         mean_x, mean_y, other_x, other_y, own_y = (np.zeros_like(moved) for _ in range(5))
         _own_gradients(even, odd, mean_x, mean_y, other_x, other_y, own_y)
+    band = np.arange(rows) * BLOCKS_ACROSS // rows
+    border = math.ceil(abs(shift) / 2) + 2  # columns that one direction did not record, and those of the difference
+    score_sums, slope_sums = np.zeros((2, BLOCKS_ACROSS, columns)), np.zeros((4, BLOCKS_ACROSS, columns))
+    _sum_products(moved, mean_x, mean_y, other_x, other_y, own_y, border, band, score_sums, slope_sums)
     u = column_places(columns)
     lag = lag_at(u, fill_squared)
-    by_fill = -0.5 * shift * u * u / np.maximum(lag, 0.1)
-    row_block, column_block = (np.arange(size) * BLOCKS_ACROSS // size for size in (rows, columns))
-    score, slope = np.zeros((BLOCKS_ACROSS**2, 3)), np.zeros((BLOCKS_ACROSS**2, 3, 3))
-    column_score, column_slope = np.zeros((BLOCKS_ACROSS, columns)), np.zeros((BLOCKS_ACROSS, columns))
-    border = math.ceil(abs(shift) / 2) + 2  # columns that one direction did not record, and those of the difference
-    pictures, places = (mean_x, mean_y, other_x, other_y, own_y), (lag, u, by_fill, row_block, column_block)
-    _accumulate(moved, *pictures, border, *places, score, slope, column_score, column_slope)
-    return ShiftEquations(score, slope, column_score, column_slope)
+    factors = np.array([lag, u, -0.5 * shift * u * u / np.maximum(lag, 0.1)])
+    first = np.searchsorted(np.arange(columns) * BLOCKS_ACROSS // columns, np.arange(BLOCKS_ACROSS))
+    score = np.add.reduceat(factors[:, None] * score_sums[list(DIRECTIONS)], first, axis=-1)
+    pairs = slope_sums.reshape(2, 2, BLOCKS_ACROSS, columns)[np.ix_(DIRECTIONS, DIRECTIONS)]
+    slope = np.add.reduceat(factors[:, None, None] * factors[None, :, None] * pairs, first, axis=-1)
+    blocks = BLOCKS_ACROSS**2
+    return ShiftEquations(
+        score.reshape(3, blocks).T, slope.reshape(3, 3, blocks).transpose(2, 0, 1), score_sums[0], slope_sums[0]
+    )
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(  # type: ignore[no-untyped-def]
-    moved,
-    mean_x,
-    mean_y,
-    other_x,
-    other_y,
-    own_y,
-    border,
-    lag,
-    u,
-    by_fill,
-    row_block,
-    column_block,
-    score,
-    slope,
-    column_score,
-    column_slope,
+def _sum_products(  # type: ignore[no-untyped-def]
+    moved, mean_x, mean_y, other_x, other_y, own_y, border, band, score, slope
 ):
+    """Add up, by band of lines and column, the products of which scores and slopes consist but for factors that depend
+    on the column alone.
+
+    Args:
+        score: the gradient along and across the lines times the difference, shape (2, bands, columns).
+        slope: the independent gradient along, then across the lines times the frame's own gradient along and across
+            them, shape (4, bands, columns).
+    """
     rows, columns = moved.shape
-    mean, independent, regressor = np.empty(3), np.empty(3), np.empty(3)
     for i in range(1, rows - 1):
-        sign = 1.0 if i % 2 == 0 else -1.0
+        half = np.float32(0.5)
+        sign = np.float32(1.0) if i % 2 == 0 else np.float32(-1.0)
+        b = band[i]
         for j in range(border, columns - border):
-            difference = sign * (moved[i, j] - 0.5 * (moved[i - 1, j] + moved[i + 1, j]))
+            difference = sign * (moved[i, j] - half * (moved[i - 1, j] + moved[i + 1, j]))
             near, far = moved[i, j + 1] - moved[i, j - 1], moved[i, j + 2] - moved[i, j - 2]
-            raw_x = (8.0 * near - far) / 12.0
-            m_x, o_x = mean_x[i, j], other_x[i, j]
-            mean[0], mean[1], mean[2] = lag[j] * m_x, u[j] * mean_y[i, j], by_fill[j] * m_x
-            independent[0], independent[1], independent[2] = lag[j] * o_x, u[j] * other_y[i, j], by_fill[j] * o_x
-            regressor[0], regressor[1], regressor[2] = lag[j] * raw_x, u[j] * own_y[i, j], by_fill[j] * raw_x
-            block = row_block[i] * BLOCKS_ACROSS + column_block[j]
-            for k in range(3):
-                score[block, k] += mean[k] * difference
-                for m in range(3):
-                    slope[block, k, m] += independent[k] * regressor[m]
-            column_score[row_block[i], j] += m_x * difference
-            column_slope[row_block[i], j] += o_x * raw_x
+            own_x = (8.0 * near - far) / 12.0
+            score[0, b, j] += mean_x[i, j] * difference
+            score[1, b, j] += mean_y[i, j] * difference
+            slope[0, b, j] += other_x[i, j] * own_x
+            slope[1, b, j] += other_x[i, j] * own_y[i, j]
+            slope[2, b, j] += other_y[i, j] * own_x
+            slope[3, b, j] += other_y[i, j] * own_y[i, j]
 
 
 def estimate_line_phase(

@@ -17,7 +17,14 @@ import numpy as np
 
 from recon.imaging.bidirectional_phase import quadrature, slow_period
 from recon.imaging.bidirectional_search import SEARCH_REACH_RAD
-from recon.imaging.phase_search import BANDS, MIN_CORRELATION_RATIO, PHASE_CELLS, PhaseMatches, match_phases
+from recon.imaging.phase_search import (
+    BANDS,
+    MIN_CORRELATION_RATIO,
+    MIN_CORRELATION_SD,
+    PHASE_CELLS,
+    PhaseMatches,
+    match_phases,
+)
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
@@ -62,6 +69,18 @@ MAX_FOLLOWED_CORRELATION = 0.1
 place, whatever the phase is."""
 
 
+NEARBY_PERIODS = 1.0 / 16.0
+"""Distance in periods of the faster axis of samples whose correlation shows that the intensity holds more than noise:
+eight cells of phase, so that coarse detail alone keeps them alike."""
+
+MIN_ALIKE_CORRELATION = 0.3
+"""Correlation of successive samples from which those of one place can be expected to agree."""
+
+MAX_PLACE_RATIO = 0.25
+"""Largest correlation of opposite directions over that of successive samples up to which the picture is wrong. It is
+near 1 for a right motion in white noise, and above 0.5 if the phase drifts by a third of a turn."""
+
+
 class Contradiction(NamedTuple):
     """What the picture shows of an axis whose motion it contradicts.
 
@@ -80,16 +99,18 @@ class Contradiction(NamedTuple):
     is_doubled: bool
 
 
-class _Slice(NamedTuple):
+class SliceMatches(NamedTuple):
     """Correlations of one slice.
 
     Attributes:
         axes: over the phases of x and y.
         persistence: of samples a period of the faster axis apart.
+        nearby: of samples ``NEARBY_PERIODS`` apart.
     """
 
     axes: tuple[PhaseMatches, PhaseMatches]
     persistence: float
+    nearby: float
 
 
 def find_contradictions(beam: Motion, intensity: Channel) -> tuple[list[Contradiction], bool]:
@@ -102,7 +123,17 @@ def find_contradictions(beam: Motion, intensity: Channel) -> tuple[list[Contradi
     Returns:
         the axes, and whether the intensity does not follow the place.
     """
-    slices = [match for match in (_match_slice(beam, intensity, *part) for part in _slices(beam, intensity)) if match]
+    return judge_slices(match_slices(beam, intensity))
+
+
+def match_slices(beam: Motion, intensity: Channel) -> list[SliceMatches]:
+    """Correlations of all slices that hold samples that differ; arguments as for ``find_contradictions``."""
+    found = (_match_slice(beam, intensity, *part) for part in _slices(beam, intensity))
+    return [match for match in found if match is not None]
+
+
+def judge_slices(slices: Sequence[SliceMatches]) -> tuple[list[Contradiction], bool]:
+    """As ``find_contradictions``, from the correlations of the slices."""
     found = [_judge(column, slices) for column in range(len(AXES))]
     unfollowed = [_is_unfollowed(match) for match in slices]
     return [each for each in found if each is not None], bool(slices) and 2 * sum(unfollowed) > len(slices)
@@ -113,7 +144,8 @@ def describe_contradictions(beam: Motion, intensity: Channel) -> list[str]:
 
     Arguments as for ``find_contradictions``.
     """
-    found, unfollowed = find_contradictions(beam, intensity)
+    slices = match_slices(beam, intensity)
+    found, unfollowed = judge_slices(slices)
     lines = [_describe(each, float(np.median(beam.axes[each.axis].frequency))) for each in found]
     if unfollowed and not found:
         lines.append(
@@ -121,6 +153,22 @@ def describe_contradictions(beam: Motion, intensity: Channel) -> list[str]:
             "the picture shows something else than the scene: check that the intensity is the detector's signal, not "
             "its integral and not mostly drift, and check the frequencies of the motion"
         )
+    elif not found and 2 * sum(_disagrees_at_one_place(match) for match in slices) > len(slices) > 0:
+        alike, shown = (float(np.median([each(match) for match in slices])) for each in (_alike, _shown))
+        lines.append(
+            f"intensity: successive samples agree (correlation {alike:.2f}), and those of one place at different times "
+            f"do not ({shown:.2f}), so that the picture is wrong or shows the noise of a slow detector: check "
+            "sample_rate and start of intensity and sensors, and that they were recorded together"
+        )
+    if beam.estimator == "picture" and not lines:
+        for column, name in enumerate(AXES):
+            if 2 * sum(_is_folded(match.axes[column], _repeated(match.axes)) for match in slices) > len(slices):
+                frequency = float(np.median(beam.axes[name].frequency))
+                lines.append(
+                    f"{name}: the picture equals its mirror image in {name}: so does the specimen, or {name} moves at "
+                    f"{2 * frequency:.6g} Hz in place of {frequency:.6g} Hz and the picture is wrong: check kind and "
+                    f"frequency in [{name}.drive]"
+                )
     return lines
 
 
@@ -173,18 +221,20 @@ def axis_phases(beam: Motion, intensity: Channel, first: int, stop: int) -> tupl
     if known.sum() < 2 or np.ptp(values[known]) == 0.0:
         return None
     # The largest angle as amplitude makes a phase a matter of place and direction alone, in a spiral too.
-    x, y = (np.arctan2(angle, quadrature(angle, float(np.abs(angle[known]).max())))[known] for angle in angles)
-    return (x, y), values[known]
+    x, y = (np.arctan2(angle, quadrature(angle, float(np.abs(angle[known]).max()))) for angle in angles)
+    known &= np.isfinite(x) & np.isfinite(y)  # the quadrature is not known next to an unknown angle
+    return (x[known], y[known]), values[known]
 
 
-def _match_slice(beam: Motion, intensity: Channel, first: int, stop: int) -> _Slice | None:
+def _match_slice(beam: Motion, intensity: Channel, first: int, stop: int) -> SliceMatches | None:
     """Correlations of one slice; None without samples that differ."""
     found = axis_phases(beam, intensity, first, stop)
     if found is None:
         return None
     phases, values = found
-    lag = round(intensity.sample_rate / max(float(np.median(beam.axes[name].frequency)) for name in AXES))
-    return _Slice(match_phases(*phases, values), _autocorrelation(values, lag))
+    period = intensity.sample_rate / max(float(np.median(beam.axes[name].frequency)) for name in AXES)
+    persistence, nearby = (_autocorrelation(values, max(1, round(each * period))) for each in (1.0, NEARBY_PERIODS))
+    return SliceMatches(match_phases(*phases, values), persistence, nearby)
 
 
 def _autocorrelation(values: Array, lag: int) -> float:
@@ -200,7 +250,7 @@ def _repeated(matches: Sequence[PhaseMatches]) -> float:
     return min(matches[0].same_cell, max(float(each.reflected[each.best]) for each in matches))
 
 
-def _judge(column: int, slices: Sequence[_Slice]) -> Contradiction | None:
+def _judge(column: int, slices: Sequence[SliceMatches]) -> Contradiction | None:
     """The contradiction of an axis in most of the slices."""
     pairs = [(match.axes[column], _repeated(match.axes)) for match in slices]
     against = [pair for pair in pairs if _contradicts(*pair)]
@@ -230,11 +280,9 @@ def _contradicts(match: PhaseMatches, repeated: float) -> bool:
     if not repeated > 0.0 or at == match.best:
         return False
     fewer, more = sorted((match.common_cells[at], match.common_cells[match.best]))
-    by_band = match.by_band[:, match.best] - match.by_band[:, at]
     return bool(
         fewer >= max(MIN_COMMON_CELLS, MIN_COMMON_SHARE * more)
-        and by_band.mean() > MIN_BAND_SDS * by_band.std(ddof=1) / np.sqrt(BANDS)
-        and np.sum(by_band > 0.0) >= MIN_BANDS
+        and _differs_in_bands(match, at)
         and MIN_CORRELATION_RATIO * repeated <= best <= match.same_cell / MIN_CORRELATION_RATIO
         and agreement < MAX_AGREEMENT_RATIO * best
         and best - agreement > MIN_CONTRADICTION_SD * sd
@@ -248,14 +296,46 @@ def _is_doubled(match: PhaseMatches, repeated: float) -> bool:
     return max(match.half_turn, other * eighth) >= MIN_CORRELATION_RATIO * repeated
 
 
-def _is_unfollowed(match: _Slice) -> bool:
+def _is_folded(match: PhaseMatches, repeated: float) -> bool:
+    """Whether samples agree as well for a phase a quarter of a turn away, but for noise: the picture is symmetric."""
+    at = (match.best + PHASE_CELLS // 2) % PHASE_CELLS
+    noise = MIN_CORRELATION_SD * float(np.hypot(match.noise_sd[match.best], match.noise_sd[at]))
+    best, quarter = float(match.reflected[match.best]), float(match.reflected[at])
+    is_clear = best >= max(MIN_CORRELATION_RATIO * repeated, noise) and repeated > 0.0
+    return is_clear and best - quarter < noise and not _differs_in_bands(match, at)
+
+
+def _differs_in_bands(match: PhaseMatches, at: int) -> bool:
+    """Whether the correlation at the best phase exceeds that at another one in nearly all bands of the other axis."""
+    by_band = match.by_band[:, match.best] - match.by_band[:, at]
+    is_significant = by_band.mean() > MIN_BAND_SDS * by_band.std(ddof=1) / np.sqrt(BANDS)
+    return bool(is_significant and np.sum(by_band > 0.0) >= MIN_BANDS)
+
+
+def _alike(match: SliceMatches) -> float:
+    """Correlation of successive samples: of those in one cell of phase, most of which are of one pass, or nearby."""
+    return max(match.nearby, match.axes[0].same_cell)
+
+
+def _disagrees_at_one_place(match: SliceMatches) -> bool:
+    """Whether successive samples are alike and those of one place at different times are not, at any phase."""
+    cells = min(float(axis.common_cells.min()) for axis in match.axes)
+    alike = _alike(match)
+    return cells >= MIN_COMMON_CELLS and alike > MIN_ALIKE_CORRELATION and _shown(match) < MAX_PLACE_RATIO * alike
+
+
+def _shown(match: SliceMatches) -> float:
+    """Largest correlation of opposite directions over all phases of both axes."""
+    return max(float(axis.reflected[axis.best]) for axis in match.axes)
+
+
+def _is_unfollowed(match: SliceMatches) -> bool:
     """Whether the intensity hardly changes in a period of the faster axis, and agrees with the place at no phase."""
-    shown = max(float(axis.reflected[axis.best]) for axis in match.axes)
     cells = min(float(axis.common_cells.min()) for axis in match.axes)
     return (
         cells >= MIN_COMMON_CELLS
         and match.persistence > MIN_PERSISTENCE
-        and shown < MAX_FOLLOWED_CORRELATION * match.persistence
+        and _shown(match) < MAX_FOLLOWED_CORRELATION * match.persistence
     )
 
 

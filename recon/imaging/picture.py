@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,12 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 1 << 29
 """Pixels of a picture have to be fewer than this: gridding counts them in an int32 and needs a value beyond them."""
+
+
+def detector_names(stated: Sequence[str], count: int) -> list[str]:
+    """Name of each of ``count`` detectors in messages; ``stated`` may be empty."""
+    several = stated or [f"detector {number}" for number in range(count)]
+    return [f"intensity, {name}" for name in several] if count > 1 else ["intensity"]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon.imaging.held_out import SplitSums, held_out_ranges
 from recon.imaging.intensity_gridding import grid_scattered
 from recon.imaging.kernel_picture import PictureEstimate, choose_width, kernel_image, kernel_picture
-from recon.imaging.picture import Grid, Picture
+from recon.imaging.picture import Grid, Picture, detector_names
 from recon.imaging.pixel_noise import SampleNoise, pixel_sd
 from recon.imaging.recursive_frames import CarriedFrames, recursive_picture
 from recon.sample_ranges import SampleRanges, subtract_ranges
@@ -242,18 +242,22 @@ def _lies_on_one_line(means: Picture) -> bool:
 
 
 def _describe_flat(means: Picture, noise: Sequence[SampleNoise | None]) -> list[str]:
-    """A line where the means of the pixels of a detector are equal, or scatter as the noise of the samples alone."""
+    """A line for each detector whose pixels have equal means, or means that scatter as the noise alone."""
     visited = means.coverage > 0
     if not visited.any():
         return []
     counts = means.coverage[visited].astype(np.float64)
-    for detector, sample in zip(means.image[visited].reshape(counts.size, -1).T, noise, strict=True):
+    values = means.image[visited].reshape(counts.size, -1).T
+    names = detector_names(means.detectors, len(values))
+    lines = []
+    for name, detector, sample in zip(names, values, noise, strict=True):
         mean = float(np.average(detector, weights=counts))
         if np.allclose(detector, mean, rtol=FLOAT32_RELATIVE_ERROR, atol=0.0):
-            return [f"intensity: every sample is {mean:g}: the picture shows nothing; check the detector"]
+            lines.append(f"{name}: every sample is {mean:g}: the picture shows nothing; check the detector")
+            continue
         if sample is None or not (variance := float(sample.variance(np.asarray(mean)))) > 0:
             continue
         excess = float(np.mean(counts * (detector - mean) ** 2)) / variance - 1.0
         if excess < MAX_FLAT_EXCESS_SD * float(np.sqrt(2.0 / counts.size)):
-            return ["intensity: no structure beyond the noise was found; the picture is flat within its uncertainty"]
-    return []
+            lines.append(f"{name}: no structure beyond the noise was found; the picture is flat within its uncertainty")
+    return lines

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,8 @@ class Film:
         import tifffile
 
         with tifffile.TiffFile(self.path) as file:
-            pages = file.series[0].pages
+            series = _full_series(file)
+            pages = series[0].pages if len(series) == 1 else [page for each in series for page in each.pages]
             for index in indices:
                 planes = range(index * self.channels, (index + 1) * self.channels)
                 try:
@@ -69,7 +71,8 @@ class Film:
                     reason = " ".join(str(error).split()) or type(error).__name__
                     raise BadInput(f"frame {index} is damaged: {reason}", file=self.path) from None
                 if not np.isfinite(frame).all():
-                    raise BadInput(f"frame {index} holds pixels that are not finite numbers", file=self.path)
+                    hint = "replace them by the values around, or leave the frame out"
+                    raise BadInput(f"frame {index} holds pixels that are not finite", file=self.path, hint=hint)
                 yield frame
 
     def _plane(self, file: Any, pages: Any, index: int) -> NDArray[Any]:
@@ -89,19 +92,27 @@ def open_film(path: Path) -> Film:
     """
     import tifffile
 
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what is damaged is said in one line
     try:
         with tifffile.TiffFile(path) as file:
-            series, page = file.series[0], file.series[0].keyframe
+            several = _full_series(file)
+            series, page = several[0], several[0].keyframe
             film = Film(path, series.axes, series.shape, series.dtype, series.dataoffset, _description(file, page))
             colour = "S" in series.axes or page.photometric in COLOURS
             planes, size = len(series.pages), path.stat().st_size
+            if len(several) > 1:
+                film, planes = _join_series(film, several), len(several)
     except OSError as error:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name a film (TIFF)") from None
     except (tifffile.TiffFileError, ValueError, IndexError, KeyError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise BadInput(f"is no TIFF file that can be read: {reason}", file=path, hint="name a film (TIFF)") from None
     if colour:
-        raise BadInput("is a colour picture", file=path, hint="give the detectors as channels (axis C), not as RGB")
+        hint = (
+            "give the detectors as channels (axis C), not as RGB; tifffile.imwrite needs photometric='minisblack' for "
+        )
+        hint += "a film of 3 or 4 frames"
+        raise BadInput("is a colour picture", file=path, hint=hint)
     if film.axes[-2:] != "YX":
         raise BadInput(f"has the axes {film.axes}", file=path, hint="lines and columns have to be the last two")
     if film.dtype.kind not in "iuf":
@@ -112,6 +123,24 @@ def open_film(path: Path) -> Film:
     if film.offset is None and planes != film.frames * film.channels:
         raise BadInput(f"states {film.frames * film.channels} planes and holds {planes}", file=path)
     return film
+
+
+def _full_series(file: Any) -> list[Any]:
+    """Series of an open TIFF file, without thumbnails."""
+    return [each for each in file.series if not each.keyframe.is_reduced] or list(file.series[:1])
+
+
+def _join_series(film: Film, series: Sequence[Any]) -> Film:
+    """The film whose frames were written one by one, so that the file lists each as a series of its own.
+
+    Raises:
+        BadInput: they are no single planes of one size and type.
+    """
+    shapes = {f"{'x'.join(map(str, each.shape))} {each.axes} {each.dtype}" for each in series}
+    if len(shapes) > 1 or film.axes != "YX":
+        what = f"holds {len(series)} series ({', '.join(sorted(shapes))})"
+        raise BadInput(what, file=film.path, hint="write the film that is meant into a file of its own")
+    return replace(film, axes="TYX", shape=(len(series), *film.shape), offset=None)
 
 
 def write_film(path: Path, film: Film, planes: Iterable[NDArray[Any]]) -> None:

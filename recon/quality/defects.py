@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true
+from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true, to_sample_ranges
 from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, READ_CHUNK_SAMPLES, Channel
-from scanner.motion import Motion
+from scanner.motion import Motion, SampledAngle
 from scanner.recording import Recording
 
 MERGE_GAP_S = 1e-3
@@ -26,6 +26,10 @@ MAX_PHASE_SD_RAD = 0.25
 
 EXTRAPOLATION_BLOCKS = 2.0
 """Blocks of the slow motion beyond its first and last one over which its phase is extrapolated."""
+
+MAX_CLIPPED_SHARE = 0.01
+"""Share of clipped samples of a position signal from which the picture is wrong. A sine that is clipped at both peaks
+for so long loses 1.2e-4 of its amplitude, 0.02 of 400 pixels."""
 
 PHASE_JUMP = "leap"
 """Kind of a phase jump. summary.json contains this text, and programs that read it depend on it."""
@@ -99,6 +103,20 @@ def unrecoverable_intervals(motion: Motion, defects: Sequence[Defect]) -> list[t
     ]
 
 
+def unlocated_samples(motion: Motion, beam: Motion, defects: Sequence[Defect], intensity: Channel) -> SampleRanges:
+    """Return the samples of the intensity during which the mirror's angle is unknown.
+
+    Args:
+        motion, defects: as for :func:`unrecoverable_intervals`.
+        beam: the motion as the light shows it, on the intensity's clock.
+        intensity: of the recording.
+    """
+    unknown = to_sample_ranges(unrecoverable_intervals(motion, defects), intensity)
+    stored = [axis.angle.values for axis in beam.axes.values() if isinstance(axis.angle, SampledAngle)]
+    unknown += [each for values in stored for each in runs_of_true(np.isnan(values))]
+    return [(first, stop) for first, stop in merge_ranges(sorted(unknown), 0)]
+
+
 def describe_defects(defects: Sequence[Defect]) -> Iterator[str]:
     """Yield a line of text for each channel and kind of defect."""
     for (channel, kind), group in groupby(defects, lambda defect: (defect.channel, defect.kind)):
@@ -109,6 +127,28 @@ def describe_defects(defects: Sequence[Defect]) -> Iterator[str]:
         fraction = sum(defect.fraction * (defect.stop - defect.start) for defect in same) / total
         share = "" if fraction > MAX_STATED_FRACTION else f", {fraction:.2g} of the samples there"
         yield f"{channel}: {name} for {1e3 * total:.4g} ms in {places}, the first at {same[0].start:.6g} s{share}"
+
+
+def describe_clipped_positions(defects: Sequence[Defect], motion: Motion, duration: float) -> list[str]:
+    """A line for each position signal that clips while the estimator takes its samples for the angle.
+
+    Args:
+        defects: of the recording.
+        motion: with the estimator's name.
+        duration: of the recording [s].
+    """
+    if motion.estimator != "sensor":
+        return []
+    shares: dict[str, float] = {}
+    for each in defects:
+        if each.kind == "clipped" and each.channel.startswith("sense"):
+            shares[each.channel] = shares.get(each.channel, 0.0) + each.fraction * (each.stop - each.start) / duration
+    return [
+        f"{name}: is clipped in {share:.0%} of the samples, which the estimator sensor takes for angles: the picture "
+        "is wrong beyond that angle; lower the amplifier's gain, or use --estimator tracker, which needs the mechanics"
+        for name, share in shares.items()
+        if share > MAX_CLIPPED_SHARE
+    ]
 
 
 def _find_missing_ends(channel: Channel, intensity: Channel) -> list[Defect]:

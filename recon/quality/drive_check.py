@@ -36,6 +36,11 @@ def check_signals(recording: Recording, device: Device) -> None:
     Raises:
         BadInput: both axes have the same samples, or each axis oscillates at the resonance of the other.
     """
+    times = [edges.times for edges in recording.edges.values()]
+    if len(times) == len(AXES) and np.array_equal(times[0], times[1]):
+        edges, other = recording.edges.values()
+        hint = "check the mapping: a list may be used twice"
+        raise BadInput(f"and {other.name} hold the same edges", file=edges.file, channel=edges.name, hint=hint)
     for kind in ("sense", "angle", "velocity", "acceleration"):
         names = [f"{kind}_{axis}" for axis in AXES]
         if not all(name in recording for name in names):

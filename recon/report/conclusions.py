@@ -228,9 +228,10 @@ def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
     """How many points there are, how far they reach and how uncertain they are."""
     reach = max(abs(edge) for edge in summary["extent_m"]["z"])
     sd = max(summary["sd_m"].values())
+    of_angles = "" if summary["range_sd_m"] else "; by the angles alone, without the range finder's noise"
     return (
         f"{summary['points']} points from {summary['shots']} shots, up to {reach:.3g} m away, with a standard "
-        f"deviation of at most {1e3 * sd:.2g} mm (rms of an axis). Use {file}."
+        f"deviation of at most {1e3 * sd:.2g} mm (rms of an axis{of_angles}). Use {file}."
     )
 
 

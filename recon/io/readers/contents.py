@@ -111,6 +111,10 @@ def map_blocks(blocks: Iterable[NDArray[Any]], file: Path) -> NDArray[Any]:
         return np.memmap(store, dtype, mode="r", shape=(rows, *shape))
 
 
+MIN_JUMP_STEPS = 1.5
+"""Step of time in usual steps from which it is a jump. Rounding of printed times is looked for by the straight line."""
+
+
 def rate_from_step(step: object) -> float | None:
     """Sample rate [Hz] from a sample interval [s], rounded to 15 digits as 1/5e-10 is not 2e9; None if not positive."""
     if not isinstance(step, (int, float)) or not 0 < step < np.inf or not np.isfinite(1 / np.float64(step)):
@@ -135,9 +139,32 @@ def infer_clock(times: SampleSource) -> tuple[float | None, float | None, str]:
             off = np.abs((block - first) / step - np.arange(low, low + len(block)))
             if not (off < MAX_CLOCK_DEVIATION_SAMPLES).all():
                 row = int(np.argmin(off < MAX_CLOCK_DEVIATION_SAMPLES))
-                what = f"its times are not uniform: sample {low + row} lies {off[row]:.3g} samples off"
-                return None, first, what
+                what = _find_jump(times, size) or f"sample {low + row} lies {off[row]:.3g} samples off"
+                return None, first, f"its times are not uniform: {what}"
     return float(1 / step), first, ""
+
+
+def _find_jump(times: SampleSource, size: int) -> str:
+    """Where times first fall, or else jump, for good, in words; empty where single times are off or none is."""
+    usual = float(np.median(np.diff(np.asarray(times[: min(size, READ_CHUNK_SAMPLES)], np.float64))))
+    if not usual > 0.0:
+        return "most of them are equal to the one before, because they are stated with too few digits"
+    jump = ""
+    for low in range(0, size - 1, READ_CHUNK_SAMPLES):
+        begin = max(low - 1, 0)
+        block = np.asarray(times[begin : low + READ_CHUNK_SAMPLES + 2], np.float64)
+        steps, pairs = np.diff(block), np.full(block.size + 1, np.inf)
+        pairs[1:-2] = block[2:] - block[:-2]  # over a time that alone is off, two steps together are as usual
+        lasting = (np.abs(pairs[:-2] - 2.0 * usual) > usual / 2) & (np.abs(pairs[1:-1] - 2.0 * usual) > usual / 2)
+        falls = np.flatnonzero(lasting & (steps < 0.0))
+        if falls.size:
+            at = int(falls[0])
+            return f"sample {begin + at + 1} is {-steps[at]:.4g} s earlier than the one before; remove what is repeated"
+        rises = np.flatnonzero(lasting & (steps > MIN_JUMP_STEPS * usual))
+        if rises.size and not jump:
+            at = int(rises[0])
+            jump = f"sample {begin + at + 1} is {steps[at]:.4g} s later than the one before, not {usual:.4g} s"
+    return jump
 
 
 def unique_names(names: Iterable[str]) -> list[str]:

@@ -15,6 +15,9 @@ from scanner.errors import BadInput
 MAX_LINE_CHARACTERS = 1 << 16
 """Limit of a line, which keeps a binary file without line ends out of memory."""
 
+UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+"""Byte order marks of the text that Excel saves as "Unicode text"."""
+
 LINES_PER_BLOCK = 1 << 14
 """Lines parsed at a time: many enough for numpy's parser to be fast, few enough to bound memory."""
 
@@ -28,7 +31,9 @@ def read_lines(path: Path) -> Iterator[str]:
         BadInput: no such file, a line longer than ``MAX_LINE_CHARACTERS``, or a zero byte.
     """
     try:
-        file = path.open(encoding="utf-8-sig", errors="replace")
+        with path.open("rb") as beginning:
+            encoding = "utf-16" if beginning.read(2) in UTF_16_MARKS else "utf-8-sig"
+        file = path.open(encoding=encoding, errors="replace")
     except OSError as error:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name the instrument's file") from None
     with file:
