@@ -309,7 +309,8 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
         raise BadInput("holds no sample that can be used", file=signal.file, channel=signal.name, hint=hint)
     if missing and not gaps_ok:
         what = f"sample {earliest} at {signal.start + earliest / signal.sample_rate:.9g} s is not finite"
-        what += f", nor are {missing - 1} others of {signal.size}" if missing > 1 else ""
+        others = f"is 1 other of {signal.size}" if missing == 2 else f"are {missing - 1} others of {signal.size}"
+        what += f", nor {others}" if missing > 1 else ""
         hint = "cut the recording there or repair the sample"
         raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
     low, high = sorted((signal.gain * low + signal.offset, signal.gain * high + signal.offset))

@@ -270,7 +270,8 @@ def test_error_of_a_sample_that_is_not_finite_states_its_time(at: int, bad: floa
     with pytest.raises(BadInput) as caught:
         check_signal(signal)
     assert str(caught.value) == (
-        f"sense_x: sample {at} at {2 + at / 1e6:.9g} s is not finite; cut the recording there or repair the sample"
+        f"sense_x: sample {at} at {2 + at / 1e6:.9g} s is not finite, nor is 1 other of {values.size}; "
+        "cut the recording there or repair the sample"
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation.device_fit.data import prepare_run
-from estimation.device_fit.fit import Likelihood, fit_model
+from estimation.device_fit.fit import Likelihood, fit_model, linearise_at
 from estimation.device_fit.initial import flat_whiteners
 from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import OpenLoop, is_worse, open_loop
@@ -21,6 +21,7 @@ from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.stages import Mechanics, Position
 from tests.support.bench import DEVICE, bench_recording
+from tests.support.simulated import separate_electrodes
 
 
 def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
@@ -73,6 +74,19 @@ def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
     assert valley @ settled[at] == pytest.approx(0.0, abs=1e-9)
     changed = likelihood.residual(model, determined_parameters(fit)) - fit.residual
     assert np.sum(changed[likelihood.rows] ** 2) < 1.0
+
+
+def test_nominal_values_that_absorbed_a_misfit_stay_as_stated() -> None:
+    """Two axes drift, which no term describes, and all values lie two tolerances from the stated ones."""
+    recording, _ = separate_electrodes()
+    run = prepare_run(recording, recording.device)
+    model = Model([run], recording.device)
+    nominal = np.array([f.kind == "nominal" for f in model.parameters])
+    fit = linearise_at(Likelihood([run], flat_whiteners(model)), model, np.where(nominal, 2.0, 0.0))
+    assert fit.validation_chi2 > 2.0
+    assert not determined_parameters(fit)[nominal].any()
+    explained = replace(fit, residual=fit.residual / np.sqrt(fit.validation_chi2))
+    assert determined_parameters(explained)[nominal].any()
 
 
 @pytest.mark.slow
