@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.imaging.picture import Grid, Picture
 from scanner.device import AXES
+from scanner.device_templates import MAX_MIRROR_ANGLE_RAD
 from scanner.errors import DeviceInvalid
 from scanner.motion import AxisMotion, Motion
 
@@ -26,9 +27,6 @@ field is then empty on one side. Scans that are centred on purpose are within a 
 MIN_AMPLITUDE_FRACTION = 0.75
 """Amplitude over half angle below which a note says so: a half of the pixels is then never visited, however long the
 scan. Fields are stated to a few percent; a wrong constant of the readout or an optical angle changes more."""
-
-MAX_MIRROR_ANGLE_RAD = pi / 2
-"""Amplitude above which a unit is wrong: no mirror turns further."""
 
 OTHER_UNITS = {"degrees": pi / 180.0, "mrad": 1e-3}
 """Units of angle that half angles are stated in by mistake, in rad."""

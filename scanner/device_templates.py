@@ -116,6 +116,9 @@ KINDS = {
 MIRRORS = ("parametric", "electromagnetic", "piezo", "galvo")
 """Kinds whose angles are those of a mirror; a fibre and a stage have others."""
 
+MAX_MIRROR_ANGLE_RAD = pi / 2
+"""Amplitude above which a unit is wrong: no mirror turns further."""
+
 TYPICAL_SD = 0.3
 """Relative standard uncertainty of a typical gain or torque: instruments of one kind differ by a factor of 2."""
 
@@ -140,7 +143,7 @@ def new_device(
     scanner = KINDS[kind]
     axes = {axis: known.get(axis, KnownAxis()) for axis in AXES}
     for axis, each in axes.items():
-        if kind in MIRRORS and each.amplitude and each.amplitude > pi / 2:
+        if kind in MIRRORS and each.amplitude and each.amplitude > MAX_MIRROR_ANGLE_RAD:
             what = f"is {each.amplitude:g} rad, and no mirror turns so far"
             hint = f"{each.amplitude:g} degrees are {radians(each.amplitude):.4g} rad"
             raise BadInput(what, channel=f"--amplitude-{axis}", hint=hint)

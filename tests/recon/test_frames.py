@@ -34,7 +34,6 @@ def result() -> Reconstruction:
 
 
 def test_frames_are_written_in_every_format(result: Reconstruction, tmp_path: Path) -> None:
-    pytest.importorskip("zarr")
     write_scan_frames(tmp_path, result, OPTIONS)
     film = tifffile.imread(tmp_path / "frames.ome.tif")
     filled = tifffile.imread(tmp_path / "frames_filled.ome.tif")
@@ -58,9 +57,8 @@ def test_frames_are_written_in_every_format(result: Reconstruction, tmp_path: Pa
 
 
 def test_the_ome_zarr_is_valid_by_its_schema(result: Reconstruction, tmp_path: Path) -> None:
-    pytest.importorskip("zarr")
-    models = pytest.importorskip("ome_zarr_models.v05")
     import zarr
+    from ome_zarr_models import v05 as models
 
     write_scan_frames(tmp_path, result, OPTIONS)
     image = models.Image.from_zarr(zarr.open_group(tmp_path / "frames.ome.zarr", mode="r"))
@@ -88,7 +86,6 @@ def test_a_drawn_frame_has_a_bar_and_a_time(result: Reconstruction) -> None:
 
 
 def test_xarray_has_coordinates_and_units(result: Reconstruction) -> None:
-    pytest.importorskip("xarray")
     film = lissajous.frames(result, frame_time=0.008).to_xarray()
     assert dict(film.sizes) == {"time": 3, "y": 50, "x": 60, "detector": 2}
     assert list(film["detector"].values) == ["green", "red"]
@@ -110,7 +107,6 @@ def test_options_of_frames_need_frames(tmp_path: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.slow
 def test_a_folder_of_frames_is_replaced(tmp_path: Path) -> None:
-    pytest.importorskip("zarr")
     recording, _ = imaging()
     recording.write(tmp_path / "scan.h5")
     arguments = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out"), "--pixels", "40x40", "--zarr"]
@@ -123,7 +119,8 @@ def test_a_folder_of_frames_is_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_napari_reads_a_recording(tmp_path: Path) -> None:
-    npe2 = pytest.importorskip("npe2")
+    import npe2
+
     manifest = npe2.PluginManifest.from_file(Path(lissajous.__file__).parent / "napari.yaml")
     (reader,) = manifest.contributions.readers
     assert reader.filename_patterns == ["*.h5"]

@@ -208,10 +208,9 @@ def test_posterior_slices_use_no_other_slice(result: Reconstruction) -> None:
 
 
 def test_files_state_z(result: Reconstruction, tmp_path: Path) -> None:
-    pytest.importorskip("zarr")
-    models = pytest.importorskip("ome_zarr_models.v05")
     import imageio.v3 as iio
     import zarr
+    from ome_zarr_models import v05 as models
 
     write_scan_frames(tmp_path, result, Options(z_stack=True, zarr=True, movie="gif"))
     for name in ("frames.ome.tif", "frames_sd.ome.tif"):
@@ -254,7 +253,6 @@ def test_uneven_slices_of_several_detectors_have_positions_only(tmp_path: Path) 
 
 
 def test_xarray_has_z_in_metres(result: Reconstruction) -> None:
-    pytest.importorskip("xarray")
     data = lissajous.frames(result).to_xarray()
     assert dict(data.sizes) == {"z": 3, "y": 60, "x": 80}
     assert data["z"].values == pytest.approx(POSITIONS, abs=5e-9)

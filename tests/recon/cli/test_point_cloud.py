@@ -78,7 +78,6 @@ def lidar(geometry: Geometry, every: int = 20) -> tuple[Recording, np.ndarray]:
 
 @pytest.mark.slow
 def test_points_of_a_wall_lie_on_it(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    pytest.importorskip("pypcd4")
     recording, points = lidar(Geometry(incidence=0.5, axis_offset=0.003, range_sd=0.01), every=21)
     recording.write(tmp_path / "lidar.h5")
     assert main(["point-cloud", str(tmp_path / "lidar.h5"), "-o", str(tmp_path / "out"), "--json"]) == 0
@@ -101,7 +100,8 @@ def test_points_of_a_wall_lie_on_it(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.slow
 def test_las_holds_time_and_intensity(tmp_path: Path) -> None:
-    laspy = pytest.importorskip("laspy")
+    import laspy
+
     recording, _ = lidar(Geometry(), every=40)
     recording.write(tmp_path / "lidar.h5")
     assert main(["point-cloud", str(tmp_path / "lidar.h5"), "-o", str(tmp_path / "out"), "--format", "las"]) == 0
