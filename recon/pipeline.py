@@ -204,6 +204,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         notes=[
             *estimated.field_notes,
             *gridded.field_notes,
+            *prepared.clock_notes,
             *prepared.unknown_entries,
             *estimated.motion_notes,
             *describe_motion(motion, intensity),

@@ -119,8 +119,7 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     geometry = prepared.device.geometry or Geometry()
     angles = {axis: estimated.beam.axes[axis].angle.read()[kept] for axis in AXES}
     when = cut.start + kept / cut.sample_rate
-    unknown_keys = [line for line in prepared.unknown_entries if not line.startswith("intensity:")]
-    notes = [*unknown_keys, *sensor_notes, *estimated.motion_notes]
+    notes = [*prepared.unknown_entries, *sensor_notes, *estimated.motion_notes]
     notes += _notes(geometry, prepared.device.geometry is None, distance, estimated)
     return PointCloud(
         time=when,

@@ -45,6 +45,7 @@ class PreparedRecording:
         clock_jumps: phase jumps of the whole recording. The segment contains none of them.
         defects: clock jumps, then gaps, clipping and missing parts of the segment's channels.
         unknown_entries: a line for every channel and every device key that the program does not know.
+        clock_notes: what makes the sample rate of the intensity doubtful, a line each.
         origin: time at which the optics terms of the device begin [s].
     """
 
@@ -54,6 +55,7 @@ class PreparedRecording:
     clock_jumps: tuple[Defect, ...]
     defects: tuple[Defect, ...]
     unknown_entries: tuple[str, ...]
+    clock_notes: tuple[str, ...]
     origin: float
 
     @property
@@ -113,6 +115,7 @@ def prepare_segment(
         clock_jumps=tuple(clock_jumps),
         defects=(*clock_jumps, *find_defects(inspected)),
         unknown_entries=tuple(_unknown_entries(recording, device)),
+        clock_notes=tuple(_describe_intensity_clock(recording)),
         origin=recording.start,
     )
 
@@ -137,6 +140,7 @@ def prepare_frame(
         clock_jumps=(),
         defects=tuple(find_defects(inspected)),
         unknown_entries=(),
+        clock_notes=(),
         origin=recording.start,
     )
 
@@ -163,29 +167,26 @@ def _check_shape(intensity: Channel) -> None:
 
 
 def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:
-    """A line for every unknown channel and device key, every inverted sensor, and a short intensity."""
+    """A line for every unknown channel and device key, and every inverted sensor."""
     for name in recording.channels:
         if name not in CHANNEL_UNITS and name != "intensity":
             yield f"{name}: a channel of this name is not used{suggest_name(name)}"
     yield from describe_inverted_sensors(recording, device)
-    if "intensity" in recording and recording.duration > 0.0:
-        light = recording["intensity"]
-        covered = (light.end - light.start) / recording.duration
-        if covered < MIN_INTENSITY_COVERAGE:
-            yield (
-                f"intensity: covers {covered:.0%} of the recording, {light.end - light.start:.4g} s of "
-                f"{recording.duration:.4g} s; if it was recorded throughout, check its sample_rate"
-            )
-    yield from _describe_equal_sizes(recording)
     for key in _dotted_keys({**device.extra, **{name: axis.extra for name, axis in device.axes.items()}}):
         yield f"{key}: is no key of a device, and not used"
 
 
-def _describe_equal_sizes(recording: Recording) -> Iterator[str]:
-    """A line for the channels of motion that have as many samples as the intensity, and another rate."""
+def _describe_intensity_clock(recording: Recording) -> Iterator[str]:
+    """A line for an intensity that is short, and for one with as many samples as other channels, at another rate."""
     light = recording.channels.get("intensity")
     if light is None:
         return
+    covered = (light.end - light.start) / recording.duration if recording.duration > 0.0 else 1.0
+    if covered < MIN_INTENSITY_COVERAGE:
+        yield (
+            f"intensity: covers {covered:.0%} of the recording, {light.end - light.start:.4g} s of "
+            f"{recording.duration:.4g} s; if it was recorded throughout, check its sample_rate"
+        )
     others = {
         name: channel.sample_rate
         for name, channel in recording.channels.items()
