@@ -46,7 +46,7 @@ def test_one_column_for_both_axes_is_named() -> None:
 
 
 def test_an_intensity_that_covers_half_the_recording_is_noted() -> None:
-    assert not prepare(scan(2000.0, 835.0)).unknown_entries
+    assert not prepare(scan(2000.0, 835.0)).clock_notes
     (note,) = prepare(scan(2000.0, 835.0, light=TIME.size // 2)).clock_notes
     assert "intensity: covers 50% of the recording" in note
 
