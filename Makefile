@@ -44,7 +44,7 @@ papers: $(STAMP)
 blind: $(STAMP)
 	mkdir -p blind-benchmark
 	$(BIN)/python -m benchmarks.blind.generate blind-benchmark/recordings blind-benchmark/keys --workers 2
-	$(BIN)/python -m benchmarks.blind.score blind-benchmark/recordings blind-benchmark/keys/keys.json blind-benchmark/out --page docs/results.md
+	$(BIN)/python -m benchmarks.blind.score blind-benchmark/recordings blind-benchmark/keys/keys.json blind-benchmark/out --page docs/results/blind_benchmark.md
 
 wheel-check: $(STAMP)
 	$(BIN)/python benchmarks/wheel.py

@@ -154,10 +154,10 @@ def test_the_score_command_writes_score_and_page(tmp_path):
     keys = {name: key(effects=[target()]) for name in "abc"}
     (tmp_path / "keys.json").write_text(json.dumps(keys))
     out = tmp_path / "out"
-    results = tmp_path / "results.md"
-    results.write_text(f"before\n{score.BEGIN}old\n{score.END}\nafter\n")
+    table = tmp_path / "blind_benchmark.md"
+    table.write_text(f"before\n{score.BEGIN}old\n{score.END}\nafter\n")
     arguments = [str(tmp_path), str(tmp_path / "keys.json"), str(out), "--command", str(tool), "--timeout", "3"]
-    arguments += ["--page", str(results)]
+    arguments += ["--page", str(table)]
     assert score.main(arguments) == 0
     result = json.loads((out / "score.json").read_text())
     assert result["rates"]["right name, one effect, clear"]["rate"] == pytest.approx(1 / 3)
@@ -167,7 +167,7 @@ def test_the_score_command_writes_score_and_page(tmp_path):
     page = (out / "score.md").read_text()
     assert "| right name, one effect, clear | 33.3% |" in page
     assert page == markdown(result) + "\n" + family_table(result["families"])
-    assert results.read_text() == f"before\n{score.BEGIN}\n{page}\n{score.END}\nafter\n"
+    assert table.read_text() == f"before\n{score.BEGIN}\n{page}\n{score.END}\nafter\n"
     tool.unlink()
     assert score.main(arguments) == 0  # finished recordings are not run again
     assert json.loads((out / "score.json").read_text()) == result
