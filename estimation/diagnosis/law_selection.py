@@ -60,14 +60,13 @@ def choose_laws(
         candidates: named laws and discrepancy terms.
         progress: called with one line of text at every step.
     """
-    fit, fitted, alternates = anchor, dict[Effects, Fit](), False
+    fit, fitted, centres = anchor, dict[Effects, Fit](), set[Effects]()
     for _ in range(MAX_LINEARISATIONS):
         likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
         fit = fit_model(likelihood, fit.model, fit.x)
         linear = linear_model(likelihood, fit, candidates)
         present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
-        if alternates:
-            break
+        centres.add(linear.effects(present))
         if fitted:
             selected = [linear.select(present, max_moves=1).laws]
         elif any(map(is_discrepancy, fit.model.candidates)):
@@ -94,9 +93,9 @@ def choose_laws(
         if not fits:
             return None
         effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
-        with_laws, alternates = fits[effects], effects in fitted
-        has_new_law = bool(effects - linear.effects(present))
-        if present and has_new_law and (alternates or with_laws.neg2_log_evidence > fit.neg2_log_evidence):
+        with_laws = fits[effects]
+        is_worse = with_laws.neg2_log_evidence > fit.neg2_log_evidence
+        if present and (effects in centres or (len(effects) > len(present) and is_worse)):
             break
         fitted[effects] = fit = with_laws
     else:
@@ -143,7 +142,7 @@ def _exchange_near_rival(
             if not near or effects in fitted:
                 continue
             fitted[effects] = other = fit_laws(linear, likelihood, fit, rival.laws, fitted)
-            if not satisfies_sign_constraints(other):
+            if not satisfies_sign_constraints(other) or other.chi2 > MAX_CHI2_RATIO * fit.chi2:
                 continue
             around = linear_model(likelihood, other, discrepancies)
             laws = range(len(around.laws))

@@ -350,8 +350,9 @@ class LinearModel:
     def are_needed(self, laws: Sequence[int], explained: float, alone: float) -> bool:
         """Whether a discrepancy without bound on its scales needs laws beside it.
 
-        They have to explain ``MIN_EXPLAINED_RATIO`` of what the discrepancy beside them still does. Laws that do not
-        take the bulk of the misfit also need an advantage in evidence of ``SMALL_LAW_MARGIN``.
+        They have to explain ``MIN_EXPLAINED_RATIO`` of what the discrepancy beside them still does. Against laws that
+        take the bulk of the misfit, the discrepancy alone has to gain as much as a law; others need an advantage in
+        evidence of ``SMALL_LAW_MARGIN`` over it.
 
         Args:
             explained: fall of the misfit by the laws.
@@ -367,7 +368,7 @@ class LinearModel:
         springs = [axis for axis, effect in self.effects(laws) if effect in POLYNOMIAL_SPRINGS]
         series = len(springs) > len(set(springs))
         bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
-        return advantage > (0.0 if bulk else SMALL_LAW_MARGIN)
+        return advantage > (-MIN_SCORE_GAIN if bulk else SMALL_LAW_MARGIN)
 
     def null_gain(self, probability: float) -> float:
         """Fall of -2 log evidence that the best of all laws exceeds in noise alone with the given probability.
