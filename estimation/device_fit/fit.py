@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2 as chi2_distribution
 
 from estimation.device_fit.data import Run
 from estimation.device_fit.model import Model
@@ -56,6 +57,9 @@ MIN_STEP, MAX_STEP, STEP_WITHOUT_EFFECT = 1e-7, 3e-2, 1e-2
 """Bounds of a difference step, and the step of a parameter without effect, in prior standard deviations. Below the
 first, rounding dominates; above the second, the change is no longer linear."""
 
+MIN_PULL_PROBABILITY = 1e-3
+"""Probability of nominal values as far from the stated ones, in tolerances, below which they have absorbed a misfit."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -98,6 +102,12 @@ class Fit:
 def misfit(fit: Fit) -> float:
     """What a fit minimises: chi-square and the priors' penalty."""
     return fit.chi2 + fit.penalty
+
+
+def nominal_values_are_improbable(fit: Fit) -> bool:
+    """Whether the nominal values lie so far from the stated ones, in tolerances, that they have absorbed a misfit."""
+    pulls = fit.x[[f.kind == "nominal" for f in fit.model.parameters]]
+    return bool(chi2_distribution.sf(pulls @ pulls, pulls.size) < MIN_PULL_PROBABILITY)
 
 
 def held_out_samples(size: int, guard: tuple[int, int] = (0, 0)) -> Mask:

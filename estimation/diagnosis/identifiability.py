@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
 
 from estimation.device_fit.data import Output
-from estimation.device_fit.fit import Fit, Likelihood, linearise_at
+from estimation.device_fit.fit import Fit, Likelihood, linearise_at, nominal_values_are_improbable
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, flat_psd, make_whitener
 from estimation.device_fit.parameters import Candidate
@@ -36,10 +35,6 @@ MAX_POSTERIOR_VARIANCE = 0.5
 determine it: then the recording has less information on it than the stated tolerance."""
 
 
-MIN_PULL_PROBABILITY = 1e-3
-"""Probability of nominal values as far from the stated ones, in tolerances, below which they have absorbed a misfit."""
-
-
 def determined_parameters(fit: Fit) -> Array:
     """Parameters of a fit with the nominal values changed only along directions that the recording determines.
 
@@ -51,7 +46,7 @@ def determined_parameters(fit: Fit) -> Array:
         shape of ``fit.x``.
     """
     nominal = [i for i, f in enumerate(fit.model.parameters) if f.kind == "nominal"]
-    if _has_absorbed_misfit(fit, nominal):
+    if _has_absorbed_misfit(fit):
         return np.where(np.isin(np.arange(fit.x.size), nominal), 0.0, fit.x)
     covariance = fit.covariance
     variance, directions = np.linalg.eigh(covariance[np.ix_(nominal, nominal)])
@@ -67,7 +62,7 @@ def determined_parameters(fit: Fit) -> Array:
     return np.asarray(x)
 
 
-def _has_absorbed_misfit(fit: Fit, nominal: Sequence[int]) -> bool:
+def _has_absorbed_misfit(fit: Fit) -> bool:
     """Whether nominal values lie improbably far from the stated ones in a fit that leaves a misfit.
 
     It matters where combs alone sense the motion: the angle then rests on the shape of the capacitance, which a misfit
@@ -77,9 +72,7 @@ def _has_absorbed_misfit(fit: Fit, nominal: Sequence[int]) -> bool:
     senses_alone = all(output.kind == "sense" for run in model.runs for output in run.outputs)
     if not (senses_alone and all(model.device.axes[axis].capacitance for axis in model.axes)):
         return False
-    pulls = fit.x[list(nominal)]
-    is_improbable = chi2_distribution.sf(pulls @ pulls, pulls.size) < MIN_PULL_PROBABILITY
-    return bool(is_improbable and fit.validation_chi2 > MAX_HELD_OUT_CHI2)
+    return nominal_values_are_improbable(fit) and fit.validation_chi2 > MAX_HELD_OUT_CHI2
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, nominal_values_are_improbable
 from estimation.device_fit.initial import window_schedule
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
@@ -109,7 +109,9 @@ def common_parameters(fit: Fit) -> list[int]:
 def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequence[LinearTerm]) -> Fit:
     """The fit with these terms and no others, from their estimates in the linear model.
 
-    Where they do not follow the motion, it is made over windows of increasing length.
+    Where they do not follow the motion, it is made over windows of increasing length. Where the nominal values of
+    ``fit`` lie improbably far from the stated ones, they have absorbed what the terms now explain, and the way back
+    leads through a long curved valley. Then it is made from the stated values first.
 
     Args:
         fit: around which the model is linear.
@@ -128,11 +130,20 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
             if term.test is not None and f.kind == "term" and f.owner == term.candidate.key:
                 x[i] = without[i] = term.test.x[term.test.model.index("term", f.owner, f.name)]
         set_amplitudes(x, model, term.candidate, estimates[low:high])
+    if nominal_values_are_improbable(fit):
+        stated = fit_growing(likelihood, model, stated_values(model, x), window_schedule(model)[0])
+        if stated.chi2 < fit.chi2 and not nominal_values_are_improbable(stated):
+            return fit_model(likelihood, model, stated.x)
     start = damped_start(likelihood, fit, model, without, x - without)
     residual = likelihood.residual(model, start)[fit.rows]
     if residual @ residual < MAX_CHI2_RATIO * fit.chi2:
         return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
     return fit_growing(likelihood, model, x, window_schedule(model)[0])
+
+
+def stated_values(model: Model, x: Array) -> Array:
+    """Parameters with the nominal values as stated, shape (p,)."""
+    return np.where([f.kind == "nominal" for f in model.parameters], 0.0, x)
 
 
 def fit_laws(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models, misfit
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models, misfit, nominal_values_are_improbable
 from estimation.device_fit.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
 from estimation.device_fit.initial import (
     estimate_whiteners,
@@ -18,12 +18,12 @@ from estimation.device_fit.initial import (
 from estimation.device_fit.interference import with_interference_line
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import fit_anchor
+from estimation.diagnosis.anchor import fit_anchor, fit_growing
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
-from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
+from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import (
     ScoreTest,
@@ -45,6 +45,10 @@ MAX_DISCREPANCY_FITS = 3
 ANCHOR_EFFECTS = (("cubic-stiffness", "quadratic-drag"), ("free-stiffness",), ("free-mechanics",))
 """Terms that are fitted in this order, on all axes, where the nominal device does not follow the motion: a frequency
 and a damping that depend on the amplitude, a stiffness and a damping that drift, a free torque."""
+
+ABSORBED_EFFECT = "resonance-drift"
+"""The effect that nominal values absorb most easily: amplitude and phase of the motion follow the resonance through
+every value of mechanics and capacitance."""
 
 MAX_NONLINEAR_STARTS = 8
 """Starts of a law that is linear in no amplitude that are fitted, those with the largest predicted gain. In five
@@ -144,6 +148,9 @@ def _choose_around_nominal(
     progress: Progress,
 ) -> _Selected:
     """Named laws, else a discrepancy term, else nothing."""
+    around_drift = _choose_around_drift(likelihood, nominal, stops[0], pool, progress)
+    if around_drift is not None:
+        return around_drift
     groups = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
     anchor, tried = fit_anchor(likelihood, nominal, early, stops, [group for group in groups if group])
     selected = _choose_laws(anchor, nominal, pool, progress)
@@ -155,6 +162,30 @@ def _choose_around_nominal(
     if discrepancy is None:
         return _Selected(likelihood, nominal, nominal)
     return _choose_laws(discrepancy.fit, nominal, pool, progress) or discrepancy
+
+
+def _choose_around_drift(
+    likelihood: Likelihood, nominal: Fit, first: float, pool: Sequence[Candidate], progress: Progress
+) -> _Selected | None:
+    """Named laws around the stated device with drifting resonances, where nominal values have absorbed a misfit.
+
+    None where they have not, or where they do beside the named laws too.
+
+    Args:
+        first: end of the first window, as a fraction of the recordings.
+    """
+    drifts = [candidate for candidate in pool if candidate.term.effect == ABSORBED_EFFECT]
+    if not drifts or not nominal_values_are_improbable(nominal):
+        return None
+    progress("stated values, with drifting resonances")
+    model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, *drifts], nominal.model.mains)
+    drifting = fit_growing(
+        likelihood, model, stated_values(model, model.map_parameters_from(nominal.model, nominal.x)), first
+    )
+    if nominal_values_are_improbable(drifting):
+        return None
+    selected = _choose_laws(drifting, nominal, pool, progress)
+    return None if selected is None or nominal_values_are_improbable(selected.fit) else selected
 
 
 def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected | None:

@@ -1,0 +1,29 @@
+"""Drifting resonances that nominal values absorb: laws are sought around the stated values."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.blind.generator import Case
+from estimation.device_fit.fit import nominal_values_are_improbable
+from tests.support.blind_recordings import search_blind_recording
+
+RIVALS = ("drive-droop", "coulomb-friction", "inertia-scale", "cubic-stiffness", "quadratic-drag")
+
+
+@pytest.mark.slow
+def test_drifts_of_both_axes_are_found_although_nominal_values_absorb_them(tmp_path: Path) -> None:
+    """The nominal values move by tens of tolerances, and around them other laws take the place of the drifts."""
+    case = Case("blind-001", "one", "imaging", ("drive-droop", "resonance-drift"), "white", 3977966624)
+    blind, search = search_blind_recording(case, tmp_path, (*RIVALS, "resonance-drift"))
+    assert nominal_values_are_improbable(search.nominal)
+    found = {selected.candidate.axis: selected.candidate for selected in search.steps}
+    assert [found[axis].term.effect for axis in "xy"] == ["resonance-drift", "resonance-drift"]
+    assert not nominal_values_are_improbable(search.final)
+    assert search.final.validation_chi2 == pytest.approx(1.0, abs=0.05)
+    at = search.final.model.index("term", found["x"].key, "alpha")
+    assert at is not None
+    value = search.final.model.values(found["x"], search.final.x)[0]
+    sd = np.sqrt(search.final.covariance[at, at]) * abs(value / search.final.x[at])
+    assert value == pytest.approx(blind.truth.dk, abs=4.0 * sd)
