@@ -222,6 +222,25 @@ def test_a_film_on_a_baseline_that_gets_worse_is_noted(tmp_path: Path, capsys: p
     assert notes == {"counts": False, "baseline": True}
 
 
+@pytest.mark.parametrize("wrong", ["right", "turned", "saturated"])
+def test_a_film_that_is_turned_or_saturated_is_noted(wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    frames = film(2.0)
+    made = {"right": frames, "turned": frames.swapaxes(1, 2), "saturated": np.minimum(frames, 30)}[wrong]
+    tifffile.imwrite(tmp_path / "film.tif", made, photometric="minisblack")
+    code, out, _ = run(["bidirectional", tmp_path / "film.tif", "-o", tmp_path / "out", "--json"], capsys)
+    notes = " ".join(json.loads(out)["notes"])
+    assert code == 0
+    assert ("transpose the frames" in notes) == (wrong == "turned")
+    assert ("at the top value 30" in notes) == (wrong == "saturated")
+
+
+def test_a_film_whose_lines_stand_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    tifffile.imwrite(tmp_path / "film.tif", film(2.0)[:, ::2].repeat(2, axis=1), photometric="minisblack")
+    code, _, err = run(["bidirectional", tmp_path / "film.tif", "-o", tmp_path / "out"], capsys)
+    assert code == 2
+    assert "51% of its lines equal the line before" in err  # 32 of the 63 lines that have one before
+
+
 def test_a_truncated_film_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture, caplog: pytest.LogCaptureFixture
 ) -> None:
