@@ -46,8 +46,8 @@ def describe_saturation(frames: Frames) -> list[str]:
         if (rail := upper_rail(pixels)) is not None:
             name = f" of detector {detector}" if len(frames[0]) > 1 else ""
             notes.append(
-                f"{rail[1] / pixels.size:.2%} of the pixels{name} are at the top value {rail[0]:g}, where it is "
-                "saturated: they are lower bounds; record with less gain or light"
+                f"{100 * rail[1] / pixels.size:.2g} % of the pixels{name} are at the top value {rail[0]:g}, where it "
+                "is saturated: they are lower bounds; record with less gain or light"
             )
     return notes
 

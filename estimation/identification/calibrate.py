@@ -129,6 +129,11 @@ class _AxisIdentification:
             return
         kind = classify_recording(recording, self.name)
         if kind is None:
+            quiet = [each for each in recording.channels if each.endswith(f"_{self.name}")]
+            if quiet := [each for each in quiet if not each.startswith(("bias", "drive"))]:
+                self.notes.append(
+                    f"{self.name}: {recording.name} shows no motion above white noise in {', '.join(quiet)}"
+                )
             return
         if kind == UNREFERENCED_DRIVE and not isinstance(self.axis.require_readout(), MotionSensor):
             self.notes.append(
@@ -218,6 +223,11 @@ class _AxisIdentification:
 
     def conclude(self) -> None:
         """Determine the mechanics: scaled by driven motion, else by a bias during a decay, else by the nominal J."""
+        if self.values.keys() <= {"noise_var", "noise_sd"} and self.values and not self.swept:
+            self.notes.append(
+                f"{self.name}: no recording shows a motion: resonance, Q and all other constants stay as stated; "
+                "record a free decay or driven motion"
+            )
         if not self.decays and "k_over_J" in self.values:
             J = self.axis.require_mechanics().J
             for key in ("k", "b"):

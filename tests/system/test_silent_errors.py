@@ -333,3 +333,17 @@ def test_a_rate_in_megahertz_is_noted() -> None:
     channels = {name: (values, unit, 1.0) for name, (values, unit, _) in sensors(772014).items()}
     notes = reconstruct({**channels, "intensity": (light(772014), "V", 1.0)}, READOUTS + FIELD).notes
     assert sum("check the unit of time and sample_rate, 1 Hz" in note for note in notes) == 2
+
+
+def test_a_diagnosis_says_what_it_did_not_test(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    channels = {**sensors(772013), "intensity": (light(772013), "V", RATE_HZ)}
+    Recording.from_arrays(channels, Device.from_toml(READOUTS + FIELD)).write(tmp_path / "scan.h5")
+    code, out, _ = run(["diagnose", tmp_path / "scan.h5", "-o", tmp_path / "out"], capsys)
+    assert code == 0
+    assert "Not tested: drive and mechanics, because the device states no mechanics." in out.splitlines()[0]
+    only_x = {name: values for name, values in channels.items() if name != "sense_y"}
+    device = READOUTS[: READOUTS.index("[y.")]
+    Recording.from_arrays(only_x, Device.from_toml(device)).write(tmp_path / "x.h5")
+    code, _, err = run(["diagnose", tmp_path / "x.h5", "-o", tmp_path / "none"], capsys)
+    assert code == 2
+    assert "tests nothing: the device states no mechanics" in err

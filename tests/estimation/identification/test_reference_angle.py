@@ -128,3 +128,13 @@ def test_a_steady_tone_leaves_the_inertia_open() -> None:
     )
     with pytest.raises(BadInput, match="does not determine J; record two or more drive frequencies, or a sweep"):
         identify([settled], nominal())
+
+
+def test_noise_alone_is_no_motion() -> None:
+    noise = np.random.default_rng(772012).normal(0.0, 0.01, 40_000)
+    rest = identify([Recording.from_arrays({"sense_x": (noise, "V", RATE)})], nominal(SENSORS["angle"]))
+    assert any("no recording shows a motion" in note for note in rest.notes)
+    drive = np.sin(W * np.arange(noise.size) / RATE)
+    driven = Recording.from_arrays({"sense_x": (noise, "V", RATE), "drive_x": (drive, "V", RATE)})
+    with pytest.raises(BadInput, match="shows no motion above white noise in sense_x"):
+        identify([driven], nominal(SENSORS["angle"]))
