@@ -13,7 +13,7 @@ from estimation.diagnosis.selection import Progress
 from estimation.slow.diagnose import diagnose_decays, slow_decays
 from estimation.slow.diagnose_response import diagnose_responses
 from estimation.slow.response import frequency_responses
-from scanner.device import Device
+from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.terms import catalogue
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 SENSED_STAGES = ("capacitance", "readout", "timing")
 """Stages whose terms change the phase of the motion that is estimated from the sense signal."""
+
+UNTESTED_MOTION = "drive and mechanics, because the device states no mechanics"
 
 MeasureReference = Callable[[Recording, Device], "ReferencePhase | None"]
 """Measures the phase errors of the motion independently of the readout; None if the recording does not allow it."""
@@ -54,7 +56,7 @@ def diagnose_with_optics(
     """
     nominal = nominal_device(recordings, device)
     diagnosis = _diagnose_motion(recordings, nominal, progress)
-    pictures = [each for each in recordings if "intensity" in each and set(nominal.axes) == {"x", "y"}]
+    pictures = [each for each in recordings if "intensity" in each and set(nominal.axes) == set(AXES)]
     findings, stated = _diagnose_readout(pictures, nominal, diagnosis, measure_reference, progress)
     if findings:
         again = _diagnose_motion(recordings, stated, progress)
@@ -73,7 +75,10 @@ def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress:
     """The diagnosis without pictures; of a device without mechanics whose recordings have some, an empty one."""
     pictures = any("intensity" in recording for recording in recordings)
     if pictures and not any(axis.mechanics for axis in nominal.axes.values()):
-        return Diagnosis("consistent", (), None, nominal, None)
+        if set(nominal.axes) != set(AXES):
+            what = f"tests nothing: the device states no mechanics, and only the axis {', '.join(nominal.axes)}"
+            raise BadInput(what, file=recordings[0].path, hint="state mechanics, or both axes for the picture")
+        return Diagnosis("consistent", (), None, nominal, None, untested=UNTESTED_MOTION)
     responses = [frequency_responses(recording, nominal) for recording in recordings]
     if any(responses):
         if len(recordings) > 1:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from recon.film_checks import check_repeated_lines, describe_columns, describe_saturation
 from recon.imaging.film_equations import PooledEquations
 from recon.imaging.film_phase import FilmModel, fit_film, frame_phase, share_equations, with_reference
 from recon.imaging.line_phase import BLOCKS_ACROSS, MAX_SHIFT_SD_PX
@@ -55,6 +56,7 @@ class CorrectedFilm:
             corrected, and corrected by the same shift in all columns.
         counts: totals of the film, of the corrected film, and of what lay beyond the border.
         clipped: pixels that did not fit into the film's type.
+        doubts: notes on films that are not as they should be: saturated pixels, lines along the columns.
         means: the pixels hold means, and no totals are kept.
         seconds: computing time.
     """
@@ -70,6 +72,7 @@ class CorrectedFilm:
     rows_rms: tuple[float, float, float]
     counts: tuple[float, float, float]
     clipped: int
+    doubts: list[str]
     means: bool
     seconds: float
 
@@ -119,7 +122,7 @@ class CorrectedFilm:
         return summary
 
     def _notes(self) -> list[str]:
-        notes, rows = [], self.film.shape[-2]
+        notes, rows = list(self.doubts), self.film.shape[-2]
         border = int(np.ceil(np.abs(self.shift).max() / 2))
         if border:
             data = "NaN or 0" if self.means else "part of the counts"
@@ -170,11 +173,13 @@ def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = Fa
         raise BadInput(what, file=film.path, hint=f"at least {MIN_SIDE_PX} of each are needed")
     sampled = _spread(film.frames, SAMPLED_FRAMES)
     samples = [_as_channels(frame) for frame in film.read(sampled)]
+    check_repeated_lines(film.path, samples)
     try:
         model = fit_film(samples)
     except BadInput as error:
         error.file = film.path
         raise
+    doubts = [*describe_columns(samples, model), *describe_saturation(samples)]
     members = _spread(film.frames, REFERENCE_FRAMES)
     frames = _progress(zip(members, film.read(members), strict=True), "reference", len(members), quiet)
     known = dict(zip(sampled, samples, strict=True))
@@ -201,6 +206,7 @@ def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = Fa
         rows_rms=_rows_rms(samples, shift[sampled], model.fill**2, means),
         counts=(account.recorded, account.corrected, account.beyond),
         clipped=account.clipped,
+        doubts=doubts,
         means=means,
         seconds=time.perf_counter() - began,
     )

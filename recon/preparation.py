@@ -13,6 +13,7 @@ from estimation.signals import require_device
 from recon.quality.clock_jumps import detect_clock_jumps, longest_segment
 from recon.quality.defects import Defect, find_defects
 from recon.quality.drive_check import check_drives, check_rates, check_signals
+from recon.quality.duration_check import check_duration
 from recon.quality.sensor_sign import describe_inverted_sensors
 from scanner import devices
 from scanner.channel import CHANNEL_UNITS, Channel, check_signal, suggest_name
@@ -79,7 +80,7 @@ def prepare(recording: Recording, device: DeviceSource | None = None, undo_lag: 
 
     Raises:
         BadInput: no intensity, or one that is not a signal; no device, a device without an
-            x or a y axis, or drives that do not fit it.
+            x or a y axis, drives that do not fit it, or less than a period of the slower axis.
     """
     check_signal(recording.require("intensity", "a picture needs it"), gaps_ok=True)
     _check_shape(recording["intensity"])
@@ -92,6 +93,7 @@ def prepare(recording: Recording, device: DeviceSource | None = None, undo_lag: 
     check_drives(recording, device)
     check_signals(recording, device)
     check_rates(recording, device)
+    check_duration(recording, device)
     return prepare_segment(recording, device, clock_jumps, undo_lag)
 
 

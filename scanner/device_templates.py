@@ -119,6 +119,10 @@ MIRRORS = ("parametric", "electromagnetic", "piezo", "galvo")
 MAX_MIRROR_ANGLE_RAD = pi / 2
 """Amplitude above which a unit is wrong: no mirror turns further."""
 
+MIN_RESONANCE_HZ = 50.0
+"""Resonance of a mirror or a fibre below which a unit is wrong: the slowest resonant mirrors reach about 100 Hz, and
+the fastest, 50 kHz, stated in kHz, are still below."""
+
 TYPICAL_SD = 0.3
 """Relative standard uncertainty of a typical gain or torque: instruments of one kind differ by a factor of 2."""
 
@@ -136,7 +140,8 @@ def new_device(
             from the picture.
 
     Raises:
-        BadInput: no such kind, a drive frequency is missing, or an amplitude is larger than any mirror's.
+        BadInput: no such kind, a drive frequency is missing, an amplitude is larger or a resonance lower than any
+            mirror's.
     """
     if kind not in KINDS:
         raise BadInput(f"no kind of scanner is named {kind!r}", hint=f"there are {', '.join(KINDS)}")
@@ -147,6 +152,10 @@ def new_device(
             what = f"is {each.amplitude:g} rad, and no mirror turns so far"
             hint = f"{each.amplitude:g} degrees are {radians(each.amplitude):.4g} rad"
             raise BadInput(what, channel=f"--amplitude-{axis}", hint=hint)
+        if kind != "afm" and each.resonance and each.resonance < MIN_RESONANCE_HZ:
+            what = f"is {each.resonance:g} Hz, and no {kind} scanner resonates below {MIN_RESONANCE_HZ:g} Hz"
+            hint = f"{each.resonance:g} kHz are {1e3 * each.resonance:g} Hz"
+            raise BadInput(what, channel=f"--resonance-{axis}", hint=hint)
     filled = {axis: _fill(scanner, getattr(scanner, axis), axes[axis]) for axis in AXES}
     parts = [_heading(kind, scanner, filled), f"name = {json.dumps(name or kind)}"]
     if frequencies_only:

@@ -99,6 +99,7 @@ class Diagnosis:
         open_loop: prediction error of the nominal and the improved device, by channel.
         optics: effects on the picture, for every recording with an intensity.
         further_modes: see :func:`estimation.diagnosis.structure.describe_modes`.
+        untested: what the recordings do not test, with the reason, in words; None if everything is tested.
     """
 
     verdict: str
@@ -111,6 +112,7 @@ class Diagnosis:
     open_loop: Mapping[str, Any] = field(default_factory=dict)
     optics: tuple[Mapping[str, Any], ...] = ()
     further_modes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    untested: str | None = None
 
     def __repr__(self) -> str:
         lines = [f"Diagnosis of {self.device.name!r}: {self.verdict}"]
@@ -134,6 +136,7 @@ class Diagnosis:
             "open_loop": dict(self.open_loop),
             "optics": list(self.optics),
             "further_modes": {name: dict(modes) for name, modes in self.further_modes.items()},
+            "untested": self.untested,
         }
 
 

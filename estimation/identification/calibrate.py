@@ -26,7 +26,7 @@ from estimation.identification.fits import (
 )
 from estimation.identification.lock_in_decay import fit_lock_in_decay
 from estimation.identification.reference_angle import ReferenceAngle, find_reference_angle, with_angle
-from estimation.identification.sweep import SweptRecord, fit_swept
+from estimation.identification.sweep import UNKNOWN_FILTER, SweptRecord, fit_swept
 from estimation.reference import drive_reference
 from estimation.slow.response import Response, frequency_responses
 from estimation.slow.response_selection import select_effects
@@ -129,6 +129,11 @@ class _AxisIdentification:
             return
         kind = classify_recording(recording, self.name)
         if kind is None:
+            quiet = [each for each in recording.channels if each.endswith(f"_{self.name}")]
+            if quiet := [each for each in quiet if not each.startswith(("bias", "drive"))]:
+                self.notes.append(
+                    f"{self.name}: {recording.name} shows no motion above white noise in {', '.join(quiet)}"
+                )
             return
         if kind == UNREFERENCED_DRIVE and not isinstance(self.axis.require_readout(), MotionSensor):
             self.notes.append(
@@ -182,7 +187,9 @@ class _AxisIdentification:
         phase = drive_reference(recording[f"drive_{self.name}"], "half-drive" if electrostatic else "drive")
         rate = 1.0 / float(time[1] - time[0])
         self.driven += steady_segments(angle, drive, phase.frequency_at(time), rate)
-        self.swept.append(SweptRecord(DrivenRecord(angle, drive, phase.frequency, rate), time, phase))
+        held = recording.channels.get(reference.source) if reference.source.startswith("amplitude") else None
+        averaged = max(1, round(rate / held.sample_rate)) if held is not None else 1
+        self.swept.append(SweptRecord(DrivenRecord(angle, drive, phase.frequency, rate), time, phase, averaged))
         self.gain_tolerance = max(self.gain_tolerance, reference.gain_tolerance)
         return phase.frequency
 
@@ -216,6 +223,11 @@ class _AxisIdentification:
 
     def conclude(self) -> None:
         """Determine the mechanics: scaled by driven motion, else by a bias during a decay, else by the nominal J."""
+        if self.values.keys() <= {"noise_var", "noise_sd"} and self.values and not self.swept:
+            self.notes.append(
+                f"{self.name}: no recording shows a motion: resonance, Q and all other constants stay as stated; "
+                "record a free decay or driven motion"
+            )
         if not self.decays and "k_over_J" in self.values:
             J = self.axis.require_mechanics().J
             for key in ("k", "b"):
@@ -232,6 +244,8 @@ class _AxisIdentification:
             before = dict(self.values)
             self._take(axis, lambda axis: fit_swept(axis, self.swept))
             several = self.values != before
+            if several and any(record.averaged > 1 for record in self.swept):
+                self.notes.append(f"{self.name}: {UNKNOWN_FILTER}")
         if self.swept and not several:
             self.notes.append(
                 f"{self.name}: the driven motion does not determine J; record two or more drive frequencies, or a "

@@ -33,6 +33,10 @@ MAX_SAMPLES_PER_CYCLE = 40
 START_AMPLITUDES = (0.15, 0.5, 1.0)
 """Starts of the amplitude behind a capacitive readout, in units of theta0."""
 
+MIN_DECAY_SDS = 3.0
+"""Rate of decay in standard deviations below which a motion is no decay: its interval then includes a motion without
+end."""
+
 
 def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, IdentifiedValue]:
     """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, behind a capacitive readout, ``amplitude_over_theta0``.
@@ -68,7 +72,7 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
     def basis(x: Array, n: int) -> Array:
         """Signals that gain and offset multiply, shape (n, 2 or 3)."""
         t = np.arange((n - 1) * finer + 1) * (time[1] / finer)
-        rate, decay = w0 * (1.0 + x[0]), np.exp(x[1])
+        rate, decay = w0 * (1.0 + x[0]), first_decay * x[1]
         envelope, turn = np.exp(-decay * t), rate * t
         if order == 1:
             return np.stack([envelope * np.cos(turn), envelope * np.sin(turn), np.ones(n)], axis=1)
@@ -86,11 +90,11 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
         columns, part = basis(x, n)[skip:], y[skip:n]
         return np.asarray(part - columns @ np.linalg.lstsq(columns, part, rcond=None)[0])
 
-    decay = max(-_log_slope(y, time, order), 0.05 / time[-1])
-    starts = [np.array([0.0, np.log(decay)])]
+    first_decay = max(-_log_slope(y, time, order), 0.05 / time[-1])
+    starts = [np.array([0.0, 1.0])]
     if order == 2:
         phases = np.pi * np.arange(8) / 8
-        starts = [np.array([0.0, np.log(decay), np.log(a), p]) for a in START_AMPLITUDES for p in phases]
+        starts = [np.array([0.0, 1.0, np.log(a), p]) for a in START_AMPLITUDES for p in phases]
     per_cycle = y.size / cycles
     windows = [round(per_cycle * c) for c in (6.0, 25.0, 100.0, 400.0, 1600.0, 6400.0) if c < 0.7 * cycles]
     x = min(starts, key=lambda x: float(np.sum(residual(x, windows[0] if windows else y.size) ** 2)))
@@ -103,10 +107,13 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
         raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
     variance = float(left @ left) / max(y.size - x.size - basis(x, y.size).shape[1], 1)
     sd = np.sqrt(variance * np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))
-    rate, decay = w0 * (1.0 + x[0]), float(np.exp(x[1]))
+    if x[1] < MIN_DECAY_SDS * sd[1]:
+        what, hint = "holds a motion that does not decay", "record a free decay, or record the drive beside the motion"
+        raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
+    rate, decay = w0 * (1.0 + x[0]), float(first_decay * x[1])
     values = {
         "k_over_J": IdentifiedValue(float(rate**2 + decay**2), float(2.0 * rate * w0 * sd[0])),
-        "b_over_J": IdentifiedValue(2.0 * decay, float(2.0 * decay * sd[1])),
+        "b_over_J": IdentifiedValue(2.0 * decay, float(2.0 * first_decay * sd[1])),
     }
     if order == 2:
         values["amplitude_over_theta0"] = IdentifiedValue(float(np.exp(x[2])), float(np.exp(x[2]) * sd[2]))

@@ -10,11 +10,9 @@ the rate of a swept reference in place of w, the average of a product would be t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.identification.fits import DrivenRecord, IdentifiedValue, drive_torque, values_from_ratios
 from estimation.least_squares import fit_linear
@@ -32,6 +30,12 @@ HOPS_PER_WINDOW = 16
 MIN_INVERSE_INERTIA_SDS = 3.0
 """Estimate of 1/J over its standard deviation from which J is reported: below, its interval includes infinity."""
 
+UNKNOWN_FILTER = (
+    "the lock-in amplifier is taken to average over the time between two values; the intervals include the difference "
+    "from a filter without effect"
+)
+"""Note on motion that a lock-in amplifier recorded."""
+
 
 @dataclass(frozen=True)
 class SweptRecord:
@@ -41,15 +45,20 @@ class SweptRecord:
         driven: angle and drive voltage.
         time: of its samples, shape (n,) [s].
         reference: phase of the motion's drive.
+        averaged: samples over which the complex amplitude of the angle was averaged, as by a lock-in amplifier.
     """
 
     driven: DrivenRecord
     time: Array
     reference: PhaseReference
+    averaged: int = 1
 
 
 def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, IdentifiedValue]:
     """``J``, ``b``, ``k``, ``k_over_J`` and ``b_over_J`` from swept or transient motion.
+
+    The torque is averaged as the angle was. No recording states the filter of a lock-in amplifier, so that the standard
+    deviations include the difference from a filter that averages over much less than the time between two values.
 
     Args:
         axis: its drive and its capacitance set the torque; its mechanics are not used.
@@ -58,19 +67,44 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
         Values by name; none if 1/J is not determined, as by one steady frequency.
     """
     equations = [_equations(axis, record) for record in records]
-    columns, target = (np.concatenate(parts) for parts in zip(*equations, strict=True))
+    columns, target = (np.concatenate([getattr(each, part) for each in equations]) for part in ("columns", "target"))
     if len(target) < HOPS_PER_WINDOW or not columns.any(axis=0).all():
         return {}
     ratios, _ = fit_linear(*(np.concatenate([part.real, part.imag]) for part in (columns, target)))
-    covariance = _covariance(columns, target - columns @ ratios)
+    covariance = _covariance(equations, ratios)
     stiffness, _, inverse = ratios
     if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
-    return values_from_ratios(ratios, covariance)
+    values = values_from_ratios(ratios, covariance)
+    if all(record.averaged == 1 for record in records):
+        return values
+    sharp = fit_swept(axis, [replace(record, averaged=1) for record in records])
+    return {
+        key: IdentifiedValue(value.value, float(np.hypot(value.sd, value.value - sharp.get(key, value).value)))
+        for key, value in values.items()
+    }
 
 
-def _equations(axis: Axis, record: SweptRecord) -> tuple[Complex, Complex]:
-    """Columns of k/J, b/J and 1/J, shape (points, 3), and the right-hand side of the equation, shape (points,)."""
+@dataclass(frozen=True)
+class _Equations:
+    """Equations of motion of one record between windowed averages.
+
+    Attributes:
+        columns: of k/J, b/J and 1/J, shape (points, 3). target: right-hand side, shape (points,).
+        windows: of the angle, its velocity and its acceleration, each of shape (window,).
+        hop: samples between two points.
+    """
+
+    columns: Complex
+    target: Complex
+    windows: tuple[Complex, ...]
+    hop: int
+
+
+def _equations(axis: Axis, record: SweptRecord) -> _Equations:
+    """The equations of a record at its overlapping windows."""
+    from scipy.ndimage import uniform_filter1d
+
     rate = record.driven.rate
     hop = max(1, round(WINDOW_CYCLES * rate / record.reference.frequency / HOPS_PER_WINDOW))
     w = 2.0 * np.pi * _strongest_frequency(record, hop)
@@ -78,10 +112,14 @@ def _equations(axis: Axis, record: SweptRecord) -> tuple[Complex, Complex]:
     angle, torque = (
         (values - values.mean()) * carrier for values in (record.driven.angle, drive_torque(axis, record.driven))
     )
-    windows = _windows(hop, rate)
-    z, first, second = (_averaged(angle, window, hop) for window in windows)
-    velocity, acceleration = 1j * w * z + first, second + 2j * w * first - w**2 * z
-    return np.stack([z, velocity, -_averaged(torque, windows[0], hop)], axis=1), -acceleration
+    torque = uniform_filter1d(torque.real, record.averaged) + 1j * uniform_filter1d(torque.imag, record.averaged)
+    hann, first, second = _windows(hop, rate)
+    windows = tuple(
+        np.asarray(each, np.complex128) for each in (hann, 1j * w * hann + first, second + 2j * w * first - w**2 * hann)
+    )
+    z, velocity, acceleration = (_averaged(angle, window, hop) for window in windows)
+    columns = np.stack([z, velocity, -_averaged(torque, hann, hop)], axis=1)
+    return _Equations(columns, -acceleration, windows, hop)
 
 
 def _strongest_frequency(record: SweptRecord, hop: int) -> float:
@@ -93,20 +131,63 @@ def _strongest_frequency(record: SweptRecord, hop: int) -> float:
     return float(np.average(rate, weights=power**2))
 
 
-def _covariance(columns: Complex, residual: NDArray[Any]) -> Array:
-    """Covariance of the coefficients where residuals of overlapping windows depend on each other, shape (3, 3).
+def _covariance(equations: Sequence[_Equations], ratios: Array) -> Array:
+    """Covariance of the coefficients, shape (3, 3).
 
-    The sandwich estimate with Bartlett weights over one window (Newey and West, Econometrica 55, 703, 1987).
+    The residual is the noise of the angle, filtered by the equation of motion, which is least at the resonance, where
+    the motion is: residuals of overlapping windows compensate each other there. The noise is taken as white within the
+    windows' band; then the filter determines the correlation of the residuals, and only the noise's variance, one for
+    each record, is estimated from them.
     """
-    size = np.sqrt(np.mean(np.abs(columns) ** 2, axis=0))
-    scaled = columns / size
-    moments = (scaled.conj() * residual[:, None]).real
-    spread = moments.T @ moments
-    for lag in range(1, HOPS_PER_WINDOW):
-        between = moments[lag:].T @ moments[:-lag]
-        spread += (1.0 - lag / HOPS_PER_WINDOW) * (between + between.T)
-    inverse = np.linalg.inv((scaled.conj().T @ scaled).real)
+    size = np.sqrt(np.mean(np.abs(np.concatenate([each.columns for each in equations])) ** 2, axis=0))
+    scaled = [each.columns / size for each in equations]
+    inverse = np.linalg.inv(sum(((columns.conj().T @ columns).real for columns in scaled), np.zeros((3, 3))))
+    spread = np.zeros((3, 3))
+    for each, columns in zip(equations, scaled, strict=True):
+        correlation = _residual_correlation(each, ratios)
+        correlated = _smoothed(columns, correlation, "same")
+        between = 0.5 * (columns.conj().T @ correlated).real  # half the power of complex noise is in the real part
+        spread += between * _residual_variance(each, ratios, columns, correlation, inverse, between)
     return np.asarray(inverse @ spread @ inverse / np.outer(size, size))
+
+
+def _residual_variance(
+    equations: _Equations, ratios: Array, columns: Complex, correlation: Complex, inverse: Array, between: Array
+) -> float:
+    """Variance of the residual of one record, from its part near the resonance.
+
+    The residual is averaged under one more window, because most of its power is at the edges of the windows' band,
+    where the noise may have another level. The expected share that the fit absorbs is allowed for.
+
+    Args:
+        columns: scaled. correlation: of the residual. inverse: of the normal matrix. between: covariance of the
+            moments of the columns with a residual of variance 1.
+    """
+    weights = np.hanning(HOPS_PER_WINDOW + 2)[1:-1]
+    residual = _smoothed((equations.target - equations.columns @ ratios)[:, None], weights, "valid")
+    narrow = _smoothed(columns, weights, "valid")
+    correlated = _smoothed(_smoothed(columns, correlation, "same"), weights, "valid")
+    power = float(np.sum(np.convolve(weights, weights) * correlation[1:-1]).real)
+    absorbed = np.trace(inverse @ (correlated.conj().T @ narrow).real)
+    absorbed -= np.trace(inverse @ (narrow.conj().T @ narrow).real @ inverse @ between)
+    return float(np.sum(np.abs(residual) ** 2) / (len(residual) * power - absorbed))
+
+
+def _smoothed(values: Complex, weights: Complex | Array, mode: str) -> Complex:
+    """Convolution of every column, shape (points, columns), with weights over time."""
+    from scipy.signal import fftconvolve
+
+    return np.asarray(fftconvolve(values, weights[:, None], mode=mode, axes=0), np.complex128)
+
+
+def _residual_correlation(equations: _Equations, ratios: Array) -> Complex:
+    """Autocorrelation of the residual of white noise at the lags from -HOPS_PER_WINDOW to HOPS_PER_WINDOW points."""
+    from scipy.signal import fftconvolve
+
+    angle, velocity, acceleration = equations.windows
+    response = acceleration + ratios[1] * velocity + ratios[0] * angle
+    correlation = fftconvolve(response, response.conj()[::-1])[:: equations.hop]
+    return np.asarray(correlation / correlation[HOPS_PER_WINDOW].real, np.complex128)
 
 
 def _windows(hop: int, rate: float) -> tuple[Array, Array, Array]:
@@ -123,7 +204,7 @@ def _windows(hop: int, rate: float) -> tuple[Array, Array, Array]:
     return tuple(each / size for each in (1.0 - np.cos(turn), w * np.sin(turn), curved))  # type: ignore[return-value]
 
 
-def _averaged(values: Array | Complex, window: Array, hop: int) -> Complex:
+def _averaged(values: Array | Complex, window: Array | Complex, hop: int) -> Complex:
     """Averages under a window, one every ``hop`` samples."""
     from scipy.signal import oaconvolve
 

@@ -179,7 +179,8 @@ def lay_out_blocks(
     count = (channel.size - skipped) // max(length, 1)
     if channel.size < least or count < 1:
         raise BadInput(
-            f"is {channel.size} samples long; {least} are needed to track a motion",
+            f"is {channel.size} samples long, {slowest * channel.size / channel.sample_rate:.2g} periods of a motion "
+            f"at {slowest:.6g} Hz; {least} samples are needed to track it",
             file=channel.file,
             channel=channel.name,
             hint="record for longer",

@@ -196,6 +196,9 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
     found: list[Variable] = []
     for name_in_file in (*names, *([spec["time"]] if "time" in spec else [])):
         variable_name = find_variable(name_in_file, contents.variables)
+        if variable_name is None and find_variable(f"{split_label(name_in_file)[0]} (1)", contents.variables):
+            what = f"{source.name} names several variables {name_in_file!r}"
+            raise bad(what, f"choose one by its number; {holds}")
         if variable_name is None:
             raise bad(f"there is no variable {name_in_file!r}", holds)
         found.append(contents.variables[variable_name])

@@ -1,7 +1,8 @@
 """Whether the recording confirms the sign of a sensor of the motion: by its linear drive, an angle channel or edges.
 
 A wrong sign of a sensor's gain in the device file mirrors the picture. A passive oscillator lags the torque of a linear
-drive by 0 to 180 degrees, which confirms or contradicts the sign. A torque of combs, or no drive, does neither.
+drive by 0 to 180 degrees, which confirms or contradicts the sign. A torque of combs, or no drive, does neither. Where
+the motion itself comes from edges, its sign rests on what is stated of them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from estimation.reference import tone_frequency
 from estimation.signs import sign_from_edges
 from scanner.channel import Channel, check_signal
 from scanner.device import AXES, Axis, Device
+from scanner.edges import Edges
 from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
@@ -70,6 +72,8 @@ def describe_inverted_sensors(recording: Recording, device: Device) -> Iterator[
 def describe_unconfirmed_signs(recording: Recording, device: Device, motion: Motion) -> Iterator[str]:
     """Yield a line for every axis whose sign rests on the gain in the device file alone, or contradicts edges.
 
+    One line more names all axes whose sign rests on what is stated of their edges.
+
     Args:
         recording: that the motion was estimated from.
         device: with the readouts.
@@ -103,6 +107,32 @@ def describe_unconfirmed_signs(recording: Recording, device: Device, motion: Mot
             f"a wrong sign mirrors the picture in {axis}, and --flip-{axis} turns it"
             + (f"; a recorded drive_{axis} would confirm it" if linear else "")
         )
+    yield from _describe_signs_by_edges(recording, motion)
+
+
+def _describe_signs_by_edges(recording: Recording, motion: Motion) -> Iterator[str]:
+    """Yield one line if the sign of any axis is that of its edges: half a turn off, they give the mirrored picture."""
+    decisive = {a: recording.edges[f"sync_{a}"] for a, moved in motion.axes.items() if moved.sign == f"known: sync_{a}"}
+    if not decisive:
+        return
+    stated, remedies = [], []
+    for axis, edges in decisive.items():
+        key, value, opposite = _stated_side(edges)
+        stated.append(f"{key} = {value} of {edges.name}")
+        remedies.append(f"if it is mirrored in {axis}, state {key} = {opposite} or give --flip-{axis}")
+    yield (
+        f"the sign of {' and '.join(decisive)} rests on {' and '.join(stated)}, and the picture of the opposite is the "
+        f"mirror image: compare it with a known target; {'; '.join(remedies)}"
+    )
+
+
+def _stated_side(edges: Edges) -> tuple[str, str, str]:
+    """Name of the attribute that determines the sign, its value, and the value of the opposite sign."""
+    if edges.is_one_direction:
+        up, down = "zero-crossing-up", "zero-crossing-down"
+        return "event", edges.event, down if edges.event == up else up
+    angle = edges.angle or 0.0
+    return "angle", f"{angle:.4g} rad", f"{-angle:.4g} rad"
 
 
 def _sensor(recording: Recording, axis: Axis, name: str) -> tuple[Channel, float, int] | None:

@@ -77,6 +77,8 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         blur_px: rms blur by the phase error of an open-loop prediction in a picture of 400 pixels, before and after.
     """
     findings = content["findings"]
+    if not findings and content.get("untested"):
+        return f"The pictures agree with the nominal device within their noise. Not tested: {content['untested']}."
     if not findings and content["verdict"] == "consistent":
         return (
             "The recordings agree with the nominal device within their noise and the tolerances of its values; "
@@ -104,6 +106,8 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         text += " Use the corrected device.toml in place of the nominal one."
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}."
+    if content.get("untested"):
+        text += f" Not tested: {content['untested']}."
     return text
 
 

@@ -97,5 +97,7 @@ def test_less_than_one_and_a_half_periods_are_refused() -> None:
         name: (channel.read(0, round(1.4 / PARAMETRIC_HZ["y"] * channel.sample_rate)), "V", channel.sample_rate)
         for name, channel in recording.channels.items()
     }
-    with pytest.raises(BadInput, match=r"is 2141 samples long; 2294 are needed"):
+    with pytest.raises(
+        BadInput, match=r"is 2141 samples long, 1.4 periods of a motion at 3270 Hz; 2294 samples are needed"
+    ):
         estimate(Recording.from_arrays(short, recording.device))

@@ -53,6 +53,15 @@ def test_a_resonance_follows_from_the_drive_frequency() -> None:
     assert parametric.axes["x"].resonance == pytest.approx(1000.0, rel=0.01)
 
 
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "afm"])
+def test_a_resonance_in_kilohertz_is_refused(kind: str) -> None:
+    for resonance in (0.7, 5.4, 49.0):
+        with pytest.raises(BadInput, match=f"--resonance-y: is {resonance:g} Hz, .* {1e3 * resonance:g} Hz"):
+            new_device(kind, {"y": KnownAxis(resonance)})
+    for resonance in (60.0, 700.0, 5400.0, 49e3):
+        assert Device.from_toml(new_device(kind, {"y": KnownAxis(resonance)})).axes["y"].resonance > 59.0
+
+
 def test_a_device_may_state_drive_frequencies_only() -> None:
     known = {"x": KnownAxis(drive_frequency=2000.0, amplitude=0.1), "y": KnownAxis(drive_frequency=900.0)}
     device = Device.from_toml(new_device("electromagnetic", known, frequencies_only=True))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,61 +13,24 @@ import tifffile
 
 import lissajous
 from recon.cli import main
-from recon.reconstruction import Reconstruction
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
-
-RATE_HZ, SAMPLES, HALF_RAD = 1e6, 40_000, 0.08
-FREQUENCIES_HZ = {"x": 1870.0, "y": 733.0}
-FIELD = f"[scan]\nhalf_angle_x = {HALF_RAD}\nhalf_angle_y = {HALF_RAD}\n"
-READOUTS = "".join(f'[{a}.readout]\nkind = "position"\ngain = 20.0\nnoise_sd = 2e-3\n' for a in "xy")
-EDGES = "[x]\n[y]\n" + FIELD
-TIME = np.arange(SAMPLES) / RATE_HZ
-
-
-def angles(drift_rad: float = 0.1) -> dict[str, np.ndarray]:
-    """Motion of both axes [rad], whose phases drift."""
-    drift = drift_rad * TIME / TIME[-1]
-    return {
-        axis: 0.97 * HALF_RAD * np.sin(2 * np.pi * f * TIME + phase + drift)
-        for (axis, f), phase in zip(FREQUENCIES_HZ.items(), (0.4, 1.9), strict=True)
-    }
-
-
-def light(seed: int, drift_rad: float = 0.1) -> np.ndarray:
-    """Counts of a specimen of 60 spots without symmetry, as voltages."""
-    rng = np.random.default_rng(seed)
-    x, y = (angle / HALF_RAD for angle in angles(drift_rad).values())
-    scene = np.full(SAMPLES, 0.2)
-    for _ in range(60):
-        column, row, size = *rng.uniform(-0.95, 0.95, 2), rng.uniform(0.02, 0.06)
-        scene += rng.uniform(0.3, 1.0) * np.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * size**2))
-    return rng.poisson(300.0 * scene) / 300.0
-
-
-def sensors(seed: int) -> dict[str, tuple]:
-    rng = np.random.default_rng(seed)
-    return {f"sense_{a}": (20.0 * v + rng.normal(0.0, 2e-3, SAMPLES), "V", RATE_HZ) for a, v in angles().items()}
-
-
-def reconstruct(channels: dict[str, tuple], device: str) -> Reconstruction:
-    recording = Recording.from_arrays(channels, Device.from_toml(device))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        return lissajous.reconstruct(recording, pixels=(80, 80))
-
-
-def crossings(axis: str, upward: bool = True) -> np.ndarray:
-    """Times at which the axis passes the centre [s]."""
-    angle = angles()[axis]
-    at = np.flatnonzero((angle[:-1] < 0.0) & (angle[1:] >= 0.0) if upward else angle[:-1] * angle[1:] < 0.0)
-    return (at - angle[at] / (angle[at + 1] - angle[at])) / RATE_HZ
-
-
-def edges(x: np.ndarray, y: np.ndarray) -> dict[str, tuple]:
-    stated = {"event": "zero-crossing-up"}
-    return {"sync_x": (x, "s", stated), "sync_y": (y, "s", stated), "intensity": (light(772001), "V", RATE_HZ)}
+from tests.support.two_axis_scan import (
+    EDGES,
+    FIELD,
+    FREQUENCIES_HZ,
+    RATE_HZ,
+    READOUTS,
+    SAMPLES,
+    TIME,
+    angles,
+    crossings,
+    edges,
+    light,
+    reconstruct,
+    sensors,
+)
 
 
 def test_a_right_recording_has_no_limits() -> None:
@@ -222,6 +184,25 @@ def test_a_film_on_a_baseline_that_gets_worse_is_noted(tmp_path: Path, capsys: p
     assert notes == {"counts": False, "baseline": True}
 
 
+@pytest.mark.parametrize("wrong", ["right", "turned", "saturated"])
+def test_a_film_that_is_turned_or_saturated_is_noted(wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    frames = film(2.0)
+    made = {"right": frames, "turned": frames.swapaxes(1, 2), "saturated": np.minimum(frames, 30)}[wrong]
+    tifffile.imwrite(tmp_path / "film.tif", made, photometric="minisblack")
+    code, out, _ = run(["bidirectional", tmp_path / "film.tif", "-o", tmp_path / "out", "--json"], capsys)
+    notes = " ".join(json.loads(out)["notes"])
+    assert code == 0
+    assert ("transpose the frames" in notes) == (wrong == "turned")
+    assert ("at the top value 30" in notes) == (wrong == "saturated")
+
+
+def test_a_film_whose_lines_stand_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    tifffile.imwrite(tmp_path / "film.tif", film(2.0)[:, ::2].repeat(2, axis=1), photometric="minisblack")
+    code, _, err = run(["bidirectional", tmp_path / "film.tif", "-o", tmp_path / "out"], capsys)
+    assert code == 2
+    assert "51% of its lines equal the line before" in err  # 32 of the 63 lines that have one before
+
+
 def test_a_truncated_film_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -314,3 +295,17 @@ def test_a_rate_in_megahertz_is_noted() -> None:
     channels = {name: (values, unit, 1.0) for name, (values, unit, _) in sensors(772014).items()}
     notes = reconstruct({**channels, "intensity": (light(772014), "V", 1.0)}, READOUTS + FIELD).notes
     assert sum("check the unit of time and sample_rate, 1 Hz" in note for note in notes) == 2
+
+
+def test_a_diagnosis_says_what_it_did_not_test(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    channels = {**sensors(772013), "intensity": (light(772013), "V", RATE_HZ)}
+    Recording.from_arrays(channels, Device.from_toml(READOUTS + FIELD)).write(tmp_path / "scan.h5")
+    code, out, _ = run(["diagnose", tmp_path / "scan.h5", "-o", tmp_path / "out"], capsys)
+    assert code == 0
+    assert "Not tested: drive and mechanics, because the device states no mechanics." in out.splitlines()[0]
+    only_x = {name: values for name, values in channels.items() if name != "sense_y"}
+    device = READOUTS[: READOUTS.index("[y.")]
+    Recording.from_arrays(only_x, Device.from_toml(device)).write(tmp_path / "x.h5")
+    code, _, err = run(["diagnose", tmp_path / "x.h5", "-o", tmp_path / "none"], capsys)
+    assert code == 2
+    assert "tests nothing: the device states no mechanics" in err

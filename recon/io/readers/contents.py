@@ -168,13 +168,15 @@ def _find_jump(times: SampleSource, size: int) -> str:
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
-    """Make names unique: a repeated name gets a number appended, an empty name becomes ``column N``."""
+    """Make names unique: repeated names are all numbered, so that none of them stands for the first one; an empty name
+    becomes ``column N``."""
+    filled = [name.strip() or f"column {index}" for index, name in enumerate(names, 1)]
     out: list[str] = []
-    for index, name in enumerate(names, 1):
-        base = name.strip() or f"column {index}"
-        candidate, number = base, 1
+    for name in filled:
+        number = 1
+        candidate = f"{name} (1)" if filled.count(name) > 1 else name
         while candidate in out:
             number += 1
-            candidate = f"{base} ({number})"
+            candidate = f"{name} ({number})"
         out.append(candidate)
     return out

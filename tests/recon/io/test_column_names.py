@@ -47,7 +47,7 @@ def test_a_line_of_units_belongs_to_the_names_above_it() -> None:
         ("Time,Channel A,Channel B\n(ms),(V),(V)\n\n", 1e-3, ["Channel A", "Channel B"], ["V", "V"]),
         ("time [us],sense_x [V],photodiode [a.u.]\n", 1.0, ["sense_x", "photodiode"], ["V", "a.u."]),
         ("Model,DS1\nDate,today\nTime,A,B\ns,Volt,Volt\n", 1e-6, ["A", "B"], ["V", "V"]),
-        ("Second,Volt,Volt\n", 1e-6, ["Volt", "Volt (2)"], ["V", "V"]),
+        ("Second,Volt,Volt\n", 1e-6, ["Volt (1)", "Volt (2)"], ["V", "V"]),
     ],
 )
 def test_headers_state_names_units_and_clock(
@@ -60,6 +60,18 @@ def test_headers_state_names_units_and_clock(
     assert [each.unit for each in signals.values()] == units
     assert all(each.sample_rate == pytest.approx(1e6, rel=1e-9) for each in signals.values())
     assert all(each.start == 0.0 for each in signals.values())
+
+
+def test_a_heading_that_two_columns_share_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path, out = (
+        table(tmp_path / "a.csv", "Time (s),CH1 (V),CH1 (V)\n", [k * 1e-6 for k in range(50)]),
+        tmp_path / "a.h5",
+    )
+    for name in ("CH1", "CH1 (V)"):
+        assert main(["convert", str(path), "--channel", f"sense_x={name}", "-o", str(out)]) == 2
+        assert f"a.csv names several variables '{name}'; choose one by its number" in capsys.readouterr().err
+        assert not out.exists()
+    assert main(["convert", str(path), "--channel", "sense_x=CH1 (2)", "-o", str(out)]) == 0
 
 
 def test_uneven_times_are_no_clock(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
