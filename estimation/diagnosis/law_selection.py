@@ -22,6 +22,7 @@ from estimation.diagnosis.linear_model import (
     RivalFit,
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
+from estimation.diagnosis.necessity import are_needed, leave_nothing
 from estimation.diagnosis.significance import satisfies_sign_constraints
 
 MAX_LINEARISATIONS = 8
@@ -61,6 +62,7 @@ def choose_laws(
         progress: called with one line of text at every step.
     """
     fit, fitted, centres = anchor, dict[Effects, Fit](), set[Effects]()
+    compared: list[dict[Effects, Fit]] = []
     for _ in range(MAX_LINEARISATIONS):
         likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
         fit = fit_model(likelihood, fit.model, fit.x)
@@ -92,6 +94,7 @@ def choose_laws(
             break
         if not fits:
             return None
+        compared.append(fits)
         effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
         with_laws = fits[effects]
         is_worse = with_laws.neg2_log_evidence > fit.neg2_log_evidence
@@ -104,11 +107,42 @@ def choose_laws(
     alone = linear.hypothesis(()).neg2_log_evidence
     if any(map(is_discrepancy, anchor.model.candidates)):
         alone = min(alone, _evidence_of_discrepancy(likelihood, anchor, candidates))
-    if not linear.are_needed(present, misfit(before) - misfit(fit), alone):
+    if not are_needed(linear, present, misfit(before) - misfit(fit), alone):
         return None
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
+    leaves_nothing = leave_nothing(linear, present)
     rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
-    return Choice(likelihood, before, fit, rivals, linear.leaves_nothing(present))
+    if leaves_nothing:
+        rivals = {key: _with_fitted_rivals(key, of_law, fit, compared) for key, of_law in rivals.items()}
+    return Choice(likelihood, before, fit, rivals, leaves_nothing)
+
+
+def _with_fitted_rivals(
+    key: str, rivals: tuple[RivalFit, ...], fit: Fit, compared: Sequence[dict[Effects, Fit]]
+) -> tuple[RivalFit, ...]:
+    """Rivals of a law, and laws that were fitted in its place, with the smaller gap.
+
+    The linear model around one law may be wrong for another that fits as well. Without a discrepancy beside the laws,
+    their fits under the same noise decide.
+
+    Args:
+        key: of the law.
+        compared: fits that were compared with each other.
+    """
+    laws = {candidate.key: candidate for candidate in fit.model.candidates}
+    best = {rival.candidate.key: rival for rival in rivals}
+    for fits in compared:
+        own = next((one for one in fits.values() if {c.key for c in one.model.candidates} == laws.keys()), None)
+        if own is None:
+            continue
+        for other in fits.values():
+            new = [candidate for candidate in other.model.candidates if candidate.key not in laws]
+            if len(new) != 1 or {c.key for c in other.model.candidates} - {new[0].key} != laws.keys() - {key}:
+                continue
+            gap = max(other.neg2_log_evidence - own.neg2_log_evidence, 0.0)
+            if new[0].key not in best or gap < best[new[0].key].evidence_gap:
+                best[new[0].key] = RivalFit(gap, new[0], misfit(other) - misfit(own))
+    return tuple(sorted(best.values(), key=lambda rival: rival.evidence_gap))
 
 
 def _evidence_of_discrepancy(likelihood: Likelihood, anchor: Fit, candidates: Sequence[Candidate]) -> float:

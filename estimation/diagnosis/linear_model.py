@@ -53,22 +53,6 @@ MAX_SCALE_BESIDE = 0.1
 """Largest scale of a discrepancy beside which laws are selected, in units of its prior: a tenth of a discrepancy that
 explains a misfit by itself."""
 
-MIN_EXPLAINED_RATIO = 0.1
-"""Fall of the misfit by laws over that by free corrections beside them, from which laws may be the answer. Nominal
-values absorb most of a drift, so that a small imperfection may be larger than what is left of the drift: a true one had
-0.3. Laws that imitated an unlisted effect had 0.04 and less."""
-
-MAX_REMAINDER_RATIO = 0.03
-"""Fall of the misfit by free corrections beside laws, over that by the laws, up to which the laws take the bulk of it.
-Gravity and friction of a measured pendulum leave 3 %, a cubic spring in the place of a stop on one side 4 %."""
-
-POLYNOMIAL_SPRINGS = frozenset({"quadratic-stiffness", "cubic-stiffness", "quintic-stiffness"})
-"""Powers of the angle, of which several together approximate any spring: they do not count as the bulk of a misfit."""
-
-SMALL_LAW_MARGIN = 25.0
-"""Advantage in -2 log evidence over a discrepancy alone that laws need which leave more. A quintic spring that imitates
-a delay with memory has 12, laws beside the imperfections of ``cases_imperfect`` have 62 and more."""
-
 NULL_DRAWS, NULL_SEED = 10_000, 1
 """Draws of noise for the distribution of the largest gain in noise alone, which determine its 99.9 % quantile to 0.4,
 and the seed of them."""
@@ -222,7 +206,7 @@ class LinearModel:
         A discrepancy alone has the price of one law.
         """
         laws = hypothesis.laws
-        without = self._without_discrepancy(laws).neg2_log_evidence
+        without = self.without_discrepancy(laws).neg2_log_evidence
         beside = hypothesis.neg2_log_evidence + (0.0 if laws else MIN_SCORE_GAIN)
         return min(without, beside) + MIN_SCORE_GAIN * len(laws)
 
@@ -253,13 +237,13 @@ class LinearModel:
             laws = closest
         return laws
 
-    def _without_discrepancy(self, laws: Sequence[int]) -> Hypothesis:
+    def without_discrepancy(self, laws: Sequence[int]) -> Hypothesis:
         """The laws without a discrepancy."""
         return self.hypothesis(laws, without=range(len(self.discrepancies)))
 
     def _misfit(self, laws: Sequence[int]) -> float:
         """Of laws without a discrepancy."""
-        return self._without_discrepancy(laws).misfit
+        return self.without_discrepancy(laws).misfit
 
     def _moves(self, best: Hypothesis) -> Iterator[Hypothesis]:
         if len(best.laws) < MAX_LAWS:
@@ -304,12 +288,12 @@ class LinearModel:
         right laws, so that :meth:`select` prefers a law that leaves everything to a discrepancy.
         """
         laws: tuple[int, ...] = ()
-        lowest = self._without_discrepancy(laws).neg2_log_evidence
+        lowest = self.without_discrepancy(laws).neg2_log_evidence
         while len(laws) < MAX_LAWS:
             taken = self.effects(laws)
             more = [(*laws, i) for i in range(len(self.laws)) if not self.effects([i]) & taken]
             limit = lowest - MIN_SCORE_GAIN
-            improved = {m: e for m in more if (e := self._without_discrepancy(m).neg2_log_evidence) < limit}
+            improved = {m: e for m in more if (e := self.without_discrepancy(m).neg2_log_evidence) < limit}
             best = next((m for m in sorted(improved, key=improved.__getitem__) if self._is_possible(m)), None)
             if best is None:
                 break
@@ -347,29 +331,6 @@ class LinearModel:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
 
-    def are_needed(self, laws: Sequence[int], explained: float, alone: float) -> bool:
-        """Whether a discrepancy without bound on its scales needs laws beside it.
-
-        They have to explain ``MIN_EXPLAINED_RATIO`` of what the discrepancy beside them still does. Against laws that
-        take the bulk of the misfit, the discrepancy alone has to gain as much as a law; others need an advantage in
-        evidence of ``SMALL_LAW_MARGIN`` over it.
-
-        Args:
-            explained: fall of the misfit by the laws.
-            alone: -2 log evidence of the discrepancy without them.
-        """
-        beside = self.hypothesis(laws)
-        without = self._without_discrepancy(laws)
-        remainder = without.misfit - beside.misfit
-        if explained < MIN_EXPLAINED_RATIO * remainder:
-            return False
-        significant = without.neg2_log_evidence - beside.neg2_log_evidence > MIN_SCORE_GAIN
-        advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
-        springs = [axis for axis, effect in self.effects(laws) if effect in POLYNOMIAL_SPRINGS]
-        series = len(springs) > len(set(springs))
-        bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
-        return advantage > (-MIN_SCORE_GAIN if bulk else SMALL_LAW_MARGIN)
-
     def null_gain(self, probability: float) -> float:
         """Fall of -2 log evidence that the best of all laws exceeds in noise alone with the given probability.
 
@@ -384,10 +345,6 @@ class LinearModel:
             gain = np.einsum("id,id->d", projected, np.linalg.solve(normal, projected))
             largest = np.maximum(largest, gain - np.linalg.slogdet(normal)[1] - law.cost)
         return float(np.quantile(largest, 1.0 - probability)) if self.laws else 0.0
-
-    def leaves_nothing(self, laws: Sequence[int]) -> bool:
-        """Whether the discrepancy terms of all stages beside laws have no evidence at all."""
-        return self._without_discrepancy(laws).neg2_log_evidence < self.hypothesis(laws).neg2_log_evidence
 
     def gain_of_discrepancy(self, laws: Sequence[int]) -> float:
         """Fall of the misfit by the discrepancy terms of all stages beside laws."""

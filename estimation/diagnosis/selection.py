@@ -24,6 +24,7 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
+from estimation.diagnosis.necessity import are_needed
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import (
     ScoreTest,
@@ -259,7 +260,7 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
     discrepancies = list(filter(is_discrepancy, pool))
     without, beside = (linear_model(selected.likelihood, fit, discrepancies) for fit in (base, best))
     laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
-    if not beside.are_needed(laws, misfit(base) - misfit(best), alone):
+    if not are_needed(beside, laws, misfit(base) - misfit(best), alone):
         return selected
     best = fit_to_convergence(selected.likelihood, best.model, best.x)
     progress(f"laws beside {best.model.candidates[-1].key}")

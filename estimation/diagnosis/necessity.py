@@ -1,0 +1,52 @@
+"""Whether named laws are the answer beside free corrections of every stage, which explain a misfit without them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from estimation.diagnosis.linear_model import MIN_SCORE_GAIN, LinearModel
+
+MIN_EXPLAINED_RATIO = 0.1
+"""Fall of the misfit by laws over that by free corrections beside them, from which laws may be the answer. Nominal
+values absorb most of a drift, so that a small imperfection may be larger than what is left of the drift: a true one had
+0.3. Laws that imitated an unlisted effect had 0.04 and less."""
+
+MAX_REMAINDER_RATIO = 0.03
+"""Fall of the misfit by free corrections beside laws, over that by the laws, up to which the laws take the bulk of it.
+Gravity and friction of a measured pendulum leave 3 %, a cubic spring in the place of a stop on one side 4 %."""
+
+POLYNOMIAL_SPRINGS = frozenset({"quadratic-stiffness", "cubic-stiffness", "quintic-stiffness"})
+"""Powers of the angle, of which several together approximate any spring: they do not count as the bulk of a misfit."""
+
+SMALL_LAW_MARGIN = 25.0
+"""Advantage in -2 log evidence over a discrepancy alone that laws need which leave more. A quintic spring that imitates
+a delay with memory has 12, laws beside the imperfections of ``cases_imperfect`` have 62 and more."""
+
+
+def are_needed(linear: LinearModel, laws: Sequence[int], explained: float, alone: float) -> bool:
+    """Whether a discrepancy without bound on its scales needs laws beside it.
+
+    They have to explain ``MIN_EXPLAINED_RATIO`` of what the discrepancy beside them still does. Against laws that
+    take the bulk of the misfit, the discrepancy alone has to gain as much as a law; others need an advantage in
+    evidence of ``SMALL_LAW_MARGIN`` over it.
+
+    Args:
+        explained: fall of the misfit by the laws.
+        alone: -2 log evidence of the discrepancy without them.
+    """
+    beside = linear.hypothesis(laws)
+    without = linear.without_discrepancy(laws)
+    remainder = without.misfit - beside.misfit
+    if explained < MIN_EXPLAINED_RATIO * remainder:
+        return False
+    significant = without.neg2_log_evidence - beside.neg2_log_evidence > MIN_SCORE_GAIN
+    advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
+    springs = [axis for axis, effect in linear.effects(laws) if effect in POLYNOMIAL_SPRINGS]
+    series = len(springs) > len(set(springs))
+    bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
+    return advantage > (-MIN_SCORE_GAIN if bulk else SMALL_LAW_MARGIN)
+
+
+def leave_nothing(linear: LinearModel, laws: Sequence[int]) -> bool:
+    """Whether the discrepancy terms of all stages beside laws have no evidence at all."""
+    return linear.without_discrepancy(laws).neg2_log_evidence < linear.hypothesis(laws).neg2_log_evidence
