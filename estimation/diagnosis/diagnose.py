@@ -127,7 +127,7 @@ class Diagnosis:
             "schema": SCHEMA,
             "verdict": self.verdict,
             "findings": [
-                {key: value for key, value in asdict(finding).items() if value is not None or key == "rivals"}
+                {key: value for key, value in asdict(finding).items() if value is not None or key == "share"}
                 for finding in self.findings
             ],
             "unexplained": self.unexplained,
