@@ -22,3 +22,15 @@ def test_a_drift_that_low_frequency_noise_explains_is_removed_beside_a_true_lag(
     case = Case("blind-001", "one", "drive", ("readout-lag",), "coloured", 2317301653)
     _, search = search_blind_recording(case, tmp_path, ("readout-lag", "channel-delay", "offset-drift"))
     assert [selected.candidate.term.effect for selected in search.steps] == ["readout-lag"]
+
+
+@pytest.mark.slow
+def test_a_lag_before_a_linear_mirror_is_a_rival_of_one_behind_it(tmp_path: Path) -> None:
+    """Without the angle only the first periods tell them apart: both fit the recording as well."""
+    case = Case("blind-001", "one", "tf", ("readout-lag",), "popcorn", 2896821185)
+    _, search = search_blind_recording(case, tmp_path, ("readout-lag", "drive-lag", "channel-delay", "hysteresis"))
+    (selected,) = search.steps
+    names = [selected.candidate.term.effect, *(rival.candidate.term.effect for rival in selected.rivals)]
+    assert {"readout-lag", "drive-lag"} <= set(names[:3])
+    gaps = {rival.candidate.term.effect: rival.evidence_gap for rival in selected.rivals}
+    assert all(gaps[name] < 6.0 for name in ("readout-lag", "drive-lag") if name in gaps)
