@@ -25,6 +25,10 @@ DIVERGED_ERROR = 1e6
 """Error that is assumed where a prediction diverges, in the channel's unit: its square is finite."""
 
 
+ERROR_MARGIN = 0.01
+"""Relative increase of an open-loop error that counts as none: fits end within it."""
+
+
 @dataclass(frozen=True)
 class OpenLoop:
     """Prediction of one channel by a device, on held-out samples.
@@ -85,15 +89,20 @@ def open_loop(runs: Sequence[Run], device: Device) -> dict[str, OpenLoop]:
     return by_channel
 
 
+def has_larger_error(nominal: Mapping[str, OpenLoop], improved: Mapping[str, OpenLoop]) -> bool:
+    """Whether the error of a device, over all channels as in :func:`is_worse`, exceeds that of the nominal one."""
+    return _relative_error(improved)[0] > (1.0 + ERROR_MARGIN) * _relative_error(nominal)[0]
+
+
 def is_worse(nominal: Mapping[str, OpenLoop], improved: Mapping[str, OpenLoop]) -> bool:
-    """Whether a device predicts worse than the nominal one, by more than 1 % and twice the uncertainty.
+    """Whether a device predicts worse than the nominal one, by more than ``ERROR_MARGIN`` and twice the uncertainty.
 
     The errors of all channels are added, each as a fraction of its signal: a readout lag may change the angle by a
     thousandth of its amplitude while the error of the sense signal falls to a tenth.
     """
     before, before_sd = _relative_error(nominal)
     after, after_sd = _relative_error(improved)
-    return bool(after - before > 2.0 * np.hypot(before_sd, after_sd) + 0.01 * before)
+    return bool(after - before > 2.0 * np.hypot(before_sd, after_sd) + ERROR_MARGIN * before)
 
 
 def _relative_error(channels: Mapping[str, OpenLoop]) -> tuple[float, float]:

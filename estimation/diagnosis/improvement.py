@@ -9,7 +9,7 @@ from typing import Any
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import Fit, fit_model
 from estimation.device_fit.model import Model
-from estimation.device_fit.open_loop import OpenLoop, is_worse, open_loop
+from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.identifiability import determined_parameters
@@ -25,8 +25,7 @@ class Improvement:
 
     Attributes:
         search: result of the selection without the rejected findings.
-        device: the improved device. Its open-loop error exceeds that of the nominal device by no more than the
-            uncertainty of that comparison.
+        device: the improved device, or the nominal one if its open-loop error is not larger.
         nominal, improved: open-loop errors of the nominal and of the improved device, by channel.
     """
 
@@ -47,9 +46,10 @@ def improve(result: SelectionResult) -> Improvement:
     """Improve the device by the findings that do not make its open-loop prediction worse.
 
     As long as the device with all findings predicts worse than the nominal one, beyond the uncertainty of the
-    comparison, the weakest finding is removed. A discrepancy term always remains a finding, but if the device with its
-    measured law predicts any channel of any run worse, the device with the named laws alone is returned, or the nominal
-    one if that is worse too.
+    comparison, the weakest finding is removed. Within that uncertainty findings stay, but the nominal device takes the
+    place of one with a larger error. A discrepancy term always remains a finding, but if the device with its measured
+    law predicts any channel of any run worse, the device with the named laws alone is returned, or the nominal one if
+    that is worse too.
     """
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
@@ -62,6 +62,8 @@ def improve(result: SelectionResult) -> Improvement:
             better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
         if not is_worse(nominal, improved):
+            if has_larger_error(nominal, improved):
+                device, improved = stated, nominal
             return Improvement(result, device, nominal, improved)
         result = without_weakest(result)
 

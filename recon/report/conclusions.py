@@ -102,7 +102,10 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
             f"400 pixels, the corrected one by {blur_px[1]:.1g} px."
         )
     text += modes
-    if findings or modes:
+    loops = content.get("open_loop", {}).values()
+    if loops and all(loop["improved"] == loop["nominal"] for loop in loops):
+        text += " device.toml is the nominal device: a corrected one predicts the held-out samples no better."
+    elif findings or modes:
         text += " Use the corrected device.toml in place of the nominal one."
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}."

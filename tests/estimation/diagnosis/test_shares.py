@@ -12,7 +12,7 @@ from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Likelihood, fit_model, linearise_at
 from estimation.device_fit.initial import flat_whiteners
 from estimation.device_fit.model import Model
-from estimation.device_fit.open_loop import OpenLoop, is_worse, open_loop
+from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.clipping import find_rail
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.shares import explained_share, remaining_share
@@ -34,6 +34,12 @@ def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> No
     nominal = {"sense_x": OpenLoop(1.0, 10.0, 0.1)}
     assert not is_worse(nominal, {"sense_x": OpenLoop(1.2, 10.0, 0.1)})
     assert is_worse(nominal, {"sense_x": OpenLoop(1.4, 10.0, 0.1)})
+
+
+@pytest.mark.parametrize(("error", "larger"), [(0.9, False), (1.005, False), (1.2, True)])
+def test_a_larger_error_counts_whatever_its_uncertainty(error: float, larger: bool) -> None:
+    nominal = {"sense_x": OpenLoop(1.0, 10.0, 0.5)}
+    assert has_larger_error(nominal, {"sense_x": OpenLoop(error, 10.0, 0.5)}) is larger
 
 
 def test_a_rail_is_detected_from_samples_at_one_value() -> None:
