@@ -62,13 +62,15 @@ def choose_laws(
         progress: called with one line of text at every step.
     """
     fit, fitted, centres = anchor, dict[Effects, Fit](), set[Effects]()
-    compared: list[dict[Effects, Fit]] = []
+    compared, returned = list[dict[Effects, Fit]](), False
     for _ in range(MAX_LINEARISATIONS):
         likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
         fit = fit_model(likelihood, fit.model, fit.x)
         linear = linear_model(likelihood, fit, candidates)
         present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
         centres.add(linear.effects(present))
+        if returned:
+            break
         if fitted:
             selected = [linear.select(present, max_moves=1).laws]
         elif any(map(is_discrepancy, fit.model.candidates)):
@@ -97,8 +99,8 @@ def choose_laws(
         compared.append(fits)
         effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
         with_laws = fits[effects]
-        is_worse = with_laws.neg2_log_evidence > fit.neg2_log_evidence
-        if present and (effects in centres or (len(effects) > len(present) and is_worse)):
+        returned, is_worse = effects in centres, with_laws.neg2_log_evidence > fit.neg2_log_evidence
+        if present and is_worse and (returned or len(effects) > len(present)):
             break
         fitted[effects] = fit = with_laws
     else:
