@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from math import pi, sqrt
+from math import inf, pi, sqrt
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.blind.motion import NODES, SECTION_2, THETA, Trajectory, integrate
+from benchmarks.blind.motion import NODES, READOUT, SECTION_2, THETA, Trajectory, integrate
 from benchmarks.blind.scanner_truth import Truth
 from benchmarks.blind.scenarios import LEAD_TIME_S, Partner, Rng, Scenario, Tones, initial_states, nominal_device
 
@@ -100,9 +100,10 @@ def _device(x: Truth, y: Truth, shared: bool, rng: Rng) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=2)
-def partner_motion(partner: Partner, sections: float, duration: float) -> Trajectory:
-    """The settled motion of y over a recording; ``sections`` scales the corners of the readout shared with x."""
-    truth, step = partner.truth._replace(sections=sections), 1 / partner.steps_per_second
+def partner_motion(partner: Partner, readout: Truth, duration: float) -> Trajectory:
+    """The settled motion of y over a recording, through the filters of ``readout``."""
+    truth = partner.truth._replace(sections=readout.sections, readout_corner=readout.readout_corner)
+    step = 1 / partner.steps_per_second
     start = -PARTNER_SETTLE_TIME_S - LEAD_TIME_S
     first = start + step * np.arange(round((duration + LEAD_TIME_S - start) / step))
     return integrate(
@@ -110,14 +111,17 @@ def partner_motion(partner: Partner, sections: float, duration: float) -> Trajec
     )
 
 
-def partner_section(partner: Partner, sections: float, duration: float, clock: Array) -> Array:
-    """The demodulator's output for y's capacitance at times (n,) [F]."""
-    return partner_motion(partner, sections, duration).at(clock, SECTION_2)
+def partner_output(partner: Partner, readout: Truth, duration: float, clock: Array) -> Array:
+    """Output of ``readout`` for y's capacitance at times (n,), without its offset [V]."""
+    motion = partner_motion(partner, readout, duration)
+    if readout.readout_corner < inf:
+        return motion.at(clock, READOUT)
+    return readout.a_cir * motion.at(clock, SECTION_2)
 
 
 def partner_angle(partner: Partner, duration: float, times: Array) -> Array:
     """y's true angle at times (n,) [rad]."""
-    return partner_motion(partner, 1.0, duration).at(times, THETA)
+    return partner_motion(partner, partner.truth, duration).at(times, THETA)
 
 
 def picture(x: Array, y: Array) -> Array:

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from benchmarks.blind.imaging import partner_section
+from benchmarks.blind.imaging import partner_output
 from benchmarks.blind.motion import (
     MEMORY,
     RATE,
@@ -74,8 +74,7 @@ def channels_of_motion(scenario: Scenario, truth: Truth, trajectory: Trajectory)
     channels = {"sense_x": sense(scenario, truth, trajectory)}
     if scenario.partner is not None and not scenario.partner.shared:
         p = scenario.partner.truth
-        section = partner_section(scenario.partner, 1.0, scenario.duration, scenario.times)
-        channels["sense_y"] = p.a_cir * section + p.offset
+        channels["sense_y"] = p.offset + partner_output(scenario.partner, p, scenario.duration, scenario.times)
     if scenario.angle_sd is not None:
         channels["angle_x"] = angle(trajectory.at(scenario.times, THETA), truth)
     return channels
@@ -96,10 +95,9 @@ def sense(scenario: Scenario, truth: Truth, trajectory: Trajectory) -> Array:
         volts = trajectory.at(clock, READOUT)
     else:
         bias = command + charge_voltage(p, clock)
-        section = trajectory.at(clock, SECTION_2)
-        if scenario.partner is not None and scenario.partner.shared:
-            section = section + partner_section(scenario.partner, p.sections, scenario.duration, clock)
-        volts = _flat(trajectory.at(clock, THETA), rate, section, bias, p)
+        volts = _flat(trajectory.at(clock, THETA), rate, trajectory.at(clock, SECTION_2), bias, p)
+    if scenario.partner is not None and scenario.partner.shared:
+        volts = volts + partner_output(scenario.partner, p, scenario.duration, clock)
     volts = (volts + p.offset) * (1 + p.rate_gain * np.tanh(rate / (0.03 * scenario.omega * scenario.swing)))
     volts = volts * (1 + p.gain_drift * t / T) * (1 + p.ripple * np.sin(p.ripple_frequency * t))
     volts = volts * (1 + p.sensor_cubic * volts**2)
