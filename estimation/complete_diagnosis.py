@@ -57,6 +57,22 @@ def diagnose_with_optics(
     nominal = nominal_device(recordings, device)
     diagnosis = _diagnose_motion(recordings, nominal, progress)
     pictures = [each for each in recordings if "intensity" in each and set(nominal.axes) == set(AXES)]
+    try:
+        return _diagnose_pictures(recordings, pictures, nominal, diagnosis, measure_reference, progress)
+    except BadInput as error:  # no picture can be made of the motion, which the diagnosis of the motion may explain
+        untested = "; ".join(filter(None, (diagnosis.untested, f"the picture, because it cannot be made ({error})")))
+        return replace(diagnosis, untested=untested)
+
+
+def _diagnose_pictures(
+    recordings: Sequence[Recording],
+    pictures: Sequence[Recording],
+    nominal: Device,
+    diagnosis: Diagnosis,
+    measure_reference: MeasureReference,
+    progress: Progress,
+) -> Diagnosis:
+    """The diagnosis with what the pictures show of the readout and the optics."""
     findings, stated = _diagnose_readout(pictures, nominal, diagnosis, measure_reference, progress)
     if findings:
         again = _diagnose_motion(recordings, stated, progress)
