@@ -59,9 +59,10 @@ def diagnose_with_optics(
     pictures = [each for each in recordings if "intensity" in each and set(nominal.axes) == set(AXES)]
     try:
         return _diagnose_pictures(recordings, pictures, nominal, diagnosis, measure_reference, progress)
-    except BadInput as error:  # no picture can be made of the motion, which the diagnosis of the motion may explain
-        untested = "; ".join(filter(None, (diagnosis.untested, f"the picture, because it cannot be made ({error})")))
-        return replace(diagnosis, untested=untested)
+    except BadInput as error:
+        if diagnosis.untested:
+            raise
+        return replace(diagnosis, untested=f"the picture, because it cannot be made ({error})")
 
 
 def _diagnose_pictures(

@@ -100,9 +100,13 @@ def _device(x: Truth, y: Truth, shared: bool, rng: Rng) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=2)
-def partner_motion(partner: Partner, readout: Truth, duration: float) -> Trajectory:
-    """The settled motion of y over a recording, through the filters of ``readout``."""
-    truth = partner.truth._replace(sections=readout.sections, readout_corner=readout.readout_corner)
+def partner_motion(partner: Partner, duration: float, sections: float, corner: float) -> Trajectory:
+    """The settled motion of y over a recording, with its readout.
+
+    Args:
+        sections: factor on the corners of the demodulator. corner: of a lag behind it [rad/s].
+    """
+    truth = partner.truth._replace(sections=sections, readout_corner=corner)
     step = 1 / partner.steps_per_second
     start = -PARTNER_SETTLE_TIME_S - LEAD_TIME_S
     first = start + step * np.arange(round((duration + LEAD_TIME_S - start) / step))
@@ -113,7 +117,7 @@ def partner_motion(partner: Partner, readout: Truth, duration: float) -> Traject
 
 def partner_output(partner: Partner, readout: Truth, duration: float, clock: Array) -> Array:
     """Output of ``readout`` for y's capacitance at times (n,), without its offset [V]."""
-    motion = partner_motion(partner, readout, duration)
+    motion = partner_motion(partner, duration, readout.sections, readout.readout_corner)
     if readout.readout_corner < inf:
         return motion.at(clock, READOUT)
     return readout.a_cir * motion.at(clock, SECTION_2)
@@ -121,7 +125,7 @@ def partner_output(partner: Partner, readout: Truth, duration: float, clock: Arr
 
 def partner_angle(partner: Partner, duration: float, times: Array) -> Array:
     """y's true angle at times (n,) [rad]."""
-    return partner_motion(partner, partner.truth, duration).at(times, THETA)
+    return partner_motion(partner, duration, 1.0, inf).at(times, THETA)
 
 
 def picture(x: Array, y: Array) -> Array:

@@ -58,7 +58,8 @@ MIN_STEP, MAX_STEP, STEP_WITHOUT_EFFECT = 1e-7, 3e-2, 1e-2
 first, rounding dominates; above the second, the change is no longer linear."""
 
 MIN_PULL_PROBABILITY = 1e-3
-"""Probability of nominal values as far from the stated ones, in tolerances, below which they have absorbed a misfit."""
+"""Probability of nominal values as far from the stated ones, in tolerances, below which they have absorbed a misfit, or
+contradict their tolerances: one false alarm in a thousand recordings without any effect."""
 
 
 @dataclass(frozen=True)

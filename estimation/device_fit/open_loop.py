@@ -24,7 +24,6 @@ FIXED_PARAMETER_PRECISION = 1e14
 DIVERGED_ERROR = 1e6
 """Error that is assumed where a prediction diverges, in the channel's unit: its square is finite."""
 
-
 ERROR_MARGIN = 0.01
 """Relative increase of an open-loop error that counts as none: fits end within it."""
 

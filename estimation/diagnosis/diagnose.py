@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from estimation.device_fit.data import prepare_run
-from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.fit import Fit, Likelihood, nominal_values_are_improbable
 from estimation.device_fit.open_loop import open_loop
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.profile_likelihood import profile_interval
@@ -32,10 +32,6 @@ from scanner.terms import catalogue
 
 SCHEMA = "lissajous-diagnosis/1"
 METRIC = "reduced chi-square of the whitened residual on samples not used in the fit"
-
-PULL_LIMIT = 1e-3
-"""Probability below which the deviations (pulls) of the fitted nominal values from the stated ones are a mismatch in
-themselves: one false alarm in a thousand recordings without any effect."""
 
 
 @dataclass(frozen=True)
@@ -331,13 +327,11 @@ def _pulls(fit: Fit) -> list[tuple[float, str, str]]:
 def _prior_tension_finding(fit: Fit) -> Finding | None:
     """A finding for nominal values that deviate from the stated ones by more than their tolerances allow.
 
-    None if the deviations are as probable as ``PULL_LIMIT``.
+    None if the deviations are probable.
     """
-    from scipy.stats import chi2
-
-    pulls = _pulls(fit)
-    if chi2.sf(sum(pull**2 for pull, _, _ in pulls), len(pulls)) > PULL_LIMIT:
+    if not nominal_values_are_improbable(fit):
         return None
+    pulls = _pulls(fit)
     size, axis, name = pulls[0]
     return Finding(
         axis=axis,

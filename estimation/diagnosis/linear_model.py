@@ -30,8 +30,8 @@ Effects = frozenset[tuple[str, str]]
 
 SCALE_ITERATIONS, SCORE_TOLERANCE = 12, 0.05
 """Largest number of fixed-point iterations of the discrepancy's scales, and the change of a score by the next one below
-which they end: half of the smallest difference on which a choice depends. The limits below are calibrated with this
-number; without laws a score would fall by up to 15 more."""
+which they end: half of the smallest difference on which a choice depends. The limits here and in ``necessity.py`` are
+calibrated with this number; without laws a score would fall by up to 15 more."""
 
 MIN_DETERMINED = 1e-3
 """Least number of coefficients of a discrepancy term that count as determined: it keeps a scale finite."""

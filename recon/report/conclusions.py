@@ -77,12 +77,11 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         blur_px: rms blur by the phase error of an open-loop prediction in a picture of 400 pixels, before and after.
     """
     findings = content["findings"]
-    if not findings and content.get("untested"):
-        return f"The pictures agree with the nominal device within their noise. Not tested: {content['untested']}."
+    untested = f" Not tested: {content['untested']}." if content.get("untested") else ""
     if not findings and content["verdict"] == "consistent":
         return (
             "The recordings agree with the nominal device within their noise and the tolerances of its values; "
-            "no correction is needed."
+            "no correction is needed." + untested
         )
     modes = "".join(
         f" The drive also excites further modes of {name} at "
@@ -103,15 +102,14 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         )
     text += modes
     loops = content.get("open_loop", {}).values()
-    if loops and all(loop["improved"] == loop["nominal"] for loop in loops):
+    in_picture = any(finding["channel"] == "intensity" for finding in findings)
+    if loops and not in_picture and all(loop["improved"] == loop["nominal"] for loop in loops):
         text += " device.toml is the nominal device: a corrected one predicts the held-out samples no better."
     elif findings or modes:
         text += " Use the corrected device.toml in place of the nominal one."
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}."
-    if content.get("untested"):
-        text += f" Not tested: {content['untested']}."
-    return text
+    return text + untested
 
 
 def _describe_finding(finding: Mapping[str, Any]) -> str:
