@@ -212,7 +212,6 @@ class _Follower:
         replace_display_and_sd(self.output, self.scan.estimate)
         if self.measurement is None and wants_measurement(self.scan, self.options):
             self.measurement = self.background.submit(measure_readout, self.frame.longest, self.scan.readout_phase)
-            self.scan = replace(self.scan, measure_at=next_measurement(self.scan.frames))
         self._begin_next()
 
     def _use_measurement(self) -> None:
@@ -221,6 +220,7 @@ class _Follower:
             return
         with suppress(BadInput):  # this frame determines no phase error; what is known remains
             self.scan = replace(self.scan, readout_phase=self.measurement.result())
+        self.scan = replace(self.scan, measure_at=next_measurement(self.scan.frames))
         self.measurement = None
 
     def _note_latency(self, stop: float) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from estimation.tracker import track_end
 from recon.estimated_motion import EstimatedMotion
 from recon.imaging.bidirectional_phase import slow_period
+from recon.imaging.carried_readout_phase import apply_readout_phase, update_readout_phase
 from recon.imaging.intensity_gridding import PixelSums, add_samples, empty_sums
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.picture_estimate import (
@@ -28,7 +29,7 @@ from recon.imaging.picture_estimate import (
     picture_without_sd,
 )
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
-from recon.imaging.readout_phase import ReadoutPhase, apply_readout_phase, update_readout_phase
+from recon.imaging.readout_phase import ReadoutPhase
 from recon.io.output import write_tiff
 from recon.phase_and_drift import measure_phase_errors, wants_readout_phase
 from recon.pipeline import estimate_motion
@@ -233,10 +234,10 @@ def measure_readout(part: FramePart, known: Mapping[str, ReadoutPhase]) -> Mappi
 
 
 def next_measurement(number: int) -> int:
-    """Number of the frame in which the phase error of the readout is measured next after that of ``number``, from 1 on.
+    """Return the frame in which the readout is measured next; number: frame in which a measurement ended, from 1 on.
 
-    It takes longer than a short frame lasts. Frames at doubling numbers find it early and then refine it; in a long
-    scan every ``MAX_FRAMES_BETWEEN_MEASUREMENTS`` follow it.
+    A measurement takes longer than a short frame lasts. Frames at doubling numbers find the phase error early and then
+    refine it; in a long scan every ``MAX_FRAMES_BETWEEN_MEASUREMENTS`` follow it.
     """
     return min(2 * number, number + MAX_FRAMES_BETWEEN_MEASUREMENTS)
 
