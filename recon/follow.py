@@ -67,6 +67,7 @@ class FollowSummary:
         frame_s: duration of a frame [s]; NaN until it is known.
         frames: number of frames shown.
         dropped: number of frames not shown, because newer ones were complete or their motion could not be estimated.
+        overtaken: number of those that newer ones had overtaken: the machine is too slow for the frames.
         latency_s: time from the arrival of a frame's last sample to its picture, for each frame shown [s].
         ended: why following ended.
         shown: end of each frame shown [s], and when its picture was complete [s on the monotonic clock].
@@ -75,6 +76,7 @@ class FollowSummary:
     frame_s: float
     frames: int = 0
     dropped: int = 0
+    overtaken: int = 0
     latency_s: list[float] = field(default_factory=list)
     ended: str = "interrupted"
     shown: list[tuple[float, float]] = field(default_factory=list)
@@ -83,7 +85,9 @@ class FollowSummary:
         """Return the part "live" of summary.json."""
         values = np.array(self.latency_s or [np.nan])
         latency = {"median": float(np.median(values)), "max": float(values.max()), "first": float(values[0])}
-        return {key: getattr(self, key) for key in ("frame_s", "frames", "dropped", "ended")} | {"latency_s": latency}
+        return {key: getattr(self, key) for key in ("frame_s", "frames", "dropped", "overtaken", "ended")} | {
+            "latency_s": latency
+        }
 
 
 def follow_recording(
@@ -176,6 +180,7 @@ class _Follower:
         complete = 0 if np.isnan(length) else floor((end - begin) / length + 1e-9)
         if self.part == 0 and complete - self.done > MAX_PENDING_FRAMES:
             self.summary.dropped += complete - 1 - self.done
+            self.summary.overtaken += complete - 1 - self.done
             self.done = complete - 1
         start, stop = begin + self.done * length, begin + (self.done + 1) * length
         edges = part_edges(start, stop, slow_period(self.scan.motion)) if self.scan else [start, stop]

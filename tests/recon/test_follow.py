@@ -32,6 +32,7 @@ from recon.live_frames import (
     next_measurement,
     part_edges,
 )
+from recon.notes import describe_live_frames
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
 from scanner.errors import BadInput
@@ -169,6 +170,16 @@ def test_an_interrupt_ends_the_following_and_keeps_the_frames(written, tmp_path:
     assert main(["reconstruct", "--follow", str(path), "-o", str(out), *arguments]) == 0
     thread.join()
     assert json.loads((out / "summary.json").read_text())["live"]["ended"] == "interrupted"
+
+
+def test_frames_that_newer_ones_overtake_are_counted_and_stated(scan: Path, tmp_path: Path) -> None:
+    options = Options(pixels=(50, 50))
+    live = follow_recording(scan, tmp_path / "out", options, frame_time=0.004, quiet_time=0.1, quiet=True)
+    summary = live.summary()  # all five frames were complete at once
+    assert (live.frames, live.dropped, live.overtaken) == (1, 4, 4)
+    (note,) = describe_live_frames(summary)
+    assert "4 of 5 live frames were left out" in note
+    assert describe_live_frames(summary | {"dropped": 4, "overtaken": 0}) == []  # sensors without motion, for instance
 
 
 def test_the_readout_error_is_measured_ever_more_rarely_and_never_stops() -> None:
