@@ -18,8 +18,9 @@ import numpy as np
 
 from estimation.tracker.demodulation import harmonic_basis, sample_offsets, whiten_projections
 from estimation.tracker.kalman_filter import JUMP_NIS
+from estimation.tracker.line_noise import DISTURBED_VARIANCE_RATIO
 from estimation.tracker.linearisation import expected_projections
-from estimation.tracker.observations import DISTURBED_VARIANCE_RATIO, BlockObservations
+from estimation.tracker.observations import BlockObservations
 from estimation.tracker.state_space import RATE_TERMS
 from scanner.arrays import Array
 

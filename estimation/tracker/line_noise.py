@@ -1,4 +1,4 @@
-"""Noise of the projections: its spectrum near each harmonic of the motion, and the walk of the readout's offset.
+"""Noise of a sense channel: of its samples, its spectrum near each harmonic, and the walk of the readout's offset.
 
 The residuals of the blocks give the variance of the noise averaged over all frequencies. 1/f noise, hum, a resonance or
 a pole of the amplifier make the noise at one harmonic larger than at another. With one variance for all of them the
@@ -10,10 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.tracker.block_signal import MIN_OFFSET_DENSITY_V2_PER_S
+from estimation.tracker.change_points import project_block
 from estimation.tracker.demodulation import (
     NoiseSpectrum,
     Projections,
     harmonic_basis,
+    residual_variance,
     sample_offsets,
 )
 from scanner.arrays import Array, Index
@@ -22,6 +24,12 @@ from scanner.channel import Channel
 MAX_SPECTRUM_BLOCKS = 12
 """Blocks from which the noise near the lines is estimated, spread over the section: with some four independent values
 each they determine a variance to 21 %. More would slow the tracker down."""
+
+MODEL_ERROR_RATIO = 3e-3
+"""Standard deviation of the model error within a block, over the signal's rms: bounds the assumed noise from below."""
+
+DISTURBED_VARIANCE_RATIO = 1.5
+"""Residual variance of a block, over the median one, above which the block counts as disturbed."""
 
 MIN_DISTANCE_BINS, MAX_DISTANCE_BINS = 2.0, 5.0
 """Distances from a line at which the noise is measured, in units of the inverse length of a block: beyond what the fit
@@ -49,6 +57,45 @@ WHITE_PROBABILITY = 0.5
 LOG_VARIANCE_SDS = np.array([0.1, 0.3, 1.0, 3.0])
 """Standard deviations of the log variances that coloured noise may have, equally probable: half decades from 10 %,
 which changes no interval, to a factor of 20 in the variance."""
+
+
+def model_error_variance(projections: Projections) -> float:
+    """Return the variance of the model error within a block [V^2]."""
+    samples = np.maximum(projections.counts, 1)
+    signal_var = np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2)
+    return MODEL_ERROR_RATIO**2 * float(signal_var)
+
+
+def sample_noise_variance(
+    projections: Projections,
+    channel: Channel,
+    starts: Index,
+    pieces: Index,
+    lines: Index,
+    w: Array,
+    noise_sd: float,
+    model_error: float,
+) -> tuple[Array, float]:
+    """Return the variance of each block's samples, shape (blocks,), and the typical one [V^2].
+
+    A block has the typical variance unless it is disturbed. Lines whose phase slips or whose amplitude decays within a
+    block leave residuals about a stationary fit. Blocks that seem disturbed are therefore fitted again with two more
+    lines beside each line, which follow such changes.
+    """
+    if not projections.counts.any():  # a gap that covers all blocks
+        return np.ones(starts.size), np.nan
+    variance = residual_variance(projections)
+    variance[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator has no residuals
+    typical = max(float(np.nanmedian(variance)), model_error)
+    length = int(pieces[:, 1].max())
+    sideband = channel.sample_rate / length  # [rad/s]: a slip of 1 rad over the block
+    axes = w.shape[1]
+    extended = np.concatenate([*(lines + np.array([i * axes, 0]) for i in range(3)), [[3 * axes, 1]]])
+    for k in np.flatnonzero(variance > DISTURBED_VARIANCE_RATIO * typical):
+        omega = np.concatenate([w[k], w[k] - sideband, w[k] + sideband, [np.pi * sideband]])
+        block = project_block(channel, int(starts[k]), pieces[k], length, extended, omega)
+        variance[k] = residual_variance(block)[0]
+    return np.where(variance > DISTURBED_VARIANCE_RATIO * typical, variance, typical), typical
 
 
 def line_noise_variance(

@@ -18,18 +18,22 @@ from estimation.signals import SenseChannel, drive_channel, is_capacitive
 from estimation.tracker.amplitude_table import amplitude_table
 from estimation.tracker.averaged_dynamics import MAX_READOUT_HARMONIC, AxisParameters, axis_parameters
 from estimation.tracker.block_signal import BlockSignal
-from estimation.tracker.change_points import block_pieces, project_block, project_cut_blocks
+from estimation.tracker.change_points import block_pieces, project_cut_blocks
 from estimation.tracker.demodulation import (
     NoiseSpectrum,
     Projections,
     project_blocks,
-    residual_variance,
     whiten_projections,
 )
 from estimation.tracker.drive_blocks import MAX_LINE_RATE_RATIO, demodulate_drive
-from estimation.tracker.line_noise import initial_offset_density, line_noise_variance, noise_spectrum
+from estimation.tracker.line_noise import (
+    initial_offset_density,
+    line_noise_variance,
+    model_error_variance,
+    noise_spectrum,
+    sample_noise_variance,
+)
 from scanner.arrays import Array, Complex, Index
-from scanner.channel import Channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.harmonics import readout_response
@@ -69,12 +73,6 @@ DELAY_FREQUENCY_HZ = 1.0
 
 MOTION_SENSOR_HARMONICS = 3
 """Harmonics used of a sensor of the motion: the fundamental, and the next two, which a nonlinear suspension adds."""
-
-MODEL_ERROR_RATIO = 3e-3
-"""Standard deviation of the model error within a block, over the signal's rms: bounds the assumed noise from below."""
-
-DISTURBED_VARIANCE_RATIO = 1.5
-"""Residual variance of a block, over the median one, above which the block counts as disturbed."""
 
 
 class ClippedBlocks(NamedTuple):
@@ -239,8 +237,8 @@ def demodulate_blocks(
     if layout.switches.size:
         projections = project_cut_blocks(projections, channel, starts, pieces, lines, w)
     response, response_slope = _line_response(sense, lines, w)
-    model_error = _model_error_variance(projections)
-    noise, median_noise = _noise_variance(
+    model_error = model_error_variance(projections)
+    noise, median_noise = sample_noise_variance(
         projections, channel, starts, pieces, lines, w, sense.readout.noise_sd, model_error
     )
     if spectrum is None:
@@ -321,42 +319,3 @@ def _line_response(sense: SenseChannel, lines: Index, w: Array) -> tuple[Complex
     step = 1e-4
     high, low = (readout_response(sense.readout, f * (1.0 + s)) for s in (step, -step))
     return readout_response(sense.readout, f), (high - low) / (2.0 * step * w[:, lines[:, 0]])
-
-
-def _noise_variance(
-    projections: Projections,
-    channel: Channel,
-    starts: Index,
-    pieces: Index,
-    lines: Index,
-    w: Array,
-    noise_sd: float,
-    model_error: float,
-) -> tuple[Array, float]:
-    """Variance of each block's samples, shape (blocks,), and the typical one [V^2].
-
-    A block has the typical variance unless it is disturbed. Lines whose phase slips or whose amplitude decays within a
-    block leave residuals about a stationary fit. Blocks that seem disturbed are therefore fitted again with two more
-    lines beside each line, which follow such changes.
-    """
-    if not projections.counts.any():  # a gap that covers all blocks
-        return np.ones(starts.size), np.nan
-    variance = residual_variance(projections)
-    variance[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator has no residuals
-    typical = max(float(np.nanmedian(variance)), model_error)
-    length = int(pieces[:, 1].max())
-    sideband = channel.sample_rate / length  # [rad/s]: a slip of 1 rad over the block
-    axes = w.shape[1]
-    extended = np.concatenate([*(lines + np.array([i * axes, 0]) for i in range(3)), [[3 * axes, 1]]])
-    for k in np.flatnonzero(variance > DISTURBED_VARIANCE_RATIO * typical):
-        omega = np.concatenate([w[k], w[k] - sideband, w[k] + sideband, [np.pi * sideband]])
-        block = project_block(channel, int(starts[k]), pieces[k], length, extended, omega)
-        variance[k] = residual_variance(block)[0]
-    return np.where(variance > DISTURBED_VARIANCE_RATIO * typical, variance, typical), typical
-
-
-def _model_error_variance(projections: Projections) -> float:
-    """Variance of the model error within a block [V^2]."""
-    samples = np.maximum(projections.counts, 1)
-    signal_var = np.median(projections.squares / samples - (projections.sums[:, 0] / samples) ** 2)
-    return MODEL_ERROR_RATIO**2 * float(signal_var)
