@@ -3,15 +3,18 @@
 Each poll opens the file again and reads what is there: HDF5 that another program writes (SWMR), or an instrument's file
 that a reader reads up to its current end. A frame is reconstructed in parts while it arrives (``live_frames``), so its
 cost does not grow with the recording. Frames are shown in order. If more than ``MAX_PENDING_FRAMES`` are complete, all
-but the newest are dropped.
+but the newest are dropped. The phase error of the readout, which takes longer to measure than a frame may last, is
+measured by another thread; the frames that begin after its end use it.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import floor, pi
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from estimation.estimate import estimate
 from recon.growing_recording import Snapshot, common_time_span, poll_recording
 from recon.imaging import blur
 from recon.imaging.bidirectional_phase import slow_period
+from recon.imaging.readout_phase import ReadoutPhase
 from recon.interrupts import acknowledge_stop
 from recon.io.output import check_folder
 from recon.live_frames import (
@@ -31,10 +35,12 @@ from recon.live_frames import (
     add_part,
     finish_frame,
     first_picture,
+    measure_readout,
+    next_measurement,
     part_edges,
     replace_display_and_sd,
     replace_picture,
-    update_readout,
+    wants_measurement,
 )
 from recon.preparation import select_device
 from recon.reconstruction import Options
@@ -61,6 +67,7 @@ class FollowSummary:
         frame_s: duration of a frame [s]; NaN until it is known.
         frames: number of frames shown.
         dropped: number of frames not shown, because newer ones were complete or their motion could not be estimated.
+        overtaken: number of those that newer ones had overtaken: the machine is too slow for the frames.
         latency_s: time from the arrival of a frame's last sample to its picture, for each frame shown [s].
         ended: why following ended.
         shown: end of each frame shown [s], and when its picture was complete [s on the monotonic clock].
@@ -69,6 +76,7 @@ class FollowSummary:
     frame_s: float
     frames: int = 0
     dropped: int = 0
+    overtaken: int = 0
     latency_s: list[float] = field(default_factory=list)
     ended: str = "interrupted"
     shown: list[tuple[float, float]] = field(default_factory=list)
@@ -77,7 +85,9 @@ class FollowSummary:
         """Return the part "live" of summary.json."""
         values = np.array(self.latency_s or [np.nan])
         latency = {"median": float(np.median(values)), "max": float(values.max()), "first": float(values[0])}
-        return {key: getattr(self, key) for key in ("frame_s", "frames", "dropped", "ended")} | {"latency_s": latency}
+        return {key: getattr(self, key) for key in ("frame_s", "frames", "dropped", "overtaken", "ended")} | {
+            "latency_s": latency
+        }
 
 
 def follow_recording(
@@ -108,18 +118,20 @@ def follow_recording(
     """
     check_folder(output)
     check_ends(path)  # only once, because a poll has to be fast
-    follower = _Follower(output, options, FollowSummary(frame_time or np.nan))
+    summary = FollowSummary(frame_time or np.nan)
     with (
         suppress(KeyboardInterrupt),
+        ThreadPoolExecutor(1) as background,
         tqdm(desc="follow", unit=" frames", file=sys.stderr, disable=quiet or None) as bar,
     ):
+        follower = _Follower(output, options, summary, background)
         for snapshot in poll_recording(path, mapping, quiet_time):
             follower.arrive(snapshot)
             while follower.advance(snapshot.recording):
-                bar.update(follower.summary.frames - bar.n)
+                bar.update(summary.frames - bar.n)
                 bar.set_postfix_str(follower.describe())
     acknowledge_stop()
-    return follower.summary
+    return summary
 
 
 @dataclass
@@ -128,6 +140,7 @@ class _Follower:
 
     Attributes:
         output, options, summary: as for ``follow_recording``.
+        background: measures the phase error of the readout.
         scan: motion and readout so far; None before the first part of the first frame.
         frame: samples of the frame in progress; None before its first part.
         done: number of frames that were shown or dropped.
@@ -136,11 +149,13 @@ class _Follower:
         search: length of the recording at which the repeat time is estimated next [s].
         arrivals: end of the recording [s on its clock], and when it was read [s].
         refusal: why the last frame was not shown.
+        measurement: of the readout's phase error, in progress; None while there is none.
     """
 
     output: Path
     options: Options
     summary: FollowSummary
+    background: Executor
     scan: LiveScan | None = None
     frame: FrameSums | None = None
     done: int = 0
@@ -149,6 +164,7 @@ class _Follower:
     search: float = FIRST_REPEAT_SEARCH_S
     arrivals: list[tuple[float, float]] = field(default_factory=list)
     refusal: str = ""
+    measurement: Future[Mapping[str, ReadoutPhase]] | None = None
 
     def arrive(self, snapshot: Snapshot) -> None:
         """Note the end of the recording, and find the repeat time of the scan once enough was recorded."""
@@ -164,25 +180,28 @@ class _Follower:
         complete = 0 if np.isnan(length) else floor((end - begin) / length + 1e-9)
         if self.part == 0 and complete - self.done > MAX_PENDING_FRAMES:
             self.summary.dropped += complete - 1 - self.done
+            self.summary.overtaken += complete - 1 - self.done
             self.done = complete - 1
         start, stop = begin + self.done * length, begin + (self.done + 1) * length
         edges = part_edges(start, stop, slow_period(self.scan.motion)) if self.scan else [start, stop]
         if np.isnan(length) or (complete <= self.done and not edges[self.part + 1] <= end):
             return False
         try:
+            if self.part == 0:
+                self._use_measurement()
             self.scan, self.frame = add_part(
                 recording, edges[self.part], edges[self.part + 1], self.scan, self.frame, self.options
             )
             self.part += 1
             if self.part == len(edges) - 1:
-                self._show(recording, start, stop)
+                self._show(stop)
         except BadInput as error:  # no motion in this frame; the next one may have one
             self.refusal = f": {error}"
             self.summary.dropped += 1
             self._begin_next()
         return True
 
-    def _show(self, recording: Recording, start: float, stop: float) -> None:
+    def _show(self, stop: float) -> None:
         """Write the picture of the complete frame, then whatever takes longer."""
         assert self.scan is not None
         assert self.frame is not None
@@ -196,9 +215,18 @@ class _Follower:
             replace_picture(self.output, self.scan.estimate.picture)
             self._note_latency(stop)
         replace_display_and_sd(self.output, self.scan.estimate)
+        if self.measurement is None and wants_measurement(self.scan, self.options):
+            self.measurement = self.background.submit(measure_readout, self.frame.longest, self.scan.readout_phase)
         self._begin_next()
-        with suppress(BadInput):  # the picture is complete without
-            self.scan = update_readout(recording, start, stop, self.scan, self.options)
+
+    def _use_measurement(self) -> None:
+        """Take over the phase error of the readout if its measurement has ended."""
+        if self.scan is None or self.measurement is None or not self.measurement.done():
+            return
+        with suppress(BadInput):  # this frame determines no phase error; what is known remains
+            self.scan = replace(self.scan, readout_phase=self.measurement.result())
+        self.scan = replace(self.scan, measure_at=next_measurement(self.scan.frames))
+        self.measurement = None
 
     def _note_latency(self, stop: float) -> None:
         self.summary.frames += 1

@@ -45,7 +45,8 @@ class Snapshot(NamedTuple):
 def poll_recording(path: Path, mapping: Path | None, quiet_time: float) -> Iterator[Snapshot]:
     """Yield snapshots of a growing file until it ends. Each is closed, or grows, with the next one.
 
-    A file in HDF5's single-writer mode remains open while it grows, because opening it takes milliseconds.
+    A file in HDF5's single-writer mode remains open while it grows, because opening it takes milliseconds. Only when it
+    has not grown for ``MAX_POLL_INTERVAL_S`` is it opened again, to find whether its writer has closed or replaced it.
 
     Raises:
         BadInput: the path holds no readable recording for ``quiet_time`` [s].
@@ -57,12 +58,15 @@ def poll_recording(path: Path, mapping: Path | None, quiet_time: float) -> Itera
             state, still_written = _file_state(path), True
             try:
                 grown = None if recording is None else _refresh(recording)
-                if grown is None or not common_time_span(grown)[1] > size:
+                if grown is not None and common_time_span(grown)[1] > size:
+                    recording = grown
+                elif grown is not None and time.monotonic() - last_growth < MAX_POLL_INTERVAL_S:
+                    _wait_for_change(path, state)
+                    continue
+                else:
                     if recording is not None:
                         recording.close()
                     recording, still_written = _open_growing(path, mapping)
-                else:
-                    recording = grown
             except BadInput:  # not there yet, or read during a change
                 recording = None
                 if time.monotonic() - last_growth > quiet_time:

@@ -1,31 +1,35 @@
 """Frames of a recording that is being written, each in parts, so that little is left to do after its last sample.
 
-A part is tracked from the state in which the part before it ended, and gridded onto the pixels of the frame. When the
-last and short part has arrived, the picture follows from the sums.
+A part is tracked from the state in which the part before it ended, and its samples are added to the pixels. When
+the last and short part has arrived, the picture follows from the sums. The phase error of the readout is measured in
+one part of some frames, from samples in memory, so that another thread can do it meanwhile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from estimation.tracker import track_end
 from recon.estimated_motion import EstimatedMotion
 from recon.imaging.bidirectional_phase import slow_period
-from recon.imaging.intensity_gridding import add_pictures, grid_intensity
+from recon.imaging.carried_readout_phase import apply_readout_phase, update_readout_phase
+from recon.imaging.intensity_gridding import PixelSums, add_samples, empty_sums
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.picture_estimate import (
     EstimatedPicture,
-    grid_held_out,
+    add_held_out,
     kernel_widths,
     picture_of_sums,
     picture_without_sd,
 )
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
-from recon.imaging.readout_phase import ReadoutPhase, apply_readout_phase, update_readout_phase
+from recon.imaging.readout_phase import ReadoutPhase
 from recon.io.output import write_tiff
 from recon.phase_and_drift import measure_phase_errors, wants_readout_phase
 from recon.pipeline import estimate_motion
@@ -33,15 +37,18 @@ from recon.preparation import prepare_frame, select_device
 from recon.quality.defects import unrecoverable_intervals
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.reconstruction import Options
+from recon.registration_segments import MAX_REGISTERED_PERIODS
 from recon.report.figures import save_picture
 from recon.sample_ranges import to_sample_ranges
+from scanner.channel import Channel
 from scanner.device import Device
 from scanner.files import replacing
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 LAST_PART_PERIODS = 50.0
-"""Periods of the slower axis in each of the last two parts of a frame: tracking one takes less time than it lasts."""
+"""Periods of the slower axis in each of the last two parts of a frame: tracking one takes less time than it lasts. The
+parts before them last twice, four times as long, and so on."""
 
 LEAD_IN_PERIODS = 30.0
 """Periods of the slower axis before a segment whose state no earlier one ended in; the motions then connect."""
@@ -53,7 +60,7 @@ MAX_FRAMES_BETWEEN_MEASUREMENTS = 64
 """Frames between two measurements of the readout's phase error: seconds, in which temperature changes it little."""
 
 SIGN_TEST_SAMPLES = 4096
-"""Samples over which the signs of two motions are compared."""
+"""Samples over which the signs of two motions are compared that have no phase."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,7 @@ class LiveScan:
         estimate: picture of the frame before; None in the first frame.
         widths: of the kernel by detector [px], as that frame's samples chose them; None where there are none.
         frames: number of complete frames.
+        measure_at: number of complete frames from which the readout's phase error is measured next.
     """
 
     device: Device
@@ -79,6 +87,22 @@ class LiveScan:
     estimate: EstimatedPicture | None = None
     widths: list[float] | None = None
     frames: int = 0
+    measure_at: int = 1
+
+
+@dataclass(frozen=True)
+class FramePart:
+    """A part of a frame whose samples can be read after the recording was closed.
+
+    Attributes:
+        sensed: motion by the sense signal alone.
+        estimated: the motion that was used, with the beginning of the intensity in memory.
+        duration: of the part [s].
+    """
+
+    sensed: Motion
+    estimated: EstimatedMotion
+    duration: float
 
 
 @dataclass(frozen=True)
@@ -86,19 +110,38 @@ class FrameSums:
     """Gridded samples of a frame.
 
     Attributes:
-        means: picture of the means of all samples. held: of those held out, None where none are.
+        grid: the pixels. intensity: the channel of the samples.
+        sums: of all samples. held_sums: of those held out, None where none are.
         noise: of a sample, by detector.
+        longest: the longest part of the frame.
     """
 
-    means: Picture
-    held: Picture | None
+    grid: Grid
+    intensity: Channel
+    sums: PixelSums
+    held_sums: PixelSums | None
     noise: tuple[SampleNoise | None, ...]
+    longest: FramePart
+
+    @cached_property
+    def means(self) -> Picture:
+        """Picture of the means of all samples; of a complete frame, because it is computed once."""
+        return self.sums.picture(self.intensity, self.grid)
+
+    @cached_property
+    def held(self) -> Picture | None:
+        """Picture of the means of the samples held out; of a complete frame."""
+        return None if self.held_sums is None else self.held_sums.picture(self.intensity, self.grid)
 
 
 def part_edges(start: float, stop: float, period: float) -> list[float]:
     """Return the edges [s] of the parts of a frame from ``start`` to ``stop``; period: of the slower axis [s]."""
     last = LAST_PART_PERIODS * period
-    return [start, *(edge for edge in (stop - 2.0 * last, stop - last) if edge >= start + last), stop]
+    edges, length = [stop], last
+    while stop - length >= start + last:
+        edges.append(stop - length)
+        length *= 2.0
+    return [start, *reversed(edges)]
 
 
 def add_part(
@@ -123,16 +166,18 @@ def add_part(
     first = max(0, round((start - intensity.start) * intensity.sample_rate))
     unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, estimated.prepared.defects), intensity)
     beam, grid = estimated.beam, estimated.grid
-    means = grid_intensity(beam, intensity, grid, unlocated, first)
-    held = None if options.picture == "mean" else grid_held_out(beam, intensity, grid, unlocated, first)
     if frame is None:
-        frame = FrameSums(means, held, measure_noise(beam, intensity, grid, NOISE_SAMPLES, first))
-    else:
-        held = add_pictures(frame.held, held) if frame.held and held else None
-        frame = replace(frame, means=add_pictures(frame.means, means), held=held)
-    device = estimated.prepared.device
+        held = None if options.picture == "mean" else empty_sums(intensity, grid)
+        noise = measure_noise(beam, intensity, grid, NOISE_SAMPLES, first)
+        longest = keep_part(sensed, estimated, stop - start)
+        frame = FrameSums(grid, intensity, empty_sums(intensity, grid), held, noise, longest)
+    elif stop - start > frame.longest.duration:
+        frame = replace(frame, longest=keep_part(sensed, estimated, stop - start))
+    samples = beam, intensity, grid, unlocated, first
+    held = frame.held_sums and add_held_out(frame.held_sums, *samples)
+    frame = replace(frame, sums=add_samples(frame.sums, *samples), held_sums=held)
     if scan is None:
-        return LiveScan(device, sensed, stop, grid, known), frame
+        return LiveScan(estimated.prepared.device, sensed, stop, grid, known), frame
     return replace(scan, motion=sensed, stop=stop), frame
 
 
@@ -158,24 +203,43 @@ def finish_frame(scan: LiveScan, frame: FrameSums, options: Options) -> LiveScan
     return replace(scan, estimate=estimate, widths=widths, frames=scan.frames + 1)
 
 
-def update_readout(recording: Recording, start: float, stop: float, scan: LiveScan, options: Options) -> LiveScan:
-    """Measure the phase error of the readout in the frame from ``start`` to ``stop`` [s] where it is due."""
-    if not (measures_readout_phase(scan.frames) and wants_readout_phase(scan.motion, options)):
-        return scan
-    estimated = _estimate_part(recording, start, stop, scan, options)
-    sensed = estimated.motion
-    estimated = replace(estimated, motion=apply_readout_phase(sensed, scan.readout_phase))
-    errors = measure_phase_errors(estimated)
-    return replace(scan, readout_phase=update_readout_phase(sensed, estimated.motion, errors, scan.readout_phase))
+def keep_part(sensed: Motion, estimated: EstimatedMotion, duration: float) -> FramePart:
+    """Return a part of a frame with the samples in memory in which the phase error of the readout can be measured."""
+    prepared = estimated.prepared
+    start = prepared.intensity.start
+    cut = prepared.recording.slice(start, start + MAX_REGISTERED_PERIODS * slow_period(sensed))
+    channels = {
+        name: replace(channel, raw=channel.stored(), first=0, stop=channel.size)
+        for name, channel in cut.channels.items()
+        if name in ("intensity", "position_z")
+    }
+    recording = replace(cut, channels=MappingProxyType(channels))
+    prepared = replace(prepared, recording=recording, uncorrected=recording)
+    return FramePart(sensed, replace(estimated, prepared=prepared), duration)
 
 
-def measures_readout_phase(number: int) -> bool:
-    """Whether the phase error of the readout is measured in the frame of this number, from 1 on.
+def wants_measurement(scan: LiveScan, options: Options) -> bool:
+    """Whether the phase error of the readout is to be measured in the frame that was completed last."""
+    return scan.frames >= scan.measure_at and wants_readout_phase(scan.motion, options)
 
-    It takes longer than a short frame lasts. Frames at doubling numbers find it early and then refine it; in a long
-    scan every ``MAX_FRAMES_BETWEEN_MEASUREMENTS`` follow it.
+
+def measure_readout(part: FramePart, known: Mapping[str, ReadoutPhase]) -> Mapping[str, ReadoutPhase]:
+    """Phase error of the readout by axis, from a part of a frame and from what is known by earlier frames.
+
+    Raises:
+        BadInput: the samples cannot be used.
     """
-    return number & (number - 1) == 0 or number % MAX_FRAMES_BETWEEN_MEASUREMENTS == 0
+    errors = measure_phase_errors(part.estimated)
+    return update_readout_phase(part.sensed, part.estimated.motion, errors, known)
+
+
+def next_measurement(number: int) -> int:
+    """Return the frame in which the readout is measured next; number: frame in which a measurement ended, from 1 on.
+
+    A measurement takes longer than a short frame lasts. Frames at doubling numbers find the phase error early and then
+    refine it; in a long scan every ``MAX_FRAMES_BETWEEN_MEASUREMENTS`` follow it.
+    """
+    return min(2 * number, number + MAX_FRAMES_BETWEEN_MEASUREMENTS)
 
 
 def match_signs(motion: Motion, before: Motion) -> Motion:
@@ -223,8 +287,8 @@ def _is_opposite(old: AxisMotion, new: AxisMotion) -> bool:
     """Whether the new motion has the opposite sign of the old one at its begin."""
     before, after = old.angle.phasors(), new.angle.phasors()
     if before is not None and after is not None:  # phasors can be extrapolated beyond the end of the old motion
-        time = new.angle.start + np.arange(min(SIGN_TEST_SAMPLES, new.angle.size)) / new.angle.sample_rate
-        return float(np.mean(np.cos(before.phase(time) - after.phase(time)))) < 0.0
+        time = np.array([new.angle.start])
+        return float(np.cos(before.phase(time) - after.phase(time))[0]) < 0.0
     first = round((new.angle.start - old.angle.start) * old.angle.sample_rate)
     shared = min(SIGN_TEST_SAMPLES, max(old.angle.size - first, 0), new.angle.size)
     return float(np.nansum(old.angle.read(first, first + shared) * new.angle.read(0, shared))) < 0.0

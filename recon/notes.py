@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -209,3 +210,14 @@ def describe_clock_jumps(recording: Recording, prepared: PreparedRecording) -> s
         f"a phase jumps as if samples were lost: the longest segment between such jumps is used, {begin:.6g} s to "
         f"{end:.6g} s; cut the recording at the jumps to reconstruct the rest"
     )
+
+
+def describe_live_frames(live: Mapping[str, Any] | None) -> list[str]:
+    """A line if frames were left out because the machine was too slow; live: summary of ``--follow``, None without."""
+    if not live or not live["overtaken"]:
+        return []
+    return [
+        f"{live['overtaken']} of {live['frames'] + live['dropped']} live frames were left out, because newer ones had "
+        "arrived before they could be reconstructed: the machine is too slow for frames of "
+        f"{1e3 * live['frame_s']:.4g} ms; ask for longer frames (--frame-time), fewer pixels or --picture mean"
+    ]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimation.tracker.demodulation import NoiseSpectrum
 from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.observations import BlockLayout
 from estimation.tracker.process_noise import NoisePosterior
@@ -22,9 +23,10 @@ MAX_SKIPPED_BLOCKS = 4
 """Blocks before an earlier track's last one that a recording may begin with. Channels of axes with blocks of different
 lengths end at different times."""
 
-MIN_TUNED_SHARE = 0.75
-"""Length of a segment over that of the one before below which it inherits the tuning: it tells less of the noise, and a
-frame's short last part is to be tracked at once."""
+MIN_TUNED_SHARE = 0.9
+"""Length of a segment over that of the one in which the tuning was determined, below which it inherits the tuning: it
+determines the noise less well, and tuning takes a third of the time of a short segment. The first parts of successive
+frames are equally long to within some percent, by which the frequency that determines it may drift."""
 
 
 class Tuning(NamedTuple):
@@ -34,12 +36,14 @@ class Tuning(NamedTuple):
         densities, posterior: of the process noise.
         noise_scale: factor on the noise variance of the blocks.
         offset_density: of the random walk of the readout's offset [V^2/s].
+        spectrum: of the noise of the blocks' projections.
     """
 
     densities: Array
     posterior: NoisePosterior
     noise_scale: float
     offset_density: float
+    spectrum: NoiseSpectrum
 
 
 class TrackEnd(NamedTuple):
@@ -49,7 +53,7 @@ class TrackEnd(NamedTuple):
         start: time of the block's first sample [s]. length: of a block [samples].
         psi: reference phase of the axes in the block, shape (axes,) [rad]. w: its rate there [rad/s].
         prior: estimate before the block. signs: of the axes, as in ``AxisMotion``.
-        tuning: of the track. blocks: in it.
+        tuning: of the track. tuned_blocks: from which it was determined.
     """
 
     start: float
@@ -59,18 +63,22 @@ class TrackEnd(NamedTuple):
     prior: StateEstimate
     signs: tuple[str, ...]
     tuning: Tuning
-    blocks: int
+    tuned_blocks: int
 
-    def inherited_tuning(self, blocks: int) -> Tuning | None:
-        """The tuning for a segment of ``blocks``; None for one that is long enough to be tuned by itself."""
-        return self.tuning if blocks < MIN_TUNED_SHARE * self.blocks else None
+    def inherited_tuning(self, layout: BlockLayout) -> Tuning | None:
+        """The tuning for a segment; None for one that is long enough to be tuned by itself, or has other lines."""
+        short = layout.starts.size < MIN_TUNED_SHARE * self.tuned_blocks
+        same = layout.length == self.length and self.tuning.spectrum.excess.size == 1 + 2 * len(layout.lines)
+        return self.tuning if short and same else None
 
 
-def end_of_track(layout: BlockLayout, prior: StateEstimate, signs: list[str], tuning: Tuning) -> TrackEnd:
+def end_of_track(
+    layout: BlockLayout, prior: StateEstimate, signs: list[str], tuning: Tuning, tuned_blocks: int
+) -> TrackEnd:
     """The end of a track over all blocks of a layout; prior: before its last block."""
     channel = layout.sense.channel
     start = channel.start + int(layout.starts[-1]) / channel.sample_rate
-    return TrackEnd(start, layout.length, layout.psi[-1], layout.w[-1], prior, tuple(signs), tuning, layout.starts.size)
+    return TrackEnd(start, layout.length, layout.psi[-1], layout.w[-1], prior, tuple(signs), tuning, tuned_blocks)
 
 
 def find_end(previous: Motion | None, channel: Channel) -> TrackEnd | None:

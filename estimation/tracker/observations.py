@@ -19,7 +19,13 @@ from estimation.tracker.amplitude_table import amplitude_table
 from estimation.tracker.averaged_dynamics import MAX_READOUT_HARMONIC, AxisParameters, axis_parameters
 from estimation.tracker.block_signal import BlockSignal
 from estimation.tracker.change_points import block_pieces, project_block, project_cut_blocks
-from estimation.tracker.demodulation import Projections, project_blocks, residual_variance, whiten_projections
+from estimation.tracker.demodulation import (
+    NoiseSpectrum,
+    Projections,
+    project_blocks,
+    residual_variance,
+    whiten_projections,
+)
 from estimation.tracker.drive_blocks import MAX_LINE_RATE_RATIO, demodulate_drive
 from estimation.tracker.line_noise import initial_offset_density, line_noise_variance, noise_spectrum
 from scanner.arrays import Array, Complex, Index
@@ -214,8 +220,14 @@ def lay_out_blocks(
     )
 
 
-def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = None) -> BlockObservations:
-    """Demodulate the blocks ``first`` up to ``stop`` of a sense channel."""
+def demodulate_blocks(
+    layout: BlockLayout, first: int = 0, stop: int | None = None, spectrum: NoiseSpectrum | None = None
+) -> BlockObservations:
+    """Demodulate the blocks ``first`` up to ``stop`` of a sense channel.
+
+    Args:
+        spectrum: of the noise of their projections; measured in these blocks by default.
+    """
     sense, channel, lines, length = layout.sense, layout.sense.channel, layout.lines, layout.length
     part = slice(first, stop)
     starts, w = layout.starts[part], layout.w[part]
@@ -231,9 +243,10 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
     noise, median_noise = _noise_variance(
         projections, channel, starts, pieces, lines, w, sense.readout.noise_sd, model_error
     )
-    line_noise = line_noise_variance(projections, channel, starts, length, lines, median_noise)
-    line_noise = np.fmax(line_noise, model_error)
-    spectrum = noise_spectrum(line_noise, median_noise, length)
+    if spectrum is None:
+        line_noise = line_noise_variance(projections, channel, starts, length, lines, median_noise)
+        spectrum = noise_spectrum(np.fmax(line_noise, model_error), median_noise, length)
+    slow_noise = median_noise * (spectrum.white + length * float(spectrum.excess[0]))
     whitened, moments, _, solvers = whiten_projections(
         projections.sums, projections.grams, projections.geometry, spectrum
     )
@@ -258,7 +271,7 @@ def demodulate_blocks(layout: BlockLayout, first: int = 0, stop: int | None = No
         solvers=solvers,
         geometry=projections.geometry,
         noise_var=noise,
-        offset_density=initial_offset_density(means, samples, line_noise[0], length / channel.sample_rate),
+        offset_density=initial_offset_density(means, samples, slow_noise, length / channel.sample_rate),
         external_phase=np.zeros(w.shape),
         external_var=np.full(w.shape, np.inf),
         amplitude_table=np.stack([amplitude_table(axis, sense.readout) for axis in layout.axes]),

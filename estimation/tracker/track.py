@@ -87,9 +87,10 @@ def track(
         knots: list[list[AxisKnots]] = [[] for _ in sense.axes]
         acquired = np.zeros(len(sense.axes), bool)
         results: list[SectionResult] = []
+        inherited = end and end.inherited_tuning(layout)
         for first, stop in section_ranges(layout.drive_share):
-            observations = demodulate_blocks(layout, first, stop + LOOKAHEAD_BLOCKS)
-            inherited = end and end.inherited_tuning(layout.starts.size)
+            spectrum = inherited.spectrum if inherited else None
+            observations = demodulate_blocks(layout, first, stop + LOOKAHEAD_BLOCKS, spectrum)
             if inherited and prior:
                 section = inherit_tuning(observations, prior, signs, inherited, causal)
             else:
@@ -119,7 +120,8 @@ def track(
                 )
             axes[name] = motion_of_knots(layout.references[name], join_knots(knots[a]), clock, signs[a])
         info[sense.channel.name] = _summarise(layout, results, densities, offset_density)
-        ends[sense.channel.name] = end_of_track(layout, states.next_prior, signs, section.tuning)
+        tuned_blocks = end.tuned_blocks if end and inherited else layout.starts.size
+        ends[sense.channel.name] = end_of_track(layout, states.next_prior, signs, section.tuning, tuned_blocks)
     return Motion(axes, "tracker-causal" if causal else "tracker", info, ends=ends)
 
 
@@ -214,7 +216,8 @@ def tune_section(
         observations = expand_clipped_blocks(observations, prior or start, densities, causal)
         parts = tuning_parts(observations.signal)
     posterior = noise_posterior(observations, start, parts, densities)
-    return TunedSection(observations, prior or start, signs, Tuning(densities, posterior, scale, offset_density))
+    tuning = Tuning(densities, posterior, scale, offset_density, observations.signal.spectrum)
+    return TunedSection(observations, prior or start, signs, tuning)
 
 
 def inherit_tuning(

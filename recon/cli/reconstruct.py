@@ -218,6 +218,7 @@ def reconstruct_file(
     from recon.imaging.picture import fill_holes
     from recon.io.convert import open_any
     from recon.io.output import finite, replacing_folder, write_json, write_motion, write_sample_motion, write_tiff
+    from recon.notes import describe_live_frames
     from recon.pipeline import reconstruct
     from recon.report.conclusions import conclude_reconstruction
     from recon.report.figures import save_picture
@@ -231,6 +232,7 @@ def reconstruct_file(
             reason = "--frames without a number and --z-step cut the scan by it"
             find_z_slices(recording.require("position_z", reason), recording.require("intensity"), options.z_step)
         result = reconstruct(recording, options, None if mapping or growing else load_truth(path), quiet)
+        result = replace(result, notes=[*result.notes, *describe_live_frames(live)])
         origin = {"output": str(output), "recording": str(path)} | ({"live": live} if live else {})
         slices = write_scan_frames(folder, result, options).slices if options.wants_frames else None
         if slices is not None:

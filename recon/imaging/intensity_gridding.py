@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,33 @@ MAX_GAP_SAMPLES = 1 << 12
 """Samples between two ranges up to which they are read together."""
 
 
+@dataclass(frozen=True, eq=False)
+class PixelSums:
+    """Sums of the samples of each pixel, to which further samples of the same channel can be added.
+
+    Attributes:
+        sums: of the stored values, shape (height, width) or (height, width, detectors). counts: of the samples, shape
+            (height, width). Both are changed in place.
+        samples: number of samples that have a value, inside the field and outside.
+    """
+
+    sums: NDArray[np.float64]
+    counts: NDArray[np.uint32]
+    samples: int = 0
+
+    def picture(self, intensity: Channel, grid: Grid) -> Picture:
+        """Return the picture of the means; intensity: the channel. grid: the pixels."""
+        counts = self.counts if self.sums.ndim == 2 else self.counts[..., None]
+        means = mean_picture(intensity.gain * self.sums + intensity.offset * counts, self.counts, grid)
+        return replace(means, outside=self.samples - int(self.counts.sum()), detectors=intensity.detectors)
+
+
+def empty_sums(intensity: Channel, grid: Grid) -> PixelSums:
+    """Return the sums of no sample of a channel."""
+    shape = grid.height, grid.width
+    return PixelSums(np.zeros((*shape, *intensity.shape[1:])), np.zeros(shape, np.uint32))
+
+
 def grid_intensity(
     beam: Motion,
     intensity: Channel,
@@ -32,9 +59,24 @@ def grid_intensity(
     first: int = 0,
     stop: int | None = None,
 ) -> Picture:
-    """Return the picture of the samples ``first`` up to ``stop``.
+    """Return the picture of the samples ``first`` up to ``stop``; arguments as for :func:`add_samples`."""
+    sums = add_samples(empty_sums(intensity, grid), beam, intensity, grid, unlocated, first, stop)
+    return sums.picture(intensity, grid)
+
+
+def add_samples(
+    to: PixelSums,
+    beam: Motion,
+    intensity: Channel,
+    grid: Grid,
+    unlocated: SampleRanges,
+    first: int = 0,
+    stop: int | None = None,
+) -> PixelSums:
+    """Add the samples ``first`` up to ``stop`` to their pixels and return the sums.
 
     Args:
+        to: sums so far; its arrays are changed in place.
         beam: motion whose angles are on the intensity's clock.
         intensity: shape (n,) or (n, detectors). Samples that are not finite are left out.
         grid: the pixels.
@@ -43,9 +85,7 @@ def grid_intensity(
     """
     x, y = (beam.axes[axis].angle for axis in AXES)
     phasors_x, phasors_y = x.phasors(), y.phasors()
-    sums = np.zeros((grid.height, grid.width, *intensity.shape[1:]))
-    counts = np.zeros((grid.height, grid.width), np.uint32)
-    samples = 0
+    samples = to.samples
     located = subtract_ranges([(first, intensity.size if stop is None else stop)], unlocated)
     for begin, end in _chunks(located):
         values = contiguous_samples(intensity.stored(begin, end))
@@ -55,23 +95,19 @@ def grid_intensity(
         else:
             samples += len(values)
         if phasors_x is not None and phasors_y is not None and values.ndim == 1:
-            accumulate_phasors(phasors_x, phasors_y, begin, values, grid, sums, counts)
+            accumulate_phasors(phasors_x, phasors_y, begin, values, grid, to.sums, to.counts)
         else:
-            accumulate_samples(x.read(begin, end), y.read(begin, end), values, grid, sums, counts)
-    counts_of_sums = counts if sums.ndim == 2 else counts[..., None]
-    picture = mean_picture(intensity.gain * sums + intensity.offset * counts_of_sums, counts, grid)
-    return replace(picture, outside=samples - int(counts.sum()), detectors=intensity.detectors)
+            accumulate_samples(x.read(begin, end), y.read(begin, end), values, grid, to.sums, to.counts)
+    return replace(to, samples=samples)
 
 
-def grid_scattered(beam: Motion, intensity: Channel, grid: Grid, ranges: SampleRanges) -> Picture:
-    """Return the picture of many short ranges of samples; arguments as for :func:`grid_intensity`.
+def add_scattered(to: PixelSums, beam: Motion, intensity: Channel, grid: Grid, ranges: SampleRanges) -> PixelSums:
+    """Add many short ranges of samples to their pixels; arguments as for :func:`add_samples`.
 
     Neighbouring ranges are read together, because a call costs as much as thousands of samples.
     """
     x, y = (beam.axes[axis].angle for axis in AXES)
-    sums = np.zeros((grid.height, grid.width, *intensity.shape[1:]))
-    counts = np.zeros((grid.height, grid.width), np.uint32)
-    samples = 0
+    samples = to.samples
     for first, stop in merge_ranges(ranges, MAX_GAP_SAMPLES):
         chosen = np.zeros(stop - first, np.bool_)
         for begin, end in ranges[bisect_left(ranges, (first, first)) : bisect_left(ranges, (stop, stop))]:
@@ -82,21 +118,8 @@ def grid_scattered(beam: Motion, intensity: Channel, grid: Grid, ranges: SampleR
             samples += int(np.isfinite(values).reshape(len(values), -1).all(axis=1).sum())
         else:
             samples += len(values)
-        accumulate_samples(x.read(first, stop)[chosen], y.read(first, stop)[chosen], values, grid, sums, counts)
-    counts_of_sums = counts if sums.ndim == 2 else counts[..., None]
-    picture = mean_picture(intensity.gain * sums + intensity.offset * counts_of_sums, counts, grid)
-    return replace(picture, outside=samples - int(counts.sum()), detectors=intensity.detectors)
-
-
-def add_pictures(first: Picture, second: Picture) -> Picture:
-    """Return the picture of the samples of two pictures of means on the same pixels."""
-    coverage = first.coverage + second.coverage
-    sums = np.zeros(first.image.shape)
-    for picture in (first, second):
-        counts = picture.coverage if sums.ndim == 2 else picture.coverage[..., None]
-        sums += np.where(counts > 0, picture.image, 0.0) * counts
-    summed = mean_picture(sums, coverage, first.grid)
-    return replace(summed, outside=first.outside + second.outside, detectors=first.detectors)
+        accumulate_samples(x.read(first, stop)[chosen], y.read(first, stop)[chosen], values, grid, to.sums, to.counts)
+    return replace(to, samples=samples)
 
 
 def find_visited_pixels(beam: Motion, ranges: SampleRanges, grid: Grid) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.held_out import SplitSums, held_out_ranges
-from recon.imaging.intensity_gridding import grid_scattered
+from recon.imaging.intensity_gridding import PixelSums, add_scattered, empty_sums
 from recon.imaging.kernel_picture import PictureEstimate, choose_width, kernel_image, kernel_picture
 from recon.imaging.picture import Grid, Picture, detector_names
 from recon.imaging.pixel_noise import SampleNoise, pixel_sd
@@ -93,17 +93,26 @@ def estimate_picture(
     Raises:
         BadInput: no such kind, or the samples determine no picture of this kind.
     """
-    held = None if kind == "mean" else grid_held_out(beam, intensity, means.grid, unlocated, first, stop)
+    held = None
+    if kind != "mean":
+        sums = empty_sums(intensity, means.grid)
+        sums = add_held_out(sums, beam, intensity, means.grid, unlocated, first, stop)
+        held = sums.picture(intensity, means.grid)
     return picture_of_sums(kind, means, held, noise, before)
 
 
-def grid_held_out(
-    beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges, first: int = 0, stop: int | None = None
-) -> Picture:
-    """Return the picture of the samples ``first`` up to ``stop`` that are held out; arguments as ``grid_intensity``."""
+def add_held_out(
+    to: PixelSums,
+    beam: Motion,
+    intensity: Channel,
+    grid: Grid,
+    unlocated: SampleRanges,
+    first: int = 0,
+    stop: int | None = None,
+) -> PixelSums:
+    """Add those of the samples ``first`` up to ``stop`` that are held out; arguments as for ``add_samples``."""
     stop = intensity.size if stop is None else stop
-    left_out = subtract_ranges(held_out_ranges(first, stop), unlocated)
-    return grid_scattered(beam, intensity, grid, left_out)
+    return add_scattered(to, beam, intensity, grid, subtract_ranges(held_out_ranges(first, stop), unlocated))
 
 
 def picture_of_sums(

@@ -89,7 +89,13 @@ def correlate_matern32(lag: Array, time: float) -> Array:
 
 
 def estimate_readout_phase(
-    time: Array, value: Array, sd: Array, at: Array, sense_sd: float | Array = 0.0, may_drift: bool = True
+    time: Array,
+    value: Array,
+    sd: Array,
+    at: Array,
+    sense_sd: float | Array = 0.0,
+    may_drift: bool = True,
+    earlier: tuple[float, float] | None = None,
 ) -> ReadoutPhase | None:
     """Posterior of a phase error from measurements in the picture; None without a measurement.
 
@@ -100,11 +106,13 @@ def estimate_readout_phase(
         sense_sd: standard deviation that the estimator states for its phase, a number or shape (m,) [rad]; 0 leaves
             its error out of the posterior.
         may_drift: whether the error may vary with time.
+        earlier: mean [rad] and variance [rad²] of the constant by earlier parts of the scan, in the place of the prior.
     """
     used = np.isfinite(value) & np.isfinite(sd)
     if not used.any():
         return None
-    time, value, noise = time[used], value[used], np.diag(sd[used] ** 2)
+    expected, expected_var = earlier or (0.0, 0.0)
+    time, value, noise = time[used], value[used] - expected, np.diag(sd[used] ** 2)
     sense_sd = np.broadcast_to(sense_sd, at.shape)
     measured_sd = np.interp(time, at, sense_sd)
     share = PRIOR_PROBABILITY_AS_STATED / len(SENSE_ERROR_TIMES_S)
@@ -116,6 +124,8 @@ def estimate_readout_phase(
     offset_var = np.concatenate([[0.0], OFFSET_SDS_RAD**2])
     share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / OFFSET_SDS_RAD.size
     offset_prior = np.concatenate([[PRIOR_PROBABILITY_AS_STATED], np.full(OFFSET_SDS_RAD.size, share)])
+    if earlier is not None:
+        offset_var, offset_prior = np.array([expected_var]), np.ones(1)
     average = np.gradient(at) / np.gradient(at).sum()
     log_weight, means, variances, totals, total_vars = [], [], [], [], []
     for drift_sd, tau, prior, factor in hypotheses:
@@ -149,7 +159,8 @@ def estimate_readout_phase(
     overall, posterior = weight @ total, weight @ mean
     total_var = weight @ (np.concatenate(total_vars) + total**2) - overall**2
     variance = weight @ (np.concatenate(variances) + mean**2) - posterior**2
-    return ReadoutPhase(float(overall), math.sqrt(max(total_var, 0.0)), at, posterior, np.maximum(variance, 0.0))
+    total_sd = math.sqrt(max(total_var, 0.0))
+    return ReadoutPhase(float(overall + expected), total_sd, at, posterior + expected, np.maximum(variance, 0.0))
 
 
 def remove_readout_phase(
@@ -178,7 +189,7 @@ def remove_readout_phase(
         for column, name in enumerate(AXES):
             axis = motion.axes[name]
             measured = measured_phase_error(errors, column, axis, corrected.axes[name])
-            times = _posterior_times(axis, measured[0])
+            times = posterior_times(axis, measured[0])
             sense_sd = np.interp(times, axis.time, axis.phase_sd)
             estimate = estimate_readout_phase(*measured, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
             if estimate is not None:
@@ -197,46 +208,6 @@ def remove_readout_phase(
             break
         errors = register(corrected)
     return corrected, _errors_after(errors, before, corrected), found
-
-
-def apply_readout_phase(motion: Motion, known: Mapping[str, ReadoutPhase]) -> Motion:
-    """Correct a motion by phase errors that are known from an earlier part of the same scan.
-
-    Args:
-        motion: of the mirror.
-        known: phase errors by axis; the value at the end of each is used.
-    """
-    axes = dict(motion.axes)
-    for name, error in known.items():
-        axis = motion.axes[name]
-        ahead = axis.advanced(np.full(axis.time.size, error.mean[-1]))
-        axes[name] = replace(ahead, phase_sd=np.sqrt(axis.phase_sd**2 + error.variance[-1]))
-    return replace(motion, axes=axes)
-
-
-def update_readout_phase(
-    motion: Motion, corrected: Motion, errors: Sequence[PhaseError], known: Mapping[str, ReadoutPhase]
-) -> dict[str, ReadoutPhase]:
-    """Phase errors of the readout from a further part of a scan and from what the earlier parts showed.
-
-    Args:
-        motion, corrected: of the further part, before and after :func:`apply_readout_phase`.
-        errors: phase errors of the corrected motion.
-        known: phase errors by axis from the earlier parts. The end of each counts as one more measurement.
-    """
-    updated = dict(known)
-    for column, name in enumerate(AXES):
-        axis = motion.axes[name]
-        measured = measured_phase_error(errors, column, axis, corrected.axes[name])
-        if name in known:
-            earlier = known[name]
-            last = earlier.time[-1], earlier.mean[-1], math.sqrt(earlier.variance[-1])
-            time, value, sd = (np.append(first, rest) for first, rest in zip(last, measured, strict=True))
-            measured = time, value, sd
-        estimate = estimate_readout_phase(*measured, _posterior_times(axis, measured[0]), may_drift=False)
-        if estimate is not None:
-            updated[name] = estimate
-    return updated
 
 
 def measured_phase_error(
@@ -326,8 +297,8 @@ def common_delay(motion: Motion, found: Mapping[str, ReadoutPhase]) -> float | N
     return delay if misfit < REPORTED_SDS**2 else None
 
 
-def _posterior_times(axis: AxisMotion, measured: Array) -> Array:
-    """Times of the posterior: evenly over the scan, and those of the measurements, increasing [s]."""
+def posterior_times(axis: AxisMotion, measured: Array) -> Array:
+    """Return the times of the posterior: evenly over the scan, and those of the measurements, increasing [s]."""
     return np.unique(np.concatenate([np.linspace(axis.time[0], axis.time[-1], POSTERIOR_TIMES), measured]))
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -21,16 +22,17 @@ from estimation.tracker import track_end
 from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.follow import follow_recording, repeat_time
-from recon.imaging.readout_phase import apply_readout_phase
+from recon.imaging.carried_readout_phase import apply_readout_phase
 from recon.live_frames import (
     add_part,
     finish_frame,
     first_picture,
     match_signs,
-    measures_readout_phase,
+    measure_readout,
+    next_measurement,
     part_edges,
-    update_readout,
 )
+from recon.notes import describe_live_frames
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
 from scanner.errors import BadInput
@@ -170,8 +172,20 @@ def test_an_interrupt_ends_the_following_and_keeps_the_frames(written, tmp_path:
     assert json.loads((out / "summary.json").read_text())["live"]["ended"] == "interrupted"
 
 
+def test_frames_that_newer_ones_overtake_are_counted_and_stated(scan: Path, tmp_path: Path) -> None:
+    options = Options(pixels=(50, 50))
+    live = follow_recording(scan, tmp_path / "out", options, frame_time=0.004, quiet_time=0.1, quiet=True)
+    summary = live.summary()  # all five frames were complete at once
+    assert (live.frames, live.dropped, live.overtaken) == (1, 4, 4)
+    (note,) = describe_live_frames(summary)
+    assert "4 of 5 live frames were left out" in note
+    assert describe_live_frames(summary | {"dropped": 4, "overtaken": 0}) == []  # sensors without motion, for instance
+
+
 def test_the_readout_error_is_measured_ever_more_rarely_and_never_stops() -> None:
-    measured = [number for number in range(1, 260) if measures_readout_phase(number)]
+    measured = [1]
+    while measured[-1] < 256:
+        measured.append(next_measurement(measured[-1]))
     assert measured == [1, 2, 4, 8, 16, 32, 64, 128, 192, 256]
 
 
@@ -255,7 +269,7 @@ def test_a_frame_uses_the_readout_error_that_earlier_frames_showed() -> None:
     for start in (0.0, 0.01):
         known = scan.readout_phase if scan else {}
         scan, frame = add_part(late, start, start + 0.01, scan, None, options)
-        scan = update_readout(late, start, start + 0.01, finish_frame(scan, frame, options), options)
+        scan = replace(scan, readout_phase=measure_readout(frame.longest, known))
         motion = apply_readout_phase(scan.motion, known)
         angle = truth_from_simulation(truth).angles["x"]
         errors.append(np.degrees(evaluate_axis(motion.axes["x"], *angle).phase_rmse))
@@ -267,7 +281,9 @@ def test_a_long_frame_has_a_short_last_part() -> None:
     assert part_edges(0.0, 0.004, 1 / 3270) == [0.0, 0.004]
     assert part_edges(0.0, 0.02, 1 / 3270) == [0.0, 0.02]
     assert part_edges(0.0, 0.04, 1 / 3270) == pytest.approx([0.0, 0.04 - 50 / 3270, 0.04])
-    assert part_edges(1.0, 1.1, 1 / 3270) == pytest.approx([1.0, 1.1 - 100 / 3270, 1.1 - 50 / 3270, 1.1])
+    assert part_edges(1.0, 1.1, 1 / 3270) == pytest.approx(
+        [1.0, 1.1 - 200 / 3270, 1.1 - 100 / 3270, 1.1 - 50 / 3270, 1.1]
+    )
 
 
 @pytest.mark.parametrize("kind", ["mean", "kernel"])
