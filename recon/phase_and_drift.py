@@ -17,6 +17,7 @@ from recon.imaging.intensity_correction import (
     measure_intensity_drift,
 )
 from recon.imaging.readout_phase import describe_readout_phase, remove_readout_phase
+from recon.imaging.slow_gain import describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice
 from recon.reconstruction import Options
 from recon.registration_segments import registration_segments
@@ -34,7 +35,11 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
     The drift is then measured again in the intensity as recorded, at the corrected positions. Without a drift the first
     phase is kept.
     """
-    corrected = correct_intensity_drift(correct_readout_phase(estimated, options), options)
+    phased = correct_readout_phase(estimated, options)
+    if options.intensity_drift is None:
+        gains = [error.gain for error in phased.phase_errors or [] if error.gain is not None]
+        return replace(phased, motion_notes=[*phased.motion_notes, *describe_slow_gain(gains)])
+    corrected = correct_intensity_drift(phased, options)
     if not exceeds_uncertainty(corrected.intensity_drift):
         return corrected
     without_drift = correct_readout_phase(replace(estimated, prepared=corrected.prepared), options)
