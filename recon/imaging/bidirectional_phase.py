@@ -246,7 +246,7 @@ def _estimate_phase_errors(
         min(1.0, grid.width / MIN_CELLS_ACROSS),
         math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size),
     )
-    gain = _slow_gain(samples, grid, 4 * finest, slices)
+    gain = _slow_gain(samples, grid, finest, slices)
     samples = samples._replace(intensity=samples.intensity / gain.at(_slice_time(samples)))
     start = np.array(
         [search_phase_errors(RegistrationSamples(*(column[part == s] for column in samples))) for s in range(slices)]

@@ -6,8 +6,10 @@ place at two times then differ, as with a phase error. The model of sample i in 
     I_i = s_p exp(γ(t_i)) + noise,    γ(t) = Σ_j w_j(t) γ_j,   γ_j ~ N(0, PRIOR_SD²),
 
 with hat functions w_j between the ends of the time slices: each slice covers the field, so that it determines a gain.
-The scene s is free, and is eliminated. Gauss-Newton gives the posterior of γ. Faster changes are removed from the
-picture on request (``intensity_drift``), which takes longer.
+The scene s is free, and is eliminated. Gauss-Newton gives the posterior of γ. The variance of a sample follows from the
+scatter of the scores of the cells, which holds the detail within a cell: a few bright points would else show a drift. A
+steady gain has half of the prior probability, so that a steady detector keeps its intensity. Faster changes are removed
+from the picture on request (``intensity_drift``), which takes longer.
 """
 
 from __future__ import annotations
@@ -27,6 +29,12 @@ gain leave it at 1."""
 
 ROUNDS = 3
 """Steps of Gauss-Newton: each squares the relative error of the step before, which is a tenth for a fall to a half."""
+
+MIN_VARIANCE = 1e-100
+"""Variance of a sample in samples without noise: keeps the precision finite."""
+
+MAX_EVIDENCE = 1000.0
+"""Largest -2 log of the odds of a drift: its exponential is finite."""
 
 REPORTED_SDS = 3.0
 """Change of the gain in standard deviations from which it is reported: 0.3 % of noise exceeds."""
@@ -61,7 +69,7 @@ class SlowGain(NamedTuple):
 
 
 def estimate_slow_gain(cell: NDArray[np.int64], time: Array, intensity: Array, slices: int) -> SlowGain:
-    """The slow gain of the samples of a scan.
+    """The slow gain of the samples of a scan, averaged over a steady and a changing one by their probabilities.
 
     Args:
         cell: number of the cell of each sample, shape (n,).
@@ -80,23 +88,24 @@ def estimate_slow_gain(cell: NDArray[np.int64], time: Array, intensity: Array, s
         return np.asarray(first + last).reshape(number.size, knots)
 
     visits = sum_by_knot(np.ones_like(intensity))
-    free = max(cell.size - np.count_nonzero(visits.any(axis=1)), 1)
-    found = SlowGain(np.zeros(knots), np.eye(knots))
+    log_gain = np.zeros(knots)
     for _ in range(ROUNDS):
-        corrected = intensity / found.at(time)
+        corrected = intensity / SlowGain(log_gain, np.eye(knots)).at(time)
         scene = np.bincount(cell, corrected) / number
-        residual, square = corrected - scene[cell], scene[cell] ** 2
         information = -(visits.T * (scene**2 / number)) @ visits
         for one in (0, 1):
             for other in (0, 1):
-                product = np.bincount(left, weights[one] * weights[other] * square, slices)
+                product = np.bincount(left, weights[one] * weights[other] * scene[cell] ** 2, slices)
                 information[np.arange(slices) + one, np.arange(slices) + other] += product
-        prior = residual @ residual / free / PRIOR_SD**2
-        inverse = np.linalg.pinv(information + prior * np.eye(knots))
-        step = inverse @ (scene @ sum_by_knot(residual) - prior * found.log_gain)
-        log_gain = found.log_gain + step
-        found = SlowGain(log_gain - log_gain.mean(), prior * PRIOR_SD**2 * inverse)
-    return found
+        scores = scene[:, None] * sum_by_knot(corrected - scene[cell])
+        variance = max(np.trace(np.linalg.pinv(information) @ scores.T @ scores) / slices, MIN_VARIANCE)
+        precision = information / variance + np.eye(knots) / PRIOR_SD**2
+        covariance = np.linalg.inv(precision)
+        log_gain = log_gain + covariance @ (scores.sum(axis=0) / variance - log_gain / PRIOR_SD**2)
+        log_gain = log_gain - log_gain.mean()
+    evidence = log_gain @ precision @ log_gain - np.linalg.slogdet(precision * PRIOR_SD**2)[1]
+    share = 1.0 / (1.0 + math.exp(-0.5 * max(evidence, -MAX_EVIDENCE)))
+    return SlowGain(share * log_gain, share * (covariance + (1.0 - share) * np.outer(log_gain, log_gain)))
 
 
 def describe_slow_gain(gains: Sequence[SlowGain]) -> list[str]:

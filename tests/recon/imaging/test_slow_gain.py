@@ -39,6 +39,13 @@ def test_the_gain_is_found_with_the_stated_error() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(deviations))) < 1.3
 
 
+@pytest.mark.parametrize("target", ["usaf_bars", "siemens_star", "point_grid"])
+def test_detail_finer_than_a_cell_shows_no_gain(target: str) -> None:
+    recording, _ = simulate_experiment(Experiment(target=target, duration=0.01), 34001)
+    result = reconstruct(recording, Options(), quiet=True)
+    assert not any("--intensity-drift" in note for note in result.notes)
+
+
 @pytest.mark.parametrize("case", ["dark", "no noise", "one visit"])
 def test_samples_that_show_no_gain_leave_it_at_one(case: str) -> None:
     rng = np.random.default_rng(0)
