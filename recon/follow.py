@@ -145,6 +145,8 @@ class _Follower:
         frame: samples of the frame in progress; None before its first part.
         done: number of frames that were shown or dropped.
         part: number of parts of the frame in progress.
+        edges: of its parts [s]. They are fixed when it begins: a part that does not begin where the one before ended is
+            not tracked from its end.
         span: begin and end of the recording [s].
         search: length of the recording at which the repeat time is estimated next [s].
         arrivals: end of the recording [s on its clock], and when it was read [s].
@@ -160,6 +162,7 @@ class _Follower:
     frame: FrameSums | None = None
     done: int = 0
     part: int = 0
+    edges: list[float] = field(default_factory=list)
     span: tuple[float, float] = (0.0, 0.0)
     search: float = FIRST_REPEAT_SEARCH_S
     arrivals: list[tuple[float, float]] = field(default_factory=list)
@@ -183,17 +186,18 @@ class _Follower:
             self.summary.overtaken += complete - 1 - self.done
             self.done = complete - 1
         start, stop = begin + self.done * length, begin + (self.done + 1) * length
-        edges = part_edges(start, stop, slow_period(self.scan.motion)) if self.scan else [start, stop]
-        if np.isnan(length) or (complete <= self.done and not edges[self.part + 1] <= end):
+        if self.part == 0:
+            self.edges = part_edges(start, stop, slow_period(self.scan.motion)) if self.scan else [start, stop]
+        if np.isnan(length) or (complete <= self.done and not self.edges[self.part + 1] <= end):
             return False
         try:
             if self.part == 0:
                 self._use_measurement()
             self.scan, self.frame = add_part(
-                recording, edges[self.part], edges[self.part + 1], self.scan, self.frame, self.options
+                recording, self.edges[self.part], self.edges[self.part + 1], self.scan, self.frame, self.options
             )
             self.part += 1
-            if self.part == len(edges) - 1:
+            if self.part == len(self.edges) - 1:
                 self._show(stop)
         except BadInput as error:  # no motion in this frame; the next one may have one
             self.refusal = f": {error}"

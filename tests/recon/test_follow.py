@@ -172,6 +172,22 @@ def test_an_interrupt_ends_the_following_and_keeps_the_frames(written, tmp_path:
     assert json.loads((out / "summary.json").read_text())["live"]["ended"] == "interrupted"
 
 
+def test_each_part_begins_where_the_one_before_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, _ = imaging(0.15)  # its frequencies drift, and with them the period from which the parts follow
+    recording.write(tmp_path / "scan.h5")
+    parts = []
+
+    def record(recording: Recording, start: float, stop: float, *rest: object) -> object:
+        parts.append((start, stop))
+        return add_part(recording, start, stop, *rest)
+
+    monkeypatch.setattr("recon.follow.add_part", record)
+    options = Options(pixels=(50, 50))
+    follow_recording(tmp_path / "scan.h5", tmp_path / "out", options, frame_time=0.07, quiet_time=0.1, quiet=True)
+    assert len(parts) == 4  # a frame without an earlier one has one part, the next one has three
+    assert all(stop == start for (_, stop), (start, _) in itertools.pairwise(parts))
+
+
 def test_frames_that_newer_ones_overtake_are_counted_and_stated(scan: Path, tmp_path: Path) -> None:
     options = Options(pixels=(50, 50))
     live = follow_recording(scan, tmp_path / "out", options, frame_time=0.004, quiet_time=0.1, quiet=True)
