@@ -50,7 +50,7 @@ class PhaseReference:
     """Reference phase psi(t) of one axis: 2 pi f t plus a slow part given at knots.
 
     Attributes:
-        kind: ``"half-drive"``, ``"drive"`` or ``"absolute"``.
+        kind: ``"half-drive"``, ``"drive"``, ``"absolute"`` or ``"blocks"``.
         frequency: f, of the motion at the first knot [Hz].
         knots: times [s], shape (k,), at least 2. slow: psi - 2 pi f t at the knots [rad].
     """
@@ -74,6 +74,11 @@ class PhaseReference:
         """Frequency of the reference, psi' / 2 pi, at ``time`` [s]: shape (n,) [Hz]."""
         slope = np.gradient(self.slow, self.knots) / (2 * np.pi)
         return self.frequency + np.interp(time, self.knots, slope)
+
+
+def block_reference(frequency: float, start: float, end: float) -> PhaseReference:
+    """The reference 2 pi f t for a motion that repeats at no known frequency; f only determines the blocks of time."""
+    return PhaseReference("blocks", frequency, np.array([start, end]), np.zeros(2))
 
 
 def absolute_reference(frequency: float, start: float, end: float) -> PhaseReference:

@@ -181,7 +181,18 @@ def describe_long_frames(frame_time: float | None, intensity: Channel) -> list[s
 
 def describe_motion(motion: Motion, intensity: Channel) -> list[str]:
     """Lines on a motion that is doubtful or not fully determined."""
-    return [*describe_fast_axes(motion, intensity), *describe_ambiguous_signs(motion)]
+    lines = [*describe_unknown_frequencies(motion), *describe_fast_axes(motion, intensity)]
+    return [*lines, *describe_ambiguous_signs(motion)]
+
+
+def describe_unknown_frequencies(motion: Motion) -> list[str]:
+    """A line for each axis whose signal shows no frequency."""
+    return [
+        f"the frequency of {name} is not determined: its signal does not repeat within the recording. The picture does "
+        f"not need it; the phase of {name} has no meaning"
+        for name, axis in motion.axes.items()
+        if axis.reference == "blocks"
+    ]
 
 
 def describe_ambiguous_signs(motion: Motion) -> list[str]:
@@ -198,7 +209,9 @@ def describe_fast_axes(motion: Motion, intensity: Channel) -> list[str]:
     return [
         f"{name} moves at {frequency:.4g} Hz, and mirrors, fibres and stages move at {MIN_SCANNER_HZ:g} to "
         f"{MAX_SCANNER_HZ:.0e} Hz: check the unit of time and sample_rate, {intensity.sample_rate:.4g} Hz"
-        for name, frequency in ((name, float(np.median(axis.frequency))) for name, axis in motion.axes.items())
+        for name, frequency in (
+            (name, float(np.median(axis.frequency))) for name, axis in motion.axes.items() if axis.reference != "blocks"
+        )
         if not MIN_SCANNER_HZ < frequency < MAX_SCANNER_HZ
     ]
 

@@ -17,6 +17,7 @@ from recon.imaging.intensity_correction import (
     measure_intensity_drift,
 )
 from recon.imaging.readout_phase import describe_readout_phase, remove_readout_phase
+from recon.imaging.slow_gain import describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice
 from recon.reconstruction import Options
 from recon.registration_segments import registration_segments
@@ -34,11 +35,21 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
     The drift is then measured again in the intensity as recorded, at the corrected positions. Without a drift the first
     phase is kept.
     """
-    corrected = correct_intensity_drift(correct_readout_phase(estimated, options), options)
+    phased = correct_readout_phase(estimated, options)
+    if options.intensity_drift is None:
+        return replace(phased, motion_notes=[*phased.motion_notes, *_describe_gain(phased)])
+    corrected = correct_intensity_drift(phased, options)
     if not exceeds_uncertainty(corrected.intensity_drift):
         return corrected
     without_drift = correct_readout_phase(replace(estimated, prepared=corrected.prepared), options)
     return correct_intensity_drift(replace(without_drift, prepared=estimated.prepared), options)
+
+
+def _describe_gain(estimated: EstimatedMotion) -> list[str]:
+    """The note on a slow gain; none of a stack, whose drift no option removes, as a place is at a new z each time."""
+    if estimated.prepared.position_z is not None:
+        return []
+    return describe_slow_gain([error.gain for error in estimated.phase_errors or [] if error.gain is not None])
 
 
 def wants_readout_phase(motion: Motion, options: Options) -> bool:

@@ -132,12 +132,13 @@ class AxisMotion:
         time: shape (n,) [s], increasing.
         phase: shape (n,) [rad], unwrapped; of theta = A sin(reference + phase), where the reference is half the
             drive's phase for a parametric (electrostatic) drive, the drive's phase for a linear one, and
-            ``2 pi f0 t`` with the device's resonance f0 where no drive was recorded.
+            ``2 pi f0 t`` with the device's resonance f0 where no drive was recorded, or with an arbitrary f0 that makes
+            blocks of time where the motion repeats at no known frequency.
         amplitude: shape (n,) [rad].
         frequency: shape (n,), of the motion [Hz].
         phase_sd: shape (n,), standard deviation of ``phase`` [rad].
         angle: the angle at the intensity's samples.
-        reference: ``"half-drive"``, ``"drive"`` or ``"absolute"``.
+        reference: ``"half-drive"``, ``"drive"``, ``"absolute"``, or ``"blocks"`` if the frequency is not determined.
         sign: ``"known: <how>"`` or ``"ambiguous"``; an even capacitance fixes the phase modulo pi only.
         amplitude_sd: shape (n,), standard deviation of ``amplitude`` by the noise, without the calibration's [rad];
             None from an estimator that states none.

@@ -82,7 +82,8 @@ def choose_laws(
         if not options:
             return None
         if list(options) == [linear.effects(present)]:
-            exchanged = _exchange_near_rival(linear, likelihood, fit, present, candidates, fitted)
+            exchanged, near = _exchange_near_rival(linear, likelihood, fit, present, candidates, fitted)
+            compared.append(near)
             if exchanged is None:
                 break
             fit = exchanged
@@ -112,11 +113,9 @@ def choose_laws(
     if not are_needed(linear, present, misfit(before) - misfit(fit), alone):
         return None
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
-    leaves_nothing = leave_nothing(linear, present)
-    rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
-    if leaves_nothing:
-        rivals = {key: _with_fitted_rivals(key, of_law, fit, compared) for key, of_law in rivals.items()}
-    return Choice(likelihood, before, fit, rivals, leaves_nothing)
+    linear_rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
+    rivals = {key: _with_fitted_rivals(key, of_law, fit, compared) for key, of_law in linear_rivals.items()}
+    return Choice(likelihood, before, fit, rivals, leave_nothing(linear, present))
 
 
 def _with_fitted_rivals(
@@ -124,8 +123,8 @@ def _with_fitted_rivals(
 ) -> tuple[RivalFit, ...]:
     """Rivals of a law, and laws that were fitted in its place, with the smaller gap.
 
-    The linear model around one law may be wrong for another that fits as well. Without a discrepancy beside the laws,
-    their fits under the same noise decide.
+    The linear model around one law may be wrong by more than two laws differ: a law whose fit under the same noise is
+    as good is as probable.
 
     Args:
         key: of the law.
@@ -161,15 +160,19 @@ def _exchange_near_rival(
     present: tuple[int, ...],
     candidates: Sequence[Candidate],
     fitted: dict[Effects, Fit],
-) -> Fit | None:
+) -> tuple[Fit | None, dict[Effects, Fit]]:
     """The fit with one law exchanged that has a better evidence around itself; None where there is none.
 
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
     ``MIN_SCORE_GAIN`` are fitted, each once, and compared around their own fits.
+
+    Returns:
+        that fit, and all fits that were compared under the same noise.
     """
     discrepancies = list(filter(is_discrepancy, candidates))
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     best, lowest = None, hypothesis.neg2_log_evidence - MIN_EXCHANGE_GAIN
+    compared = {linear.effects(present): fit}
     for removed in present:
         rest = tuple(law for law in present if law != removed)
         for rival in linear.beside(rest, hypothesis.scales):
@@ -180,9 +183,10 @@ def _exchange_near_rival(
             fitted[effects] = other = fit_laws(linear, likelihood, fit, rival.laws, fitted)
             if not satisfies_sign_constraints(other) or other.chi2 > MAX_CHI2_RATIO * fit.chi2:
                 continue
+            compared[effects] = other
             around = linear_model(likelihood, other, discrepancies)
             laws = range(len(around.laws))
             score = around.hypothesis(tuple(laws), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
             if score < lowest:
                 best, lowest = other, score
-    return best
+    return best, compared

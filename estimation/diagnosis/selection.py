@@ -24,7 +24,7 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
-from estimation.diagnosis.necessity import are_needed
+from estimation.diagnosis.necessity import MAX_REMAINDER_RATIO, are_needed
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import (
     ScoreTest,
@@ -242,13 +242,13 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
     """The selection with a law that is linear in no amplitude, as a clip level or a mode that grows, where one gains.
 
     The named laws are chosen again beside it. Where free corrections beside the selected laws have no evidence, such a
-    law has none either.
+    law has none either; where they take the bulk of the misfit, it is sought beside them and not in their place.
     """
     if selected.leaves_nothing:
         return selected
-    bases = [selected.nominal]
-    if uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates)):
-        bases.append(selected.fit)
+    has_laws = uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates))
+    takes_bulk = has_laws and misfit(selected.fit) < MAX_REMAINDER_RATIO * misfit(selected.nominal)
+    bases = [*([] if takes_bulk else [selected.nominal]), *([selected.fit] if has_laws else [])]
     scored = [(base, score) for base in bases for score in _nonlinear_starts(selected.likelihood, base, pool)]
     starts = [(s.model, damped_start(selected.likelihood, base, s.model, s.x, s.step)) for base, s in scored]
     fitted = fit_models(selected.likelihood, starts, abort_above=misfit(selected.fit))

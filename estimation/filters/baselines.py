@@ -9,7 +9,8 @@ import numpy as np
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
 from estimation.initial import fit_initial_motion
 from estimation.lock_in_channels import lock_in_angle
-from estimation.reference import PhaseReference, absolute_reference, tone_frequency
+from estimation.reference import PhaseReference, absolute_reference, block_reference, tone_frequency
+from estimation.short_tone import fit_short_tone
 from estimation.signals import (
     NOISE_SAMPLES,
     intensity_clock,
@@ -123,13 +124,21 @@ def reference_of_any_waveform(recording: Recording, device: Device, name: str, c
 
     It is that of :func:`reference_from_drive_or_signal`, else the strongest line of the position signal, else a
     frequency that makes the whole recording ``MIN_BLOCKS`` blocks of the slow clock. The angle does not depend on it.
+    The spectrum of a ramp or a step has its strongest line at few periods, where no sine fits it: that is no frequency.
     """
-    with suppress(BadInput):
-        return reference_from_drive_or_signal(recording, device, name, channel)
-    with suppress(BadInput):
-        return absolute_reference(tone_frequency(channel), channel.start, channel.end)
+    references = (
+        lambda: reference_from_drive_or_signal(recording, device, name, channel),
+        lambda: absolute_reference(tone_frequency(channel), channel.start, channel.end),
+    )
+    most = 2.0 * BLOCK_CYCLES
+    for find in references:
+        with suppress(BadInput):
+            found = find()
+            few = found.frequency * channel.size < most * channel.sample_rate
+            if found.kind != "absolute" or not few or fit_short_tone(channel, 0.0, most) is not None:
+                return found
     lowest = MIN_BLOCKS * (BLOCK_CYCLES + 1.0) * channel.sample_rate / channel.size
-    return absolute_reference(lowest, channel.start, channel.end)
+    return block_reference(lowest, channel.start, channel.end)
 
 
 def axis_motion_from_angle(

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from recon.imaging.bidirectional_equations import BLOCKS_PER_SLICE, normal_equations
 from recon.imaging.bidirectional_search import SEARCH_RESOLUTION_RAD, RegistrationSamples, search_phase_errors
 from recon.imaging.picture import Grid
+from recon.imaging.slow_gain import SlowGain, estimate_slow_gain
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
@@ -85,12 +86,14 @@ class PhaseError:
         time: middle of the slice since the first sample [s].
         x, y: value and standard error of each axis [rad].
         parts: the same of short parts of the slice; None where they were not measured.
+        gain: slow gain of all slices that share the picture; None where it was not measured.
     """
 
     time: float
     x: PhaseEstimate
     y: PhaseEstimate
     parts: PhaseErrorParts | None = None
+    gain: SlowGain | None = None
 
 
 class _Fit(NamedTuple):
@@ -158,7 +161,7 @@ def measure_phase_errors(
         np.arange(n) * (slices * BLOCKS_PER_SLICE) // max(n, 1),
     ]
     finite = np.all([np.isfinite(column) for column in columns], axis=0)
-    value, sd, parts = _estimate_phase_errors(
+    value, sd, parts, gain = _estimate_phase_errors(
         RegistrationSamples(*(column[finite] for column in columns)), grid, slices
     )
     length = n / slices / rate
@@ -169,6 +172,7 @@ def measure_phase_errors(
             PhaseEstimate(float(value[s, 0]), float(sd[s, 0])),
             PhaseEstimate(float(value[s, 1]), float(sd[s, 1])),
             PhaseErrorParts(s * length + within, parts[s, ..., 0], parts[s, ..., 1]),
+            gain,
         )
         for s in range(slices)
     ]
@@ -230,11 +234,20 @@ def quadrature(theta: Array, amplitude: float | Array) -> Array:
     return np.sign(rise) * np.sqrt(np.maximum(np.square(amplitude) - np.square(theta), 0.0))
 
 
-def _estimate_phase_errors(samples: RegistrationSamples, grid: Grid, slices: int) -> tuple[Array, Array, Array]:
-    """Phase errors, standard errors and parts as in ``_Fit``, each at the cell size with the least standard error."""
+def _estimate_phase_errors(
+    samples: RegistrationSamples, grid: Grid, slices: int
+) -> tuple[Array, Array, Array, SlowGain | None]:
+    """Phase errors, standard errors and parts as in ``_Fit``, each at the cell size with the least standard error, and
+    the slow gain."""
     part = samples.block // BLOCKS_PER_SLICE
     if np.bincount(part, minlength=slices).min() < 4 * BLOCKS_PER_SLICE:
-        return np.full((slices, 2), np.nan), np.full((slices, 2), np.inf), _undetermined_parts(slices)
+        return np.full((slices, 2), np.nan), np.full((slices, 2), np.inf), _undetermined_parts(slices), None
+    finest = max(
+        min(1.0, grid.width / MIN_CELLS_ACROSS),
+        math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size),
+    )
+    gain = _slow_gain(samples, grid, finest, slices)
+    samples = samples._replace(intensity=samples.intensity / gain.at(_slice_time(samples)))
     start = np.array(
         [search_phase_errors(RegistrationSamples(*(column[part == s] for column in samples))) for s in range(slices)]
     )
@@ -242,10 +255,6 @@ def _estimate_phase_errors(samples: RegistrationSamples, grid: Grid, slices: int
     start = np.where(clear, start, 0.0)
     best, limit = start, np.full_like(start, SEARCH_RESOLUTION_RAD)
     best_parts = _undetermined_parts(slices)
-    finest = max(
-        min(1.0, grid.width / MIN_CELLS_ACROSS),
-        math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size),
-    )
     for cell in (4 * finest, 2 * finest, finest):  # noisy pictures need large cells, fine detail small ones
         fit = _fit_cells(samples, best, grid, cell)
         clear &= fit.clear  # noise that hides coarse detail also hides fine detail
@@ -256,7 +265,22 @@ def _estimate_phase_errors(samples: RegistrationSamples, grid: Grid, slices: int
         best, limit = np.where(better, fit.value, best), np.where(better, fit.sd, limit)
         best_parts = np.where(better[:, None, :, None], fit.parts, best_parts)
     determined = limit < SEARCH_RESOLUTION_RAD
-    return np.where(determined, best, np.nan), np.where(determined, limit, np.inf), best_parts
+    return np.where(determined, best, np.nan), np.where(determined, limit, np.inf), best_parts, gain
+
+
+def _slow_gain(samples: RegistrationSamples, grid: Grid, cell: float, slices: int) -> SlowGain:
+    """The slow change of the detector's gain, found in cells of one size [px]."""
+    columns, rows = math.ceil(grid.width / cell), math.ceil(grid.height / cell)
+    column, row = (
+        np.clip((place / cell + 0.5 * number).astype(np.int64), 0, number - 1)
+        for place, number in ((samples.x, columns), (samples.y, rows))
+    )
+    return estimate_slow_gain(row * columns + column, _slice_time(samples), samples.intensity, slices)
+
+
+def _slice_time(samples: RegistrationSamples) -> Array:
+    """Middle of each sample's block, in slices from the first sample, shape (n,)."""
+    return (samples.block + 0.5) / BLOCKS_PER_SLICE
 
 
 def _undetermined_parts(slices: int) -> Array:

@@ -162,7 +162,7 @@ def axis_table(summary: Mapping[str, Any]) -> Table:
             "standard deviation of the amplitude: scale of the picture",
             *(_format_amplitude_sd(summary[a]) for a in AXES),
         ],
-        ["frequency [Hz]", *(f"{summary[a]['frequency_hz']:.3f}" for a in AXES)],
+        ["frequency [Hz]", *(_format_frequency(summary[a]["frequency_hz"]) for a in AXES)],
         ["sign of the angle", *(summary[a]["sign"] for a in AXES)],
     ]
     return Table(["", *AXES], rows)
@@ -197,6 +197,10 @@ def sample_motion_sections(result: Reconstruction) -> list[Section]:
 def blur_figure_of(parts: Mapping[str, Mapping[str, float]], p: float) -> Figure:
     """Bars of blur by cause."""
     return Figure(blur_figure(parts, p), "blur by cause; dashed: the tolerated p pixels")
+
+
+def _format_frequency(frequency: float | None) -> str:
+    return "not determined" if frequency is None else f"{frequency:.3f}"
 
 
 def _format_amplitude_sd(axis: Mapping[str, Any]) -> str:

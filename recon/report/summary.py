@@ -74,7 +74,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
         "amplitude_rad": scale * float(np.mean(own.amplitude)),
         **amplitude_uncertainty(result, axis),
         "amplitude_from": amplitude_source(result, axis),
-        "frequency_hz": float(np.mean(own.frequency)),
+        "frequency_hz": None if own.reference == "blocks" else float(np.mean(own.frequency)),
         "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
         "picture_phase_error_deg": picture_phase_error(result.phase_errors, axis),
         "readout_phase_deg": readout_phase_summary(result, axis),

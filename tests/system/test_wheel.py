@@ -2,10 +2,13 @@
 
 import subprocess
 import sys
+import tomllib
 import zipfile
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from recon.cli import main
 
@@ -31,6 +34,17 @@ def test_the_wheel_contains_every_file_of_the_packages(wheel: zipfile.ZipFile) -
     assert {f"{name}/py.typed" for name in PACKAGES} <= names
     templates = {f"recon/report/templates/{name}" for name in ("report.html", "sweeps.js")}
     assert {"scanner/devices/imaging.toml", *templates} <= names
+
+
+def test_every_locked_package_runs_on_the_oldest_supported_python() -> None:
+    """A release may ask for 3.11.5; a version 3.11.2 then cannot install the lock file."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    oldest = project["requires-python"].removeprefix(">=") + ".0"
+    locked = {line.partition("==")[0].replace("_", "-") for line in (ROOT / "requirements.lock").read_text().split()}
+    found = {d.name.replace("_", "-"): d.metadata for d in distributions() if d.name.replace("_", "-") in locked}
+    assert len(found) > 0.9 * len(locked)
+    required = {name: data["Requires-Python"] for name, data in found.items() if "Requires-Python" in data}
+    assert {name: text for name, text in required.items() if not SpecifierSet(text).contains(oldest)} == {}
 
 
 def test_the_wheel_has_the_commands_the_extras_and_the_licence(wheel: zipfile.ZipFile) -> None:

@@ -34,3 +34,14 @@ def test_a_lag_before_a_linear_mirror_is_a_rival_of_one_behind_it(tmp_path: Path
     assert {"readout-lag", "drive-lag"} <= set(names[:3])
     gaps = {rival.candidate.term.effect: rival.evidence_gap for rival in selected.rivals}
     assert all(gaps[name] < 6.0 for name in ("readout-lag", "drive-lag") if name in gaps)
+
+
+@pytest.mark.slow
+def test_laws_whose_fits_are_equal_are_rivals_beside_a_discrepancy(tmp_path: Path) -> None:
+    """The evidence of their fits differs by 2.5, that of their sensitivities around one fit by 20."""
+    case = Case("blind-001", "one", "drive", ("drive-lag",), "hum", 601541145)
+    _, search = search_blind_recording(case, tmp_path, ("readout-lag", "drive-lag", "channel-delay", "hysteresis"))
+    (selected,) = search.steps
+    gaps = {rival.candidate.term.effect: rival.evidence_gap for rival in selected.rivals}
+    named = {selected.candidate.term.effect, *(name for name, gap in gaps.items() if gap < 6.0)}
+    assert {"readout-lag", "drive-lag", "channel-delay"} <= named

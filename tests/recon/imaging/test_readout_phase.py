@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from recon.imaging.bidirectional_phase import PhaseError, PhaseErrorParts, Phase
 from recon.imaging.readout_phase import correlate_matern32, estimate_readout_phase, remove_readout_phase
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
+from recon.report.summary import summarise
 from scanner.recording import Recording
 from tests.support.simulated import imaging, with_sense
 
@@ -152,18 +155,33 @@ def test_a_correction_that_the_next_picture_confirms_is_applied() -> None:
     assert found["x"].value == pytest.approx(np.radians(1.1), abs=np.radians(0.05))
 
 
-def test_a_specimen_without_detail_gives_a_wide_interval_and_a_note() -> None:
-    recording, simulated = imaging()
-    channels = {k: (c.read(), c.unit, c.sample_rate, c.start) for k, c in recording.channels.items()}
+def featureless() -> Recording:
+    """The scan of a specimen without detail."""
+    recording = imaging()[0]
     light = np.random.default_rng(0).poisson(200.0, recording["intensity"].size).astype(float)
-    channels["intensity"] = (light, *channels["intensity"][1:])
-    featureless = Recording.from_arrays(channels, recording.device)
-    result = reconstruct(featureless, Options(), truth_from_simulation(simulated), quiet=True)
-    for axis in "xy":
+    return recording.with_channel(replace(recording["intensity"], raw=light, gain=1.0, offset=0.0))
+
+
+def test_a_specimen_without_detail_gives_a_wide_interval_and_a_note() -> None:
+    result = reconstruct(featureless(), Options(), truth_from_simulation(imaging()[1]), quiet=True)
+    for axis, rate in (("x", 13840.0), ("y", 3270.0)):
         assert axis not in result.readout_phase
         sd = result.motion.axes[axis].phase_sd
-        assert np.all(sd > 2.0 * np.pi * 3000.0 * 0.3e-6)
+        assert np.all(sd > 2.0 * np.pi * rate * 0.49e-6)
     assert sum("determines no phase" in note for note in result.notes) == 2
+
+
+@pytest.mark.parametrize("delay", [-0.9e-6, 0.9e-6])
+def test_without_a_picture_the_interval_holds_an_unstated_delay_that_the_harmonics_do_not_show(delay: float) -> None:
+    recording, simulated = featureless(), imaging()[1]
+    late = recording.with_channel(replace(recording["sense"], start=recording["sense"].start + delay))
+    result = reconstruct(late, Options(), truth_from_simulation(simulated), quiet=True)
+    summary = summarise(result)
+    for axis, rate in (("x", 13840.0), ("y", 3270.0)):
+        error, sd = result.evaluation[axis].phase, result.motion.axes[axis].phase_sd
+        assert abs(error.mean()) == pytest.approx(2.0 * np.pi * rate * abs(delay), rel=0.02)
+        assert np.abs(error).max() < 1.96 * sd.min()
+        assert summary["readout_phase_deg"][axis] is None
 
 
 def lit(scene: np.ndarray, creep: float = 0.0, saturation: float = 1.0) -> Recording:

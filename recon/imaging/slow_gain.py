@@ -1,0 +1,126 @@
+"""Slow changes of the detector's gain, estimated beside the phase error so that they are not attributed to the phase.
+
+Bleaching, laser power and a detector's supply change the gain over many periods of the slower axis. Samples of one
+place at two times then differ, as with a phase error. The model of sample i in cell p is
+
+    I_i = s_p exp(γ(t_i)) + noise,    γ(t) = Σ_j w_j(t) γ_j,   γ_j ~ N(0, PRIOR_SD²),
+
+with hat functions w_j between the ends of the time slices: each slice covers the field, so that it determines a gain.
+The scene s is free, and is eliminated. Gauss-Newton gives the posterior of γ. The variance of a sample follows from the
+scatter of the scores of the cells, which holds the detail within a cell: a few bright points would else show a drift. A
+steady gain has half of the prior probability, so that a steady detector keeps its intensity. Faster changes are removed
+from the picture on request (``intensity_drift``), which takes longer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.arrays import Array
+
+PRIOR_SD = 0.5
+"""Standard deviation of the logarithm of the gain at the end of a slice: bleaching to 60 %. Samples that determine no
+gain leave it at 1."""
+
+ROUNDS = 3
+"""Steps of Gauss-Newton: each squares the relative error of the step before, which is a tenth for a fall to a half."""
+
+MIN_VARIANCE = 1e-100
+"""Variance of a sample in samples without noise: keeps the precision finite."""
+
+MAX_EVIDENCE = 1000.0
+"""Largest -2 log of the odds of a drift: its exponential is finite."""
+
+REPORTED_SDS = 3.0
+"""Change of the gain in standard deviations from which it is reported: 0.3 % of noise exceeds."""
+
+MIN_REPORTED_CHANGE = 0.01
+"""Relative change of the gain from which it is reported: a third of the noise of a pixel of 1000 photons."""
+
+
+class SlowGain(NamedTuple):
+    """Posterior of the logarithm of the gain at the ends of the slices, with mean 0, as a factor belongs to the scene.
+
+    Attributes:
+        log_gain: shape (slices + 1,).
+        covariance: shape (slices + 1, slices + 1).
+    """
+
+    log_gain: Array
+    covariance: Array
+
+    def at(self, time: Array) -> Array:
+        """The gain at times in slices, shape (n,)."""
+        return np.exp(np.interp(time, np.arange(self.log_gain.size), self.log_gain))
+
+    @property
+    def change(self) -> tuple[float, float]:
+        """Relative change from the largest to the smallest gain, positive if it rises with time, and its sd."""
+        low, high = int(np.argmin(self.log_gain)), int(np.argmax(self.log_gain))
+        first, last = min(low, high), max(low, high)
+        change = math.exp(self.log_gain[last] - self.log_gain[first])
+        pair = self.covariance[np.ix_((first, last), (first, last))]
+        return change - 1.0, change * math.sqrt(max(pair[0, 0] + pair[1, 1] - 2.0 * pair[0, 1], 0.0))
+
+
+def estimate_slow_gain(cell: NDArray[np.int64], time: Array, intensity: Array, slices: int) -> SlowGain:
+    """The slow gain of the samples of a scan, averaged over a steady and a changing one by their probabilities.
+
+    Args:
+        cell: number of the cell of each sample, shape (n,).
+        time: of each sample in slices, from 0 to ``slices``, shape (n,).
+        intensity: shape (n,).
+        slices: equal parts of the scan.
+    """
+    knots, left = slices + 1, np.minimum(time.astype(np.int64), slices - 1)
+    weights = (1.0 - (time - left), time - left)
+    number = np.maximum(np.bincount(cell), 1).astype(float)
+
+    def sum_by_knot(values: Array) -> Array:
+        """Sums of the values times each hat function over the samples of each cell, shape (cells, knots)."""
+        size = number.size * knots
+        first, last = (np.bincount(cell * knots + left + side, weights[side] * values, size) for side in (0, 1))
+        return np.asarray(first + last).reshape(number.size, knots)
+
+    visits = sum_by_knot(np.ones_like(intensity))
+    log_gain = np.zeros(knots)
+    for _ in range(ROUNDS):
+        corrected = intensity / SlowGain(log_gain, np.eye(knots)).at(time)
+        scene = np.bincount(cell, corrected) / number
+        information = -(visits.T * (scene**2 / number)) @ visits
+        for one in (0, 1):
+            for other in (0, 1):
+                product = np.bincount(left, weights[one] * weights[other] * scene[cell] ** 2, slices)
+                information[np.arange(slices) + one, np.arange(slices) + other] += product
+        scores = scene[:, None] * sum_by_knot(corrected - scene[cell])
+        variance = max(np.trace(np.linalg.pinv(information) @ scores.T @ scores) / slices, MIN_VARIANCE)
+        precision = information / variance + np.eye(knots) / PRIOR_SD**2
+        covariance = np.linalg.inv(precision)
+        log_gain = log_gain + covariance @ (scores.sum(axis=0) / variance - log_gain / PRIOR_SD**2)
+        log_gain = log_gain - log_gain.mean()
+    evidence = log_gain @ precision @ log_gain - np.linalg.slogdet(precision * PRIOR_SD**2)[1]
+    share = 1.0 / (1.0 + math.exp(-0.5 * max(evidence, -MAX_EVIDENCE)))
+    return SlowGain(share * log_gain, share * (covariance + (1.0 - share) * np.outer(log_gain, log_gain)))
+
+
+def describe_slow_gain(gains: Sequence[SlowGain]) -> list[str]:
+    """A line if the gain changes, with the option that removes the change from the picture.
+
+    Args:
+        gains: of parts of the scan, each with its own picture.
+    """
+    changes = [gain.change for gain in gains]
+    clear = [each for each in changes if abs(each[0]) > max(MIN_REPORTED_CHANGE, REPORTED_SDS * each[1])]
+    if not clear:
+        return []
+    change, sd = max(clear, key=lambda each: abs(each[0]))
+    return [
+        f"intensity: samples of one place {'rise' if change > 0.0 else 'fall'} by {100 * abs(change):.2g} % "
+        f"± {100 * sd:.1g} % during the scan (gain, laser power or bleaching). The phase allows for it, the picture "
+        "does not: run again with --intensity-drift gain, or offset for stray light"
+    ]
