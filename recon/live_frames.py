@@ -19,11 +19,11 @@ from estimation.tracker import track_end
 from recon.estimated_motion import EstimatedMotion
 from recon.imaging.bidirectional_phase import slow_period
 from recon.imaging.carried_readout_phase import apply_readout_phase, update_readout_phase
-from recon.imaging.intensity_gridding import PixelSums, add_samples, empty_sums
+from recon.imaging.held_out import held_out_ranges
+from recon.imaging.intensity_gridding import PixelSums, add_samples, add_scattered, empty_sums
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.picture_estimate import (
     EstimatedPicture,
-    add_held_out,
     kernel_widths,
     picture_of_sums,
     picture_without_sd,
@@ -39,7 +39,7 @@ from recon.quality.sensor_noise import check_sensor_noise
 from recon.reconstruction import Options
 from recon.registration_segments import MAX_REGISTERED_PERIODS
 from recon.report.figures import save_picture
-from recon.sample_ranges import to_sample_ranges
+from recon.sample_ranges import subtract_ranges, to_sample_ranges
 from scanner.channel import Channel
 from scanner.device import Device
 from scanner.files import replacing
@@ -173,9 +173,11 @@ def add_part(
         frame = FrameSums(grid, intensity, empty_sums(intensity, grid), held, noise, longest)
     elif stop - start > frame.longest.duration:
         frame = replace(frame, longest=keep_part(sensed, estimated, stop - start))
-    samples = beam, intensity, grid, unlocated, first
-    held = frame.held_sums and add_held_out(frame.held_sums, *samples)
-    frame = replace(frame, sums=add_samples(frame.sums, *samples), held_sums=held)
+    located = subtract_ranges([(first, intensity.size)], unlocated)
+    frame = replace(frame, sums=add_samples(frame.sums, beam, intensity, grid, located))
+    if frame.held_sums is not None:
+        held_out = subtract_ranges(held_out_ranges(first, intensity.size), unlocated)
+        frame = replace(frame, held_sums=add_scattered(frame.held_sums, beam, intensity, grid, held_out))
     if scan is None:
         return LiveScan(estimated.prepared.device, sensed, stop, grid, known), frame
     return replace(scan, motion=sensed, stop=stop), frame

@@ -246,9 +246,10 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
     """
     if selected.leaves_nothing:
         return selected
-    has_laws = uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates))
-    takes_bulk = has_laws and misfit(selected.fit) < MAX_REMAINDER_RATIO * misfit(selected.nominal)
-    bases = [*([] if takes_bulk else [selected.nominal]), *([selected.fit] if has_laws else [])]
+    bases = [selected.nominal]
+    if uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates)):
+        takes_bulk = misfit(selected.fit) < MAX_REMAINDER_RATIO * misfit(selected.nominal)
+        bases = [selected.fit] if takes_bulk else [selected.nominal, selected.fit]
     scored = [(base, score) for base in bases for score in _nonlinear_starts(selected.likelihood, base, pool)]
     starts = [(s.model, damped_start(selected.likelihood, base, s.model, s.x, s.step)) for base, s in scored]
     fitted = fit_models(selected.likelihood, starts, abort_above=misfit(selected.fit))

@@ -59,35 +59,31 @@ def grid_intensity(
     first: int = 0,
     stop: int | None = None,
 ) -> Picture:
-    """Return the picture of the samples ``first`` up to ``stop``; arguments as for :func:`add_samples`."""
-    sums = add_samples(empty_sums(intensity, grid), beam, intensity, grid, unlocated, first, stop)
-    return sums.picture(intensity, grid)
+    """Return the picture of the samples ``first`` up to ``stop``.
+
+    Args:
+        beam, intensity, grid: as for :func:`add_samples`.
+        unlocated: samples that belong to no pixel because the beam's place is unknown.
+        first, stop: samples to grid; all where ``stop`` is None.
+    """
+    located = subtract_ranges([(first, intensity.size if stop is None else stop)], unlocated)
+    return add_samples(empty_sums(intensity, grid), beam, intensity, grid, located).picture(intensity, grid)
 
 
-def add_samples(
-    to: PixelSums,
-    beam: Motion,
-    intensity: Channel,
-    grid: Grid,
-    unlocated: SampleRanges,
-    first: int = 0,
-    stop: int | None = None,
-) -> PixelSums:
-    """Add the samples ``first`` up to ``stop`` to their pixels and return the sums.
+def add_samples(to: PixelSums, beam: Motion, intensity: Channel, grid: Grid, ranges: SampleRanges) -> PixelSums:
+    """Add ranges of samples to their pixels and return the sums.
 
     Args:
         to: sums so far; its arrays are changed in place.
         beam: motion whose angles are on the intensity's clock.
         intensity: shape (n,) or (n, detectors). Samples that are not finite are left out.
         grid: the pixels.
-        unlocated: samples that belong to no pixel because the beam's place is unknown.
-        first, stop: samples to grid; all where ``stop`` is None.
+        ranges: of samples whose place is known.
     """
     x, y = (beam.axes[axis].angle for axis in AXES)
     phasors_x, phasors_y = x.phasors(), y.phasors()
     samples = to.samples
-    located = subtract_ranges([(first, intensity.size if stop is None else stop)], unlocated)
-    for begin, end in _chunks(located):
+    for begin, end in _chunks(ranges):
         values = contiguous_samples(intensity.stored(begin, end))
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             values = np.where(np.isinf(values), np.nan, values)  # accumulation leaves NaN out

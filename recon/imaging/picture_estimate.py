@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.held_out import SplitSums, held_out_ranges
-from recon.imaging.intensity_gridding import PixelSums, add_scattered, empty_sums
+from recon.imaging.intensity_gridding import add_scattered, empty_sums
 from recon.imaging.kernel_picture import PictureEstimate, choose_width, kernel_image, kernel_picture
-from recon.imaging.picture import Grid, Picture, detector_names
+from recon.imaging.picture import Picture, detector_names
 from recon.imaging.pixel_noise import SampleNoise, pixel_sd
 from recon.imaging.recursive_frames import CarriedFrames, recursive_picture
 from recon.sample_ranges import SampleRanges, subtract_ranges
@@ -95,24 +95,11 @@ def estimate_picture(
     """
     held = None
     if kind != "mean":
+        ranges = held_out_ranges(first, intensity.size if stop is None else stop)
         sums = empty_sums(intensity, means.grid)
-        sums = add_held_out(sums, beam, intensity, means.grid, unlocated, first, stop)
+        sums = add_scattered(sums, beam, intensity, means.grid, subtract_ranges(ranges, unlocated))
         held = sums.picture(intensity, means.grid)
     return picture_of_sums(kind, means, held, noise, before)
-
-
-def add_held_out(
-    to: PixelSums,
-    beam: Motion,
-    intensity: Channel,
-    grid: Grid,
-    unlocated: SampleRanges,
-    first: int = 0,
-    stop: int | None = None,
-) -> PixelSums:
-    """Add those of the samples ``first`` up to ``stop`` that are held out; arguments as for ``add_samples``."""
-    stop = intensity.size if stop is None else stop
-    return add_scattered(to, beam, intensity, grid, subtract_ranges(held_out_ranges(first, stop), unlocated))
 
 
 def picture_of_sums(

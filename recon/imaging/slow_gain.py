@@ -56,7 +56,7 @@ class SlowGain(NamedTuple):
 
     def at(self, time: Array) -> Array:
         """The gain at times in slices, shape (n,)."""
-        return np.exp(np.interp(time, np.arange(self.log_gain.size), self.log_gain))
+        return _gain_at(self.log_gain, time)
 
     @property
     def change(self) -> tuple[float, float]:
@@ -66,6 +66,11 @@ class SlowGain(NamedTuple):
         change = math.exp(self.log_gain[last] - self.log_gain[first])
         pair = self.covariance[np.ix_((first, last), (first, last))]
         return change - 1.0, change * math.sqrt(max(pair[0, 0] + pair[1, 1] - 2.0 * pair[0, 1], 0.0))
+
+
+def _gain_at(log_gain: Array, time: Array) -> Array:
+    """The gain at times in slices, shape (n,), from its logarithm at their ends."""
+    return np.exp(np.interp(time, np.arange(log_gain.size), log_gain))
 
 
 def estimate_slow_gain(cell: NDArray[np.int64], time: Array, intensity: Array, slices: int) -> SlowGain:
@@ -90,7 +95,7 @@ def estimate_slow_gain(cell: NDArray[np.int64], time: Array, intensity: Array, s
     visits = sum_by_knot(np.ones_like(intensity))
     log_gain = np.zeros(knots)
     for _ in range(ROUNDS):
-        corrected = intensity / SlowGain(log_gain, np.eye(knots)).at(time)
+        corrected = intensity / _gain_at(log_gain, time)
         scene = np.bincount(cell, corrected) / number
         information = -(visits.T * (scene**2 / number)) @ visits
         for one in (0, 1):
