@@ -15,7 +15,7 @@ from recon.evaluation import load_truth
 from recon.io.output import finite, replacing_folder
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
-from recon.report.comparison import comparison_report
+from recon.report.comparison import comparison_report, upright_picture
 from recon.report.figures import data_uri, save_picture
 from recon.report.page import Figure, Section
 from recon.report.summary import summarise
@@ -55,7 +55,7 @@ def main(folder: Path) -> None:
         (beside / "report.html").write_text(page, encoding="utf-8")
         (beside / "summary.json").write_text(json.dumps(summaries, indent=1), encoding="utf-8")
         for name, result in results.items():
-            save_picture(beside / f"{name.replace(' ', '-').lower()}.png", result.picture)
+            save_picture(beside / f"{name.replace(' ', '-').lower()}.png", upright_picture(result))
     for name, summary in summaries.items():
         x, y, ratio = summary["x"], summary["y"], summary["picture"]["rms"] / summaries["true motion"]["picture"]["rms"]
         print(

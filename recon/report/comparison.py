@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from recon.imaging.picture import Picture
 from recon.reconstruction import Reconstruction
 from recon.report.figures import (
     contrast_limits,
@@ -50,7 +52,7 @@ def comparison_report(
     pictures, enlarged = [], []
     bar = scale_bar(first.picture.grid)
     for name, result in results.items():
-        image = _upright_image(result)
+        image = fill_small_holes(upright_picture(result))
         pictures.append(Figure(picture_data_uri(image, limits), picture_caption(name, summaries[name]), scale_bar=bar))
         enlarged.append(
             Figure(
@@ -117,9 +119,12 @@ def _picture_cell(picture: Mapping[str, float], best: float) -> str:
     return f"{picture['rms']:.4f} ({picture['rms'] / best:.3f} ×)"
 
 
-def _upright_image(result: Reconstruction) -> Any:
+def upright_picture(result: Reconstruction) -> Picture:
+    """The picture as the scene lies: axes whose sign the recording leaves open are turned as in the truth."""
     flip_x, flip_y = is_mirrored(result)
-    return fill_small_holes(result.picture)[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
+    rows, columns = (slice(None, None, -1 if flip else 1) for flip in (flip_y, flip_x))
+    picture = result.picture
+    return replace(picture, image=picture.image[rows, columns], coverage=picture.coverage[rows, columns])
 
 
 def _central_part(image: Any) -> Any:
