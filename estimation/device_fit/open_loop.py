@@ -93,14 +93,14 @@ def has_larger_error(nominal: Mapping[str, OpenLoop], improved: Mapping[str, Ope
     return _relative_error(improved)[0] > (1.0 + ERROR_MARGIN) * _relative_error(nominal)[0]
 
 
-def is_worse(nominal: Mapping[str, OpenLoop], improved: Mapping[str, OpenLoop]) -> bool:
-    """Whether a device predicts worse than the nominal one, by more than ``ERROR_MARGIN`` and twice the uncertainty.
+def is_worse(reference: Mapping[str, OpenLoop], device: Mapping[str, OpenLoop]) -> bool:
+    """Whether a device predicts worse than a reference, by more than ``ERROR_MARGIN`` and twice the uncertainty.
 
     The errors of all channels are added, each as a fraction of its signal: a readout lag may change the angle by a
     thousandth of its amplitude while the error of the sense signal falls to a tenth.
     """
-    before, before_sd = _relative_error(nominal)
-    after, after_sd = _relative_error(improved)
+    before, before_sd = _relative_error(reference)
+    after, after_sd = _relative_error(device)
     return bool(after - before > 2.0 * np.hypot(before_sd, after_sd) + ERROR_MARGIN * before)
 
 

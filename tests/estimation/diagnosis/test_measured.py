@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.measured import ROWS
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.predict import predict
 from estimation.diagnosis import selection as searching
-from estimation.diagnosis.diagnose import Diagnosis, build_diagnosis
+from estimation.diagnosis.diagnose import Diagnosis, build_diagnosis, diagnose
 from recon.io.convert import convert
 from scanner.device import Axis, Device
 from scanner.recording import Recording
@@ -76,6 +77,15 @@ def test_hysteresis_and_drift_terms_explain_the_piezo_stage(measured_data: Path)
     assert (
         held_out_rms_mv(fit_laws(recording, LAWS)) < 0.3 < 0.8 < held_out_rms_mv(fit_laws(recording, ("offset-drift",)))
     )
+
+
+@pytest.mark.slow
+def test_no_law_is_named_where_a_drive_was_not_recorded(measured_data: Path) -> None:
+    """A membrane is driven for the first 1.4 s: a second mode that has decayed by then fits, and predicts nothing."""
+    (recording,), _, device = ROWS["membrane-505"](measured_data)
+    diagnosis = diagnose([recording], device)
+    assert diagnosis.findings == ()
+    assert diagnosis.unexplained is not None
 
 
 def test_a_device_without_a_drive_is_predicted_as_a_free_decay() -> None:
