@@ -26,6 +26,9 @@ hardly be distinguished from lower ones."""
 FORCE_POWERS = tuple((i, n - i) for n in range(2, FORCE_DEGREE + 1) for i in range(n, -1, -1))
 """Powers (i, j) of angle and rate in the force polynomial, in the order of its coefficients."""
 
+N_FORCE_POWERS = len(FORCE_POWERS)
+"""Number of coefficients of the force polynomial."""
+
 FORCE_DRIFT_COSINES = 3
 """Number of cosines over the duration for the drift of stiffness and damping in ``free-mechanics``. Three describe a
 monotonic drift; other drifts are described by ``free-stiffness``."""
@@ -63,17 +66,6 @@ SOURCE = "discrepancy term (Kennedy & O'Hagan 2001): polynomials and cosines wit
 
 
 @njit(cache=True)
-def _cosines(phase, coefficients):  # type: ignore[no-untyped-def]
-    """sum_j coefficients[j - 1] cos(j phase)."""
-    cosine = np.cos(phase)
-    total, previous, current = 0.0, 1.0, cosine
-    for i in range(len(coefficients)):
-        total += coefficients[i] * current
-        previous, current = current, 2.0 * cosine * current - previous
-    return total
-
-
-@njit(cache=True)
 def apply_play(signal, width):  # type: ignore[no-untyped-def]
     """Output of a play operator of half-width ``width`` for ``signal``, shape (n,), equal to it at the first sample."""
     output = np.empty_like(signal)
@@ -86,16 +78,27 @@ def apply_play(signal, width):  # type: ignore[no-untyped-def]
 
 @njit(TORQUE_LAW, cache=True)
 def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    """Force polynomial, drift and memory: torque [N m] and the rates of the two hidden states."""
+    """Force polynomial, drift and memory: torque [N m] and the rates of the two hidden states.
+
+    Sums are evaluated by nested products over constant ranges, which the compiler unrolls.
+    """
     x, y = theta / p[0], omega / (p[0] * p[1])
-    total, index = 0.0, 3
-    for n in range(2, FORCE_DEGREE + 1):
-        for j in range(n + 1):
-            total += p[index] * x ** (n - j) * y**j
-            index += 1
-    total += (p[index] * z0 + p[index + 1] * z1) * x + (p[index + 2] * z0 + p[index + 3] * z1) * y
-    phase = np.pi * t / p[2]
-    total += _cosines(phase, p[index + 4 :: 2]) * x + _cosines(phase, p[index + 5 :: 2]) * y
+    total, cosine = 0.0, np.cos(np.pi * t / p[2])
+    for j in range(FORCE_DEGREE, -1, -1):
+        in_angle = 0.0
+        for i in range(FORCE_DEGREE - j, -1, -1):
+            n = i + j
+            in_angle = in_angle * x + (p[n * (n + 1) // 2 + j] if n > 1 else 0.0)
+        total = total * y + in_angle
+    memory = 3 + N_FORCE_POWERS
+    stiffness = p[memory] * z0 + p[memory + 1] * z1
+    damping = p[memory + 2] * z0 + p[memory + 3] * z1
+    previous, current = 1.0, cosine
+    for i in range(FORCE_DRIFT_COSINES):
+        stiffness += p[memory + 4 + 2 * i] * current
+        damping += p[memory + 5 + 2 * i] * current
+        previous, current = current, 2.0 * cosine * current - previous
+    total += stiffness * x + damping * y
     amplitude_squared = x * x + y * y
     return (
         -total * nominal.k * p[0],
@@ -106,10 +109,15 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
 
 @njit(TORQUE_LAW, cache=True)
 def _drifting_force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    """Torque [N m] of a stiffness and a damping that depend on time."""
-    phase, first_damping = np.pi * t / p[1], 2 + STIFFNESS_COSINES
-    force = _cosines(phase, p[2:first_damping]) * theta + _cosines(phase, p[first_damping:]) * omega / p[0]
-    return -force * nominal.k, 0.0, 0.0
+    """Torque [N m] of a stiffness and a damping that depend on time, both cosine series by Clenshaw's recurrence."""
+    cosine, first_damping = np.cos(np.pi * t / p[1]), 2 + STIFFNESS_COSINES
+    stiffness, older_stiffness, damping, older_damping = 0.0, 0.0, 0.0, 0.0
+    for j in range(STIFFNESS_COSINES - 1, -1, -1):
+        stiffness, older_stiffness = p[2 + j] + 2.0 * cosine * stiffness - older_stiffness, stiffness
+        if j < DAMPING_COSINES:
+            damping, older_damping = p[first_damping + j] + 2.0 * cosine * damping - older_damping, damping
+    stiffness, damping = cosine * stiffness - older_stiffness, cosine * damping - older_damping
+    return -(stiffness * theta + damping * omega / p[0]) * nominal.k, 0.0, 0.0
 
 
 @njit(CAPACITANCE_LAW, cache=True)

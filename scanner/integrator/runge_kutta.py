@@ -146,28 +146,45 @@ def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)
-def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, laws, s, used):  # type: ignore[no-untyped-def]
+def _terms(s, laws):  # type: ignore[no-untyped-def]
+    """What :func:`_evaluate_terms` needs of the state and the laws, without an array: a function that is passed an
+    array counts references to it, which takes longer than most laws.
+
+    Torque laws, their number, address and ``p_stride`` of their parameters; the same of the capacitance laws;
+    addresses of the state and of the nominal values.
+    """
+    return (
+        laws[0], laws[2], _data_address(laws[1]), laws[1].shape[2],
+        laws[3], laws[5], _data_address(laws[4]), laws[4].shape[2],
+        _data_address(s), _data_address(laws[6]),
+    )  # fmt: skip
+
+
+@njit(forceinline=True, **_COMPILER_OPTIONS)
+def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, terms, used):  # type: ignore[no-untyped-def]
     """Set ``TERM_TORQUE``, ``TERM_SLOPE`` and the derivatives ``dz_row`` of the hidden states, in all used lanes."""
     # Unpacked, because an index into the tuple would copy all of its functions at every call.
-    (first, second, third, fourth), n, capacitance_laws = laws[0], laws[2], laws[3]
-    state, nominal = _data_address(s), _data_address(laws[6])
-    s[TERM_TORQUE], s[TERM_SLOPE] = 0.0, 0.0
-    p, stride = _data_address(laws[1]), laws[1].shape[2]
+    (first, second, third, fourth), n, p, stride, capacitance_laws, m, capacitance_p, capacitance_stride, state, own = (
+        terms
+    )
+    s = carray(_pointer(state), (ROWS, LANES))
+    for lane in range(used):
+        s[TERM_TORQUE, lane], s[TERM_SLOPE, lane] = 0.0, 0.0
     term = stride * BYTES_PER_FLOAT
     if n > 0:
-        first(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, stride, nominal, used)
+        first(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, stride, own, used)
     if n > 1:
-        second(state, t, other, volt, theta_row, omega_row, z_row + 2, dz_row + 2, p + term, stride, nominal, used)
+        second(state, t, other, volt, theta_row, omega_row, z_row + 2, dz_row + 2, p + term, stride, own, used)
     if n > 2:
-        third(state, t, other, volt, theta_row, omega_row, z_row + 4, dz_row + 4, p + 2 * term, stride, nominal, used)
+        third(state, t, other, volt, theta_row, omega_row, z_row + 4, dz_row + 4, p + 2 * term, stride, own, used)
     if n > 3:
-        fourth(state, t, other, volt, theta_row, omega_row, z_row + 6, dz_row + 6, p + 3 * term, stride, nominal, used)
-    p, stride = _data_address(laws[4]), laws[4].shape[2]
-    term = stride * BYTES_PER_FLOAT
-    for i in range(laws[5]):
+        fourth(state, t, other, volt, theta_row, omega_row, z_row + 6, dz_row + 6, p + 3 * term, stride, own, used)
+    term = capacitance_stride * BYTES_PER_FLOAT
+    for i in range(m):
         capacitance_laws[i](
-            state, t, other, volt, theta_row, omega_row, z_row, dz_row, p + i * term, stride, nominal, used
-        )
+            state, t, other, volt, theta_row, omega_row, z_row, dz_row,
+            capacitance_p + i * term, capacitance_stride, own, used,
+        )  # fmt: skip
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)
@@ -209,33 +226,34 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
         s[J : TORQUE_PER_VOLT + 1, lane] = laws[6][motion]
     s[STAGE_Z : STAGE_Z + 2 * MAX_TERMS_PER_STAGE] = s[Z : Z + 2 * MAX_TERMS_PER_STAGE]
     angle[:, 0], rate[:, 0] = start[:, 0], start[:, 1]
+    terms = _terms(s, laws)
     for i in range(voltage.shape[0]):
         v0, v1, v2 = voltage[i, 0], voltage[i, 1], voltage[i, 2]
         e0, e1, e2 = laws[7] * v0, laws[7] * v1, laws[7] * v2
         o0, o1, o2 = other[i, 0], other[i, 1], other[i, 2]
         if any_term:
-            _evaluate_terms(t, THETA, OMEGA, Z, DZ1, o0, v0, laws, s, used)
+            _evaluate_terms(t, THETA, OMEGA, Z, DZ1, o0, v0, terms, used)
             _set_stage_z(DZ1, half, s, hidden_states, width)
         for lane in range(width):
             s[ALPHA1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, electrostatic, e0)
             s[OMEGA2, lane] = s[OMEGA, lane] + half * s[ALPHA1, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA, lane]
         if any_term:
-            _evaluate_terms(t + half, STAGE_THETA, OMEGA2, STAGE_Z, DZ2, o1, v1, laws, s, used)
+            _evaluate_terms(t + half, STAGE_THETA, OMEGA2, STAGE_Z, DZ2, o1, v1, terms, used)
             _set_stage_z(DZ2, half, s, hidden_states, width)
         for lane in range(width):
             s[ALPHA2, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA2, v1, electrostatic, e1)
             s[OMEGA3, lane] = s[OMEGA, lane] + half * s[ALPHA2, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA2, lane]
         if any_term:
-            _evaluate_terms(t + half, STAGE_THETA, OMEGA3, STAGE_Z, DZ3, o1, v1, laws, s, used)
+            _evaluate_terms(t + half, STAGE_THETA, OMEGA3, STAGE_Z, DZ3, o1, v1, terms, used)
             _set_stage_z(DZ3, step, s, hidden_states, width)
         for lane in range(width):
             s[ALPHA3, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA3, v1, electrostatic, e1)
             s[OMEGA4, lane] = s[OMEGA, lane] + step * s[ALPHA3, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + step * s[OMEGA3, lane]
         if any_term:
-            _evaluate_terms(t + step, STAGE_THETA, OMEGA4, STAGE_Z, DZ4, o2, v2, laws, s, used)
+            _evaluate_terms(t + step, STAGE_THETA, OMEGA4, STAGE_Z, DZ4, o2, v2, terms, used)
             for k in range(hidden_states):
                 for lane in range(width):
                     rates = s[DZ1 + k, lane] + 2.0 * s[DZ2 + k, lane] + 2.0 * s[DZ3 + k, lane] + s[DZ4 + k, lane]
