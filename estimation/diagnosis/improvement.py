@@ -15,7 +15,6 @@ from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.shares import describe_unexplained
 from scanner.device import Axis, Device
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 
@@ -47,12 +46,10 @@ def improve(result: SelectionResult) -> Improvement:
     """Improve the device by the findings that do not make its open-loop prediction worse.
 
     As long as the device with all findings predicts worse than the nominal one, beyond the uncertainty of the
-    comparison, the weakest finding is removed. Within that uncertainty findings stay if they leave noise alone, and the
-    nominal device takes the place of one with a larger error. Findings that leave more than noise have to predict
-    better beyond that uncertainty: those that do neither may imitate what no law describes. A rail at which samples
-    stand is certain and stays. A discrepancy term always remains a finding, but if the device with its measured law
-    predicts any channel of any run worse, the device with the named laws alone is returned, or the nominal one if that
-    is worse too.
+    comparison, the weakest finding is removed; a rail at which samples stand is certain and stays. Within that
+    uncertainty findings stay, but the nominal device takes the place of one with a larger error. A discrepancy term
+    always remains a finding, but if the device with its measured law predicts any channel of any run worse, the device
+    with the named laws alone is returned, or the nominal one if that is worse too.
     """
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
@@ -64,8 +61,7 @@ def improve(result: SelectionResult) -> Improvement:
             options = [device, *([_without_discrepancy(result)] if unnamed and len(result.steps) > 1 else [])]
             better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
-        leave_noise = describe_unexplained(result) is None
-        if is_worse(improved, nominal) or (leave_noise and not is_worse(nominal, improved)):
+        if not is_worse(nominal, improved):
             if has_larger_error(nominal, improved):
                 device, improved = stated, nominal
             return Improvement(result, device, nominal, improved)

@@ -22,7 +22,7 @@ from estimation.diagnosis.linear_model import (
     RivalFit,
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
-from estimation.diagnosis.necessity import are_needed, leave_nothing
+from estimation.diagnosis.necessity import leave_nothing, need_of_laws
 from estimation.diagnosis.significance import satisfies_sign_constraints
 
 MAX_LINEARISATIONS = 8
@@ -41,6 +41,7 @@ class Choice(NamedTuple):
         before, fit: of the nominal device, and of the device with them.
         rivals: other laws in the place of each, by its key.
         leaves_nothing: whether free corrections of all stages beside them have no evidence.
+        certain: whether they are the answer if no law is found beside them; see :class:`necessity.Need`.
     """
 
     likelihood: Likelihood
@@ -48,6 +49,7 @@ class Choice(NamedTuple):
     fit: Fit
     rivals: dict[str, tuple[RivalFit, ...]]
     leaves_nothing: bool
+    certain: bool
 
 
 def choose_laws(
@@ -110,12 +112,13 @@ def choose_laws(
     alone = linear.hypothesis(()).neg2_log_evidence
     if any(map(is_discrepancy, anchor.model.candidates)):
         alone = min(alone, _evidence_of_discrepancy(likelihood, anchor, candidates))
-    if not are_needed(linear, present, misfit(before) - misfit(fit), alone):
+    need = need_of_laws(linear, present, misfit(before) - misfit(fit), alone)
+    if not need.possible:
         return None
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     linear_rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
     rivals = {key: _with_fitted_rivals(key, of_law, fit, compared) for key, of_law in linear_rivals.items()}
-    return Choice(likelihood, before, fit, rivals, leave_nothing(linear, present))
+    return Choice(likelihood, before, fit, rivals, leave_nothing(linear, present), need.certain)
 
 
 def _with_fitted_rivals(

@@ -24,7 +24,7 @@ from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
-from estimation.diagnosis.necessity import MAX_REMAINDER_RATIO, are_needed
+from estimation.diagnosis.necessity import MAX_REMAINDER_RATIO, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import (
     ScoreTest,
@@ -99,6 +99,7 @@ class _Selected:
         without: fits without one of several terms, by its key.
         rivals: of each by its key.
         leaves_nothing: whether free corrections of all stages beside them have no evidence.
+        certain: whether they are the answer; otherwise a discrepancy term is.
     """
 
     likelihood: Likelihood
@@ -107,6 +108,7 @@ class _Selected:
     without: Mapping[str, Fit] = field(default_factory=dict)
     rivals: Mapping[str, tuple[RivalFit, ...]] = field(default_factory=dict)
     leaves_nothing: bool = False
+    certain: bool = True
 
 
 def select_terms(
@@ -134,13 +136,12 @@ def select_terms(
     named = [term for term in terms.values() if term.effect not in certain]
     pool = all_candidates(device, nominal.model, [*named, *DISCREPANCY_TERMS.values()])
     progress(f"{len(pool)} candidates")
-    selected = _choose_around_nominal(likelihood, nominal, early, stops, pool, progress)
-    selected = _with_nonlinear_term(selected, nominal, pool, progress)
+    selected = _choose_terms(likelihood, nominal, early, stops, pool, progress)
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
     return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps)
 
 
-def _choose_around_nominal(
+def _choose_terms(
     likelihood: Likelihood,
     nominal: Fit,
     early: Sequence[Fit],
@@ -148,21 +149,24 @@ def _choose_around_nominal(
     pool: Sequence[Candidate],
     progress: Progress,
 ) -> _Selected:
-    """Named laws, else a discrepancy term, else nothing."""
+    """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
     around_drift = _choose_around_drift(likelihood, nominal, stops[0], pool, progress)
     if around_drift is not None:
-        return around_drift
+        return _with_nonlinear_term(around_drift, nominal, pool, progress)
     groups = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
     anchor, tried = fit_anchor(likelihood, nominal, early, stops, [group for group in groups if group])
     selected = _choose_laws(anchor, nominal, pool, progress)
     if selected is not None:
-        return selected
+        selected = _with_nonlinear_term(selected, nominal, pool, progress)
+        if selected.certain:
+            return selected
     progress("discrepancy terms")
     of_discrepancy = [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])]
     discrepancy = _choose_discrepancy(anchor, of_discrepancy, nominal, pool)
     if discrepancy is None:
-        return _Selected(likelihood, nominal, nominal)
-    return _choose_laws(discrepancy.fit, nominal, pool, progress) or discrepancy
+        return _with_nonlinear_term(_Selected(likelihood, nominal, nominal), nominal, pool, progress)
+    laws = _choose_laws(discrepancy.fit, nominal, pool, progress)
+    return _with_nonlinear_term(laws if laws and laws.certain else discrepancy, nominal, pool, progress)
 
 
 def _choose_around_drift(
@@ -197,7 +201,9 @@ def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress:
     fit, without = drop_redundant(choice.likelihood, choice.fit)
     if not evidence_gain(choice.likelihood, choice.before, fit):
         return None
-    return _Selected(choice.likelihood, choice.before, fit, without, choice.rivals, choice.leaves_nothing)
+    return _Selected(
+        choice.likelihood, choice.before, fit, without, choice.rivals, choice.leaves_nothing, choice.certain
+    )
 
 
 def _choose_discrepancy(
@@ -261,7 +267,8 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
     discrepancies = list(filter(is_discrepancy, pool))
     without, beside = (linear_model(selected.likelihood, fit, discrepancies) for fit in (base, best))
     laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
-    if not are_needed(beside, laws, misfit(base) - misfit(best), alone):
+    need = need_of_laws(beside, laws, misfit(base) - misfit(best), alone)
+    if not need.possible:
         return selected
     best = fit_to_convergence(selected.likelihood, best.model, best.x)
     progress(f"laws beside {best.model.candidates[-1].key}")
@@ -270,7 +277,8 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
         return with_laws
     likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
     before = fit_model(likelihood, nominal.model, nominal.x)
-    return _Selected(likelihood, before, *drop_redundant(likelihood, fit_model(likelihood, best.model, best.x)))
+    fit, removed = drop_redundant(likelihood, fit_model(likelihood, best.model, best.x))
+    return _Selected(likelihood, before, fit, removed, certain=need.certain)
 
 
 def _step(selected: _Selected, candidate: Candidate) -> SelectionStep:
