@@ -10,8 +10,9 @@ s is the random error of the estimator, σs the standard deviation that it state
 variance of the corrected phase is the posterior variance of β. The hyperparameters σ0, σ1, τ and a factor on the
 standard errors are averaged over by their marginal likelihood (Rasmussen and Williams 2006, eq. 2.30).
 σ0 = 0 and σ1 = 0, a readout as stated, have half of the prior probability each, so that a correct readout keeps the
-precision that the sense signal gives. Whether they are zero is common to both axes, which the same electronics read;
-their sizes are not, because a delay, a pole and feedthrough act on the axes differently.
+precision that the sense signal gives. Whether the readout varies (σ1 > 0) is common to both axes, because the same
+electronics read them: the axis that the picture determines better decides it for both. The constant is not common,
+because feedthrough of one drive shifts one axis alone.
 """
 
 from __future__ import annotations
@@ -68,41 +69,41 @@ class Hypotheses(NamedTuple):
     Attributes:
         time: increasing, shape (m,) [s].
         log_weight: logarithm of prior probability times marginal likelihood, shape (h,).
-        has_constant, has_drift: whether σ0 and σ1 are above zero, shape (h,).
+        drifts: whether σ1 is above zero, shape (h,).
         mean, variance: of β at ``time``, shape (h, m) [rad, rad²].
         total, total_variance: of the mean of c + g over the scan, shape (h,) [rad, rad²].
     """
 
     time: Array
     log_weight: Array
-    has_constant: NDArray[np.bool_]
-    has_drift: NDArray[np.bool_]
+    drifts: NDArray[np.bool_]
     mean: Array
     variance: Array
     total: Array
     total_variance: Array
 
     def log_evidence(self) -> Array:
-        """Logarithm of the summed weights by whether there is a constant and whether there is a drift, shape (2, 2)."""
-        evidence = np.full((2, 2), -np.inf)
-        np.logaddexp.at(evidence, (self.has_constant.astype(int), self.has_drift.astype(int)), self.log_weight)
+        """Logarithm of the summed weights without and with a drift, shape (2,)."""
+        evidence = np.full(2, -np.inf)
+        np.logaddexp.at(evidence, self.drifts.astype(int), self.log_weight)
         return evidence
 
-    def average(self, other_evidence: Array | float = 0.0) -> ReadoutPhase:
+    def average(self, other_evidence: Array | None = None) -> ReadoutPhase:
         """The posterior averaged over the hypotheses.
 
         Args:
-            other_evidence: that of the other axis, by constant and drift as in ``log_evidence``.
+            other_evidence: that of the other axis without and with a drift, as in ``log_evidence``.
         """
-        other = np.broadcast_to(other_evidence, (2, 2))
-        log_weight = self.log_weight + other[self.has_constant.astype(int), self.has_drift.astype(int)]
+        log_weight = self.log_weight
+        if other_evidence is not None:
+            log_weight = log_weight + other_evidence[self.drifts.astype(int)]
         weight = np.exp(log_weight - np.max(log_weight))
         weight /= weight.sum()
         value, mean = weight @ self.total, weight @ self.mean
         value_variance = weight @ (self.total_variance + self.total**2) - value**2
         variance = weight @ (self.variance + self.mean**2) - mean**2
         return ReadoutPhase(
-            float(value), math.sqrt(max(value_variance, 0.0)), self.time, mean, np.maximum(variance, 0.0)
+            float(value), math.sqrt(max(float(value_variance), 0.0)), self.time, mean, np.maximum(variance, 0.0)
         )
 
 
@@ -180,16 +181,15 @@ def weigh_hypotheses(
     return Hypotheses(
         at,
         np.concatenate(log_weight),
-        np.tile(offset_var > 0.0, len(combinations)),
         np.repeat([drift_sd > 0.0 for drift_sd, *_ in combinations], offset_var.size),
         *(np.concatenate(each) for each in (means, variances, totals, total_vars)),
     )
 
 
 def average_jointly(axes: Mapping[str, Hypotheses]) -> dict[str, ReadoutPhase]:
-    """The averaged posterior of each axis, with constant and drift present in all axes or in none."""
+    """The averaged posterior of each axis, with a drift in all axes or in none."""
     evidence = {name: axis.log_evidence() for name, axis in axes.items()}
     return {
-        name: axis.average(sum((each for other, each in evidence.items() if other != name), np.zeros((2, 2))))
+        name: axis.average(sum((each for other, each in evidence.items() if other != name), np.zeros(2)))
         for name, axis in axes.items()
     }
