@@ -177,12 +177,24 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
         )
     delay = common_delay(motion, found) if late else None
     if delay is not None:
-        pole = f" or a pole near {1e-3 / (2.0 * np.pi * delay):.2g} kHz" if delay > 0.0 else ""
-        notes.append(
-            f"a delay of {1e6 * delay:.2g} µs{pole} in the readout would explain the error of both axes; "
-            "run `lissajous diagnose`"
-        )
+        notes.append(_describe_delay(delay, motion.estimator))
     return notes
+
+
+def _describe_delay(delay: float, estimator: str) -> str:
+    """The line on a delay [s] of the motion's signal that explains the phase errors of both axes.
+
+    No signal comes before the motion, so that a negative delay is one of the intensity, or of its clock.
+    """
+    if delay < 0.0:
+        return (
+            f"an intensity that is {-1e6 * delay:.2g} µs late (detector, amplifier, start of the channel) would "
+            "explain the error of both axes: positions in the picture are right, and the motion is late by this time"
+        )
+    pole = f"a delay of {1e6 * delay:.2g} µs or a pole near {1e-3 / (2.0 * np.pi * delay):.2g} kHz in the "
+    if estimator == "tracker":
+        return pole + "readout would explain the error of both axes; run `lissajous diagnose`"
+    return pole + "position detectors would explain the error of both axes; state their channels' start earlier by it"
 
 
 def _sd_as_stated(axis: AxisMotion) -> float:
