@@ -9,7 +9,7 @@ from estimation.optics.correction import beam_motion
 from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.intensity_drift import IntensityDrift
 from recon.imaging.picture import Grid
-from recon.imaging.readout_phase import ReadoutPhase
+from recon.imaging.readout_phase_model import ReadoutPhase
 from recon.imaging.sample_motion import SampleMotion
 from recon.imaging.sample_motion_correction import relative_to_sample
 from recon.preparation import PreparedRecording

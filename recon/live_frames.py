@@ -29,7 +29,7 @@ from recon.imaging.picture_estimate import (
     picture_without_sd,
 )
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
-from recon.imaging.readout_phase import ReadoutPhase
+from recon.imaging.readout_phase_model import ReadoutPhase
 from recon.io.output import write_tiff
 from recon.phase_and_drift import measure_phase_errors, wants_readout_phase
 from recon.pipeline import estimate_motion

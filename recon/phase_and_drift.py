@@ -23,7 +23,7 @@ from recon.reconstruction import Options
 from recon.registration_segments import registration_segments
 from scanner.motion import Motion
 
-ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor")
+ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor", "edges")
 """Estimators whose motion is corrected by the phase error that the picture shows. ``picture`` has its phase from the
 picture already; the other estimators serve for comparison, as their papers describe them."""
 

@@ -15,7 +15,7 @@ from recon.imaging.intensity_drift import DriftKind, IntensityDrift
 from recon.imaging.picture import Picture
 from recon.imaging.picture_estimate import PictureKind
 from recon.imaging.pixel_noise import SampleNoise
-from recon.imaging.readout_phase import ReadoutPhase
+from recon.imaging.readout_phase_model import ReadoutPhase
 from recon.imaging.sample_motion import SampleMotion
 from recon.preparation import DeviceSource
 from recon.quality.defects import Defect

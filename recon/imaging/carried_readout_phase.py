@@ -12,13 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from recon.imaging.bidirectional_phase import PhaseError
-from recon.imaging.readout_phase import (
-    OFFSET_SDS_RAD,
-    ReadoutPhase,
-    estimate_readout_phase,
-    measured_phase_error,
-    posterior_times,
-)
+from recon.imaging.readout_phase import measured_phase_error, posterior_times
+from recon.imaging.readout_phase_model import OFFSET_SDS_RAD, ReadoutPhase, weigh_hypotheses
 from scanner.device import AXES
 from scanner.motion import Motion
 
@@ -62,7 +57,7 @@ def update_readout_phase(
             updated[name] = replace(known[name], variance=known[name].variance + CHANGE_SD_RAD**2)
             earlier = float(updated[name].mean[-1]), float(updated[name].variance[-1])
         times = posterior_times(axis, measured[0])
-        estimate = estimate_readout_phase(*measured, times, may_drift=False, earlier=earlier)
-        if estimate is not None:
-            updated[name] = estimate
+        hypotheses = weigh_hypotheses(*measured, times, may_drift=False, earlier=earlier)
+        if hypotheses is not None:
+            updated[name] = hypotheses.average()
     return updated

@@ -2,52 +2,32 @@
 
 The sense signal follows fast changes of the phase to 0.01°. A delay, an amplifier pole, feedthrough of the drive or a
 curved characteristic that the device file does not state shifts its phase by an amount that varies slowly. The
-self-crossings of the scan (``bidirectional_phase``) measure the same phase without the readout. The model of an axis is
-
-    β(t) = c + g(t) + s(t),   c ~ N(0, σ0²),
-
-with β the true phase minus the phase of the estimator, measured with independent errors in short parts of the scan. g
-and s are Gaussian processes with Matérn-3/2 covariances (σ1², τ) and (σs(t)², τ). c and g are the error of the readout;
-s is the random error of the estimator, σs the standard deviation that it states. The picture measures s too, so the
-variance of the corrected phase is the posterior variance of β. The hyperparameters σ0, σ1, τ and a factor on the
-standard errors are averaged over by their marginal likelihood (Rasmussen and Williams 2006, eq. 2.30).
-σ0 = 0 and σ1 = 0, a readout as stated, have half of the prior probability each, so that a correct readout keeps the
-precision that the sense signal gives.
+self-crossings of the scan (``bidirectional_phase``) measure the same phase without the readout. ``readout_phase_model``
+combines both.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from recon.imaging.bidirectional_phase import PhaseError, PhaseEstimate
+from recon.imaging.readout_phase_model import (
+    DRIFT_SDS_RAD,
+    Hypotheses,
+    ReadoutPhase,
+    average_jointly,
+    weigh_hypotheses,
+)
 from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.motion import AxisMotion, Motion
 
-OFFSET_SDS_RAD = np.radians([0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
-"""Standard deviations σ0 that a constant phase error may have: half decades from a thirtieth of the usual bound of
-0.286°, below which no picture changes, to the reach of the registration."""
-DRIFT_SDS_RAD = np.radians([0.01, 0.03, 0.1, 0.3, 1.0])
-"""Standard deviations σ1 that the varying part may have: half decades; no readout varies by more."""
-DRIFT_TIMES_S = (3e-3, 10e-3, 30e-3)
-"""Correlation times τ that it may have: half decades up to the length of a scan. The sense signal determines faster
-changes better than the picture."""
-SENSE_ERROR_TIMES_S = (1e-3, *DRIFT_TIMES_S)
-"""Correlation times τ of the estimator's error, equally probable: half decades down to 1 ms, which the error has in 1/f
-noise beside an amplifier's resonance. It is longer in white noise."""
-NOISE_FACTORS = np.array([1.0, 2.0, 4.0])
-"""Factors on the standard errors of the measurements, equally probable. Detail that the registration does not resolve
-acts on short parts as additional noise."""
 MIN_DRIFT_SLICES = 3
 """Slices from which the error may vary with time. In a shorter scan neighbouring parts have the holes of the picture in
 common, which resembles a drift."""
-PRIOR_PROBABILITY_AS_STATED = 0.5
-"""Prior probability that the constant, and independently that the varying part, is zero: no preference either way."""
 UNDESCRIBED_DELAY_SD_S = 0.5e-6
 """Standard deviation of the delay of electronics that no device file describes, where no picture measures it: cables,
 converters and amplifiers are late by up to a microsecond."""
@@ -63,104 +43,6 @@ CONVERGENCE_SD = 0.5
 POSTERIOR_TIMES = 200
 """Times at which the posterior is evaluated in addition to those of the measurements: 0.3 ms apart in a scan of 60
 ms."""
-
-
-@dataclass(frozen=True)
-class ReadoutPhase:
-    """Posterior of the phase error of one axis: true phase minus estimated phase, positive for a late sense signal.
-
-    Attributes:
-        value, sd: of the mean of the readout's error over the scan, without the estimator's random error [rad].
-        time: shape (n,), increasing [s].
-        mean, variance: of both together at these times, shape (n,) [rad, rad²].
-    """
-
-    value: float
-    sd: float
-    time: Array
-    mean: Array
-    variance: Array
-
-
-def correlate_matern32(lag: Array, time: float) -> Array:
-    """Matérn-3/2 correlation at differences ``lag`` [s], of any shape, with the correlation time ``time`` [s]."""
-    scaled = math.sqrt(3.0) * np.abs(lag) / time
-    return np.asarray((1.0 + scaled) * np.exp(-scaled))
-
-
-def estimate_readout_phase(
-    time: Array,
-    value: Array,
-    sd: Array,
-    at: Array,
-    sense_sd: float | Array = 0.0,
-    may_drift: bool = True,
-    earlier: tuple[float, float] | None = None,
-) -> ReadoutPhase | None:
-    """Posterior of a phase error from measurements in the picture; None without a measurement.
-
-    Args:
-        time: of the measurements, shape (n,) [s].
-        value, sd: phase errors and standard deviations, shape (n,) [rad]; an infinite sd is no measurement.
-        at: times of the posterior, shape (m,), m > 1, increasing [s].
-        sense_sd: standard deviation that the estimator states for its phase, a number or shape (m,) [rad]; 0 leaves
-            its error out of the posterior.
-        may_drift: whether the error may vary with time.
-        earlier: mean [rad] and variance [rad²] of the constant by earlier parts of the scan, in the place of the prior.
-    """
-    used = np.isfinite(value) & np.isfinite(sd)
-    if not used.any():
-        return None
-    expected, expected_var = earlier or (0.0, 0.0)
-    time, value, noise = time[used], value[used] - expected, np.diag(sd[used] ** 2)
-    sense_sd = np.broadcast_to(sense_sd, at.shape)
-    measured_sd = np.interp(time, at, sense_sd)
-    share = PRIOR_PROBABILITY_AS_STATED / len(SENSE_ERROR_TIMES_S)
-    drifts = [(0.0, tau, share) for tau in SENSE_ERROR_TIMES_S]  # standard deviation, correlation time, probability
-    share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / (DRIFT_SDS_RAD.size * len(DRIFT_TIMES_S))
-    if may_drift:
-        drifts += [(drift_sd, tau, share) for drift_sd in DRIFT_SDS_RAD for tau in DRIFT_TIMES_S]
-    hypotheses = [(*drift, factor) for drift in drifts for factor in NOISE_FACTORS]
-    offset_var = np.concatenate([[0.0], OFFSET_SDS_RAD**2])
-    share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / OFFSET_SDS_RAD.size
-    offset_prior = np.concatenate([[PRIOR_PROBABILITY_AS_STATED], np.full(OFFSET_SDS_RAD.size, share)])
-    if earlier is not None:
-        offset_var, offset_prior = np.array([expected_var]), np.ones(1)
-    average = np.gradient(at) / np.gradient(at).sum()
-    log_weight, means, variances, totals, total_vars = [], [], [], [], []
-    for drift_sd, tau, prior, factor in hypotheses:
-        within = (drift_sd**2 + np.outer(measured_sd, measured_sd)) * correlate_matern32(time[:, None] - time, tau)
-        correlation = correlate_matern32(time[:, None] - at, tau)
-        across = (drift_sd**2 + np.outer(measured_sd, sense_sd)) * correlation
-        covariance = cho_factor(factor**2 * noise + within, lower=True)
-        solved_value, solved_one = cho_solve(covariance, value), cho_solve(covariance, np.ones_like(value))
-        log_det = 2.0 * np.log(np.diag(covariance[0])).sum()
-        left = 1.0 - across.T @ solved_one  # of a constant, what the varying part does not follow, shape (m,)
-        explained = (solve_triangular(covariance[0], across, lower=True) ** 2).sum(axis=0)
-        mean_across = drift_sd**2 * (correlation @ average)
-        mean_left = 1.0 - mean_across @ solved_one
-        between = drift_sd**2 * (average @ correlate_matern32(at[:, None] - at, tau) @ average)
-        mean_variance = max(between - mean_across @ cho_solve(covariance, mean_across), 0.0)
-        # The constant adds σ0² 1 1ᵀ to the covariance: its posterior variance and mean follow from two inner products.
-        information, score = solved_one.sum(), solved_value.sum()
-        constant_var = offset_var / (1.0 + offset_var * information)
-        constant = constant_var * score
-        log_weight.append(
-            np.log(prior * offset_prior)
-            - 0.5 * (value @ solved_value - constant * score + log_det + np.log1p(offset_var * information))
-        )
-        means.append(across.T @ solved_value + constant[:, None] * left)
-        variances.append(np.maximum(drift_sd**2 + sense_sd**2 - explained, 0.0) + constant_var[:, None] * left**2)
-        totals.append(mean_across @ solved_value + constant * mean_left)
-        total_vars.append(mean_variance + constant_var * mean_left**2)
-    weight = np.exp(np.concatenate(log_weight) - np.max(log_weight))
-    weight /= weight.sum()
-    mean, total = np.concatenate(means), np.concatenate(totals)
-    overall, posterior = weight @ total, weight @ mean
-    total_var = weight @ (np.concatenate(total_vars) + total**2) - overall**2
-    variance = weight @ (np.concatenate(variances) + mean**2) - posterior**2
-    total_sd = math.sqrt(max(total_var, 0.0))
-    return ReadoutPhase(float(overall + expected), total_sd, at, posterior + expected, np.maximum(variance, 0.0))
 
 
 def remove_readout_phase(
@@ -186,12 +68,9 @@ def remove_readout_phase(
     refuted: set[str] = set()
     for last in (False,) * (MAX_ROUNDS - 1) + (True,):
         axes = dict(motion.axes)
-        for column, name in enumerate(AXES):
-            axis = motion.axes[name]
-            measured = measured_phase_error(errors, column, axis, corrected.axes[name])
-            times = posterior_times(axis, measured[0])
-            sense_sd = np.interp(times, axis.time, axis.phase_sd)
-            estimate = estimate_readout_phase(*measured, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
+        estimates = average_jointly(_weigh_axes(motion, corrected, errors, set(AXES) - refuted))
+        for name in AXES:
+            axis, estimate = motion.axes[name], estimates.get(name)
             if estimate is not None:
                 axes[name] = advance_axis(axis, estimate)
                 moved = axes[name].phase - corrected.axes[name].phase
@@ -208,6 +87,28 @@ def remove_readout_phase(
             break
         errors = register(corrected)
     return corrected, _errors_after(errors, before, corrected), found
+
+
+def _weigh_axes(
+    motion: Motion, corrected: Motion, errors: Sequence[PhaseError], names: Set[str]
+) -> dict[str, Hypotheses]:
+    """Hypotheses on the phase errors of axes of ``motion``, without the axes of which the picture determines none.
+
+    Args:
+        motion, corrected: before and after a correction.
+        errors: of the corrected motion.
+        names: of the axes.
+    """
+    found = {}
+    for name in names:
+        axis = motion.axes[name]
+        measured = measured_phase_error(errors, AXES.index(name), axis, corrected.axes[name])
+        times = posterior_times(axis, measured[0])
+        sense_sd = np.interp(times, axis.time, axis.phase_sd)
+        hypotheses = weigh_hypotheses(*measured, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
+        if hypotheses is not None:
+            found[name] = hypotheses
+    return found
 
 
 def measured_phase_error(
@@ -276,12 +177,24 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
         )
     delay = common_delay(motion, found) if late else None
     if delay is not None:
-        pole = f" or a pole near {1e-3 / (2.0 * np.pi * delay):.2g} kHz" if delay > 0.0 else ""
-        notes.append(
-            f"a delay of {1e6 * delay:.2g} µs{pole} in the readout would explain the error of both axes; "
-            "run `lissajous diagnose`"
-        )
+        notes.append(_describe_delay(delay, motion.estimator))
     return notes
+
+
+def _describe_delay(delay: float, estimator: str) -> str:
+    """The line on a delay [s] of the motion's signal that explains the phase errors of both axes.
+
+    No signal comes before the motion, so that a negative delay is one of the intensity, or of its clock.
+    """
+    if delay < 0.0:
+        return (
+            f"an intensity that is {-1e6 * delay:.2g} µs late (detector, amplifier, start of the channel) would "
+            "explain the error of both axes: positions in the picture are right, and the motion is late by this time"
+        )
+    pole = f"a delay of {1e6 * delay:.2g} µs or a pole near {1e-3 / (2.0 * np.pi * delay):.2g} kHz in the "
+    if estimator == "tracker":
+        return pole + "readout would explain the error of both axes; run `lissajous diagnose`"
+    return pole + "position detectors would explain the error of both axes; state their channels' start earlier by it"
 
 
 def _sd_as_stated(axis: AxisMotion) -> float:

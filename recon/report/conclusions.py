@@ -18,6 +18,9 @@ the samples is not visible."""
 MIN_READOUT_ERROR_SD = 3.0
 """Phase error of the readout in standard deviations from which it is stated: chance exceeds it in 0.3 % of readouts."""
 
+SIGNALS_BY_ESTIMATOR = {"sensor": "position signal is", "edges": "list of sync edges is"}
+"""The signal that an estimator takes the phase from, where it is not the sense signal."""
+
 SUFFICIENT_FILL = 0.9
 """Fraction of visited pixels below which a longer recording or fewer pixels are advised. Isolated holes up to this
 number are filled from their neighbours without visible loss."""
@@ -66,7 +69,8 @@ def _describe_readout_phase(summary: Mapping[str, Any]) -> str:
             late.append(f"{format_uncertain(abs(error['value']), error['sd'], '°')} {word} in {axis}")
     if not late:
         return ""
-    return f"The sense signal is {' and '.join(late)}; the picture was used instead. "
+    signal = SIGNALS_BY_ESTIMATOR.get(summary["estimator"], "sense signal is")
+    return f"The {signal} {' and '.join(late)}; the picture was used instead. "
 
 
 def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] | None = None) -> str:

@@ -8,7 +8,7 @@ import pytest
 from estimation.tracker import track
 from recon.imaging.bidirectional_phase import PhaseError, PhaseErrorParts, PhaseEstimate
 from recon.imaging.carried_readout_phase import CHANGE_SD_RAD, apply_readout_phase, update_readout_phase
-from recon.imaging.readout_phase import ReadoutPhase
+from recon.imaging.readout_phase_model import ReadoutPhase
 from scanner.motion import Motion
 from tests.support.simulated import imaging
 

@@ -13,7 +13,8 @@ from phantoms.optics import Detector, detect, sample_scene
 from phantoms.targets import make_target
 from recon.evaluation import truth_from_simulation
 from recon.imaging.bidirectional_phase import PhaseError, PhaseErrorParts, PhaseEstimate
-from recon.imaging.readout_phase import correlate_matern32, estimate_readout_phase, remove_readout_phase
+from recon.imaging.readout_phase import remove_readout_phase
+from recon.imaging.readout_phase_model import ReadoutPhase, average_jointly, correlate_matern32, weigh_hypotheses
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
 from recon.report.summary import summarise
@@ -29,6 +30,13 @@ def measured(truth: np.ndarray, sd: float, rng: np.random.Generator) -> tuple[np
     return np.interp(TIME_S, POSTERIOR_TIME_S, truth) + rng.normal(0.0, sd, TIME_S.size), np.full(TIME_S.size, sd)
 
 
+def estimated(value: np.ndarray, sd: np.ndarray, at: np.ndarray, sense_sd: float = 0.0) -> ReadoutPhase:
+    """Posterior of one axis by its measurements at ``TIME_S``."""
+    hypotheses = weigh_hypotheses(TIME_S, value, sd, at, sense_sd)
+    assert hypotheses is not None
+    return hypotheses.average()
+
+
 @pytest.mark.parametrize("kind", ["as stated", "constant", "drifting"])
 def test_intervals_have_their_nominal_coverage(kind: str) -> None:
     rng = np.random.default_rng(5)
@@ -40,8 +48,7 @@ def test_intervals_have_their_nominal_coverage(kind: str) -> None:
         if kind == "drifting":
             covariance = np.radians(0.1) ** 2 * correlate_matern32(POSTERIOR_TIME_S[:, None] - POSTERIOR_TIME_S, 5e-3)
             truth += rng.multivariate_normal(np.zeros(POSTERIOR_TIME_S.size), covariance)
-        posterior = estimate_readout_phase(TIME_S, *measured(truth, np.radians(0.03), rng), POSTERIOR_TIME_S)
-        assert posterior is not None
+        posterior = estimated(*measured(truth, np.radians(0.03), rng), POSTERIOR_TIME_S)
         error = posterior.mean - truth
         covered.append(np.abs(error) < 1.96 * np.sqrt(posterior.variance))
         variances.append(posterior.variance)
@@ -63,8 +70,7 @@ def test_the_picture_reduces_the_random_error_of_the_estimator() -> None:
     for _ in range(40):
         truth = sense_sd * rng.multivariate_normal(np.zeros(POSTERIOR_TIME_S.size), correlation)
         data = measured(truth, np.radians(0.03), rng)
-        posterior = estimate_readout_phase(TIME_S, *data, POSTERIOR_TIME_S, sense_sd)
-        assert posterior is not None
+        posterior = estimated(*data, POSTERIOR_TIME_S, sense_sd)
         errors.append(posterior.mean - truth)
         stated.append(np.sqrt(posterior.variance))
         values.append(posterior.value / posterior.sd)
@@ -76,27 +82,39 @@ def test_the_picture_reduces_the_random_error_of_the_estimator() -> None:
 def test_a_large_constant_is_found_to_the_precision_of_the_mean() -> None:
     rng = np.random.default_rng(2)
     truth = np.full(POSTERIOR_TIME_S.size, np.radians(5.0))
-    posterior = estimate_readout_phase(TIME_S, *measured(truth, np.radians(0.03), rng), POSTERIOR_TIME_S)
-    assert posterior is not None
+    posterior = estimated(*measured(truth, np.radians(0.03), rng), POSTERIOR_TIME_S)
     assert posterior.sd == pytest.approx(np.radians(0.03) / np.sqrt(TIME_S.size), rel=0.5)
     assert abs(posterior.value - truth[0]) < 3.0 * posterior.sd
 
 
 def test_without_measurements_there_is_no_estimate() -> None:
     nothing = np.full(TIME_S.size, np.nan), np.full(TIME_S.size, np.inf)
-    assert estimate_readout_phase(TIME_S, *nothing, POSTERIOR_TIME_S) is None
+    assert weigh_hypotheses(TIME_S, *nothing, POSTERIOR_TIME_S) is None
 
 
 def test_the_estimate_returns_to_the_constant_away_from_the_measurements() -> None:
     rng = np.random.default_rng(3)
     value, sd = measured(np.full(POSTERIOR_TIME_S.size, np.radians(1.0)), np.radians(0.03), rng)
     late = POSTERIOR_TIME_S + 10.0
-    posterior = estimate_readout_phase(TIME_S, value, sd, late)
-    assert posterior is not None
+    posterior = estimated(value, sd, late)
     np.testing.assert_allclose(posterior.mean, np.radians(1.0), atol=np.radians(0.03))
-    inside = estimate_readout_phase(TIME_S, value, sd, POSTERIOR_TIME_S)
-    assert inside is not None
+    inside = estimated(value, sd, POSTERIOR_TIME_S)
     assert posterior.variance.mean() >= inside.variance.mean()
+
+
+def test_an_axis_measured_well_narrows_the_intervals_of_the_other_one_if_its_readout_does_not_drift() -> None:
+    rng = np.random.default_rng(4)
+    still = np.zeros(POSTERIOR_TIME_S.size)
+    drift = np.radians(0.3) * np.sin(2.0 * np.pi * POSTERIOR_TIME_S / 0.03)
+    stated = {"still": [], "drifting": []}  # of y, whose readout does not drift, over that without x
+    for _ in range(10):
+        y = weigh_hypotheses(TIME_S, *measured(still, np.radians(0.1), rng), POSTERIOR_TIME_S, np.radians(0.01))
+        for kind, truth in (("still", still), ("drifting", drift)):
+            x = weigh_hypotheses(TIME_S, *measured(truth, np.radians(0.01), rng), POSTERIOR_TIME_S, np.radians(0.01))
+            assert x is not None
+            assert y is not None
+            stated[kind].append(np.mean(average_jointly({"x": x, "y": y})["y"].variance / y.average().variance))
+    assert max(stated["still"]) < 1.0 < min(stated["drifting"])
 
 
 def delayed(sense: np.ndarray) -> np.ndarray:
