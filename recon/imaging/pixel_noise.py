@@ -75,7 +75,7 @@ def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> S
 
 
 def _fit_line(level: Array, found: Array, sd: Array) -> tuple[float, float]:
-    """Floor and slope, neither negative, of variances ``found`` with the standard deviations ``sd``, each of shape (n,)."""
+    """Floor and slope, neither negative, of the variances ``found``; ``sd``: of these. All have the shape (n,)."""
     (floor, slope), _ = nnls(np.column_stack([np.ones_like(level), level]) / sd[:, None], found / sd)
     return float(floor), float(slope)
 
