@@ -78,8 +78,11 @@ narrower: gaps between the lines of a scan are seldom wider."""
 MIN_STATIONARY_WEIGHT = 0.05
 """Weight of the picture under the stationary prior below which it is left out: it gains less than 1 %."""
 
-COARSE_TOLERANCE, FINE_TOLERANCE = 0.1, 0.02
+COARSE_TOLERANCE, FINE_TOLERANCE = 0.15, 0.03
 """Relative residuals of the solutions: for the comparison of strengths, and for the picture."""
+
+STATIONARY_COARSE_TOLERANCE = 0.05
+"""The same for the comparison with the picture under the stationary prior, in the norm of its preconditioner."""
 
 
 def posterior_picture(samples: SplitSums, noise: SampleNoise, initial_strength: float | None = None) -> PictureEstimate:
@@ -145,7 +148,9 @@ def _add_stationary(
     """
     kept, kept_counts = pixel_means(samples.kept_sums, samples.kept_counts), samples.kept_counts
     scene_mean = float(samples.kept_sums.sum() / kept_counts.sum())
-    stationary = stationary_mean(kept, kept_counts * precision, spectrum, scene_mean)
+    stationary = stationary_mean(
+        kept, kept_counts * precision, spectrum, scene_mean, tolerance=STATIONARY_COARSE_TOLERANCE
+    )
     difference = stationary - mean
     residual = pixel_means(samples.held_sums, samples.held_counts) - mean
     scale = float(np.vdot(judged * difference, difference))
