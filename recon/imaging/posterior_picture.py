@@ -81,6 +81,9 @@ MIN_STATIONARY_WEIGHT = 0.05
 COARSE_TOLERANCE, FINE_TOLERANCE = 0.15, 0.03
 """Relative residuals of the solutions: for the comparison of strengths, and for the picture."""
 
+MAX_ITERATIONS = 8
+"""Iterations of a solution at most. With 40, four scenes change by 0.01 dB, and one takes 1.2 times as long."""
+
 STATIONARY_COARSE_TOLERANCE = 0.05
 """The same for the comparison with the picture under the stationary prior, in the norm of its preconditioner."""
 
@@ -204,7 +207,7 @@ def _posterior_means(
     level = np.float32(np.vdot(precision, means) / precision.sum())
     scaled = (_bordered(precision)[..., None] / strengths).astype(np.float32)
     data = _bordered(means - level).astype(np.float32)[..., None] * scaled
-    return solve(stencil, scaled, data, start - level, tolerance) + level
+    return solve(stencil, scaled, data, start - level, tolerance, MAX_ITERATIONS) + level
 
 
 def _mean_over_pixel(image: Array) -> Array:
