@@ -84,9 +84,6 @@ COARSE_TOLERANCE, FINE_TOLERANCE = 0.15, 0.03
 MAX_ITERATIONS = 8
 """Iterations of a solution at most. With 40, four scenes change by 0.01 dB, and one takes 1.2 times as long."""
 
-STATIONARY_COARSE_TOLERANCE = 0.05
-"""The same for the comparison with the picture under the stationary prior, in the norm of its preconditioner."""
-
 
 def posterior_picture(samples: SplitSums, noise: SampleNoise, initial_strength: float | None = None) -> PictureEstimate:
     """Return the posterior mean of the scene and its standard deviation.
@@ -151,9 +148,7 @@ def _add_stationary(
     """
     kept, kept_counts = pixel_means(samples.kept_sums, samples.kept_counts), samples.kept_counts
     scene_mean = float(samples.kept_sums.sum() / kept_counts.sum())
-    stationary = stationary_mean(
-        kept, kept_counts * precision, spectrum, scene_mean, tolerance=STATIONARY_COARSE_TOLERANCE
-    )
+    stationary = stationary_mean(kept, kept_counts * precision, spectrum, scene_mean)
     difference = stationary - mean
     residual = pixel_means(samples.held_sums, samples.held_counts) - mean
     scale = float(np.vdot(judged * difference, difference))

@@ -80,30 +80,54 @@ def measure_scale(samples: SplitSums, mean: Array, precision: Array, predicted: 
     """
     scale = np.exp(LOG_SCALES)
     log_density = -0.5 * ((LOG_SCALES - np.log(expected)) / PRIOR_LOG_SD) ** 2
-    used = (samples.held_counts > 0) & (samples.kept_counts == 0)
+    weights = _representative_weights(samples)
+    used = weights > 0
     if used.any():
         residual = (pixel_means(samples.held_sums, samples.held_counts) - mean)[used]
         noise, variance = 1.0 / (samples.held_counts * precision)[used], predicted[used]
-        weight = 1.0 / (smooth(samples.counts, DENSITY_WIDTH_PX)[used] * (noise + expected * variance))
-        found = weight @ (residual**2 - noise) / (weight @ variance)
-        scatter = [weight * noise, CORRELATED_ERRORS * weight * variance]
+        own = 1.0 + (samples.kept_counts * precision)[used] * expected * variance
+        slope = variance / own**2
+        weight = weights[used] / (own**2 * (noise + expected * variance))
+        total = weight @ slope
+        found = expected + weight @ (residual**2 - noise - expected * variance / own) / total
+        scatter = [weight * noise, CORRELATED_ERRORS * weight * variance / own]
         of_noise, cross, of_errors = 2.0 * np.array([scatter[i] @ scatter[j] for i, j in ((0, 0), (0, 1), (1, 1))])
-        spread = (of_noise + scale * (2.0 * cross + scale * of_errors)) / (weight @ variance) ** 2
+        spread = (of_noise + scale * (2.0 * cross + scale * of_errors)) / total**2
         log_density -= 0.5 * ((found - scale) ** 2 / spread + np.log(spread))
     density = np.exp(log_density - log_density.max())
     return float(np.exp(density @ LOG_SCALES / density.sum()))
 
 
+def _representative_weights(samples: SplitSums) -> Array:
+    """Weight of each held-out pixel, 0 in others, by which they represent the area of the picture.
+
+    Pixels with and without further samples count as visited and unvisited pixels of the picture, and within each of the
+    two by the inverse density of the scan.
+    """
+    area = 1.0 / np.maximum(smooth(samples.counts, DENSITY_WIDTH_PX), np.finfo(np.float32).tiny)
+    weights = np.zeros(area.shape)
+    for in_held, in_picture in (
+        (samples.kept_counts > 0, samples.counts > 0),
+        (samples.kept_counts == 0, samples.counts == 0),
+    ):
+        part = in_held & (samples.held_counts > 0)
+        weights[part] = in_picture.mean() * area[part] / max(area[part].sum(), 1e-300)
+    return weights
+
+
 def variance_at_centres(variance: Array, data: Array, detail: CentreDetail) -> tuple[Array, Array]:
     """Return the variance of a picture at the pixels' centres, and the weight of a pixel's own samples in its value.
 
-    The picture is the mean of the neighbours' prediction and of the pixel's own samples. It is the best estimate of the
-    samples' expectation, from which the value at the centre deviates.
+    The picture is the posterior mean m of the expectation of a pixel's samples. Given all samples, let that have the
+    variance v, the value c at the centre R v, and both the covariance C v. Without the pixel's own samples, v is larger
+    by 1 / (1 - share), and the best estimate of c moves by C times as much as m for them. The error of m as an estimate
+    of c follows, except for the difference of the two that other pixels determine.
 
     Args:
-        variance: of the expectation of a pixel's samples, given all samples but these.
+        variance: of the expectation, given all samples but those of the pixel.
         data: precision of the mean of the pixel's samples, 0 without.
-        detail: at the centres relative to the expectation of the samples.
+        detail: R and C.
     """
     share = data * variance / (1.0 + data * variance)
-    return variance * np.maximum(detail.variance - share * (2.0 * detail.covariance - 1.0), 0.0), share
+    ratio = detail.variance * (1.0 - share) + share * (detail.covariance - 1.0) ** 2
+    return variance * ratio, share

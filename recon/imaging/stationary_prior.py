@@ -62,12 +62,7 @@ def fit_spectrum(scene: SceneCovariance) -> Array:
 
 
 def stationary_mean(
-    means: Array,
-    precision: Array,
-    spectrum: Array,
-    scene_mean: float,
-    start: Array | None = None,
-    tolerance: float = TOLERANCE,
+    means: Array, precision: Array, spectrum: Array, scene_mean: float, start: Array | None = None
 ) -> Array:
     """Return the posterior mean of the scene, shape (height, width).
 
@@ -79,7 +74,6 @@ def stationary_mean(
         spectrum: from :func:`fit_spectrum`.
         scene_mean: prior mean.
         start: a similar solution of the same spectrum, with which the iteration begins.
-        tolerance: of the residual, relative, in the norm of the preconditioner.
     """
     root, data = np.sqrt(spectrum).astype(np.float32), precision.astype(np.float32)
     inverse = (1.0 / (1.0 + spectrum * precision.mean())).astype(np.float32)
@@ -91,7 +85,7 @@ def stationary_mean(
         return np.asarray(fft.idctn(root * modes, norm="ortho", overwrite_x=True))
 
     residual = to_modes(data * (means - scene_mean).astype(np.float32))
-    target = tolerance**2 * float(np.vdot(residual, inverse * residual))
+    target = TOLERANCE**2 * float(np.vdot(residual, inverse * residual))
     solution = np.zeros_like(residual)
     if start is not None:
         solution = fft.dctn((start - scene_mean).astype(np.float32), norm="ortho") / root

@@ -8,7 +8,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from recon.imaging.held_out import SplitSums
-from recon.imaging.pixel_noise import SampleNoise
+from recon.imaging.pixel_noise import SampleNoise, measure_sample_noise
 from recon.imaging.posterior_picture import posterior_picture
 from recon.imaging.posterior_sd import PRIOR_LOG_SD, measure_scale, variance_at_centres
 from recon.imaging.scene_covariance import measure_covariance, unresolved_variance
@@ -64,10 +64,13 @@ def test_the_dense_part_of_a_scan_does_not_determine_the_scale_alone() -> None:
 def test_the_variance_at_centres_is_that_of_correlated_normal_numbers() -> None:
     """Expectation of the samples and value at the centre are drawn together; the picture estimates the former."""
     variance, precision, detail = 2.0, 1.5, CentreDetail(1.6, 1.2)
-    covariance = variance * np.array([[1.0, detail.covariance], [detail.covariance, detail.variance]])
+    found, share = variance_at_centres(np.array(variance), np.array(precision), detail)
+    left = variance / (1.0 + variance * precision)  # given the pixel's own samples too
+    assert share == pytest.approx(precision * left)
+    without_own = detail.variance * left + share * variance * detail.covariance**2
+    covariance = [[variance, detail.covariance * variance], [detail.covariance * variance, without_own]]
     rng = np.random.default_rng(2)
     expectation, centre = rng.multivariate_normal([0.0, 0.0], covariance, 200_000).T
-    found, share = variance_at_centres(np.array(variance), np.array(precision), detail)
     picture = share * (expectation + rng.normal(scale=precision**-0.5, size=expectation.size))
     assert np.mean((picture - centre) ** 2) == pytest.approx(float(found), rel=0.02)
     unvisited, no_share = variance_at_centres(np.array(variance), np.array(0.0), detail)
@@ -106,7 +109,9 @@ def test_intervals_of_a_texture_as_fine_as_the_pixels_hold_the_centres() -> None
         return [each.reshape(SIZE, SIZE).astype(float) for each in sums]
 
     samples = SplitSums(*images(slice(None)), *images(slice(0, None, 10)))
-    estimate = posterior_picture(samples, SampleNoise(noise_sd**2, 0.0, 0.0))
+    noise = measure_sample_noise(pixel, values)
+    assert noise is not None
+    estimate = posterior_picture(samples, noise)
     inside = np.abs(estimate.image - scene) < 1.96 * estimate.sd
     for part in (samples.counts > 0, samples.counts == 0):
         assert 0.93 < inside[part].mean() < 0.97
