@@ -186,7 +186,7 @@ def _weights(covariance: Array, power: float) -> tuple[Array, Array, Array]:
         return np.ones_like(xx), np.zeros_like(xx), np.ones_like(xx)
     centre, difference = half_trace + added, 0.5 * (xx - yy)
     radius = np.hypot(difference, xy)
-    large, small = (centre + radius) ** -power, np.maximum(centre - radius, 0.5 * added) ** -power
+    large, small = (1.0 / (centre + radius)) ** power, (1.0 / np.maximum(centre - radius, 0.5 * added)) ** power
     mean, slope = 0.5 * (large + small), 0.5 * (large - small) / np.maximum(radius, 1e-12 * centre)
     scale = np.exp(-0.5 * np.mean(np.log(large * small)))
     return scale * (mean + slope * difference), scale * slope * xy, scale * (mean - slope * difference)

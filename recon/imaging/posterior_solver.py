@@ -57,70 +57,65 @@ def build_stencil(xx, xy, yy):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, forceinline=True, fastmath=True)
-def _set_before(stencil, x, i, j, total):  # type: ignore[no-untyped-def]
-    """Set ``total`` to the couplings of a pixel to its four neighbours that come before it in the order of a sweep."""
-    left, above = stencil[1, i, j - 1], stencil[2, i - 1, j]
-    above_left, above_right = stencil[3, i - 1, j - 1], stencil[4, i - 1, j + 1]
+def _add_coupled(stencil, x, i, j, total):  # type: ignore[no-untyped-def]
+    """Set ``total`` to the couplings of a pixel to its eight neighbours."""
+    c0, c1, c2, c3 = stencil[1, i, j], stencil[1, i, j - 1], stencil[2, i, j], stencil[2, i - 1, j]
+    c4, c5, c6, c7 = stencil[3, i, j], stencil[3, i - 1, j - 1], stencil[4, i, j], stencil[4, i - 1, j + 1]
     for k in range(LANES):
         total[k] = (
-            left * x[i, j - 1, k]
-            + above * x[i - 1, j, k]
-            + above_left * x[i - 1, j - 1, k]
-            + above_right * x[i - 1, j + 1, k]
-        )
-
-
-@numba.njit(cache=True, forceinline=True, fastmath=True)
-def _set_after(stencil, x, i, j, total):  # type: ignore[no-untyped-def]
-    """Set ``total`` to the couplings of a pixel to its four neighbours that come after it."""
-    right, below, below_right, below_left = stencil[1, i, j], stencil[2, i, j], stencil[3, i, j], stencil[4, i, j]
-    for k in range(LANES):
-        total[k] = (
-            right * x[i, j + 1, k]
-            + below * x[i + 1, j, k]
-            + below_right * x[i + 1, j + 1, k]
-            + below_left * x[i + 1, j - 1, k]
+            c0 * x[i, j + 1, k]
+            + c2 * x[i + 1, j, k]
+            + c3 * x[i - 1, j, k]
+            + c4 * x[i + 1, j + 1, k]
+            + c5 * x[i - 1, j - 1, k]
+            + c6 * x[i + 1, j - 1, k]
+            + c7 * x[i - 1, j + 1, k]
+            + c1 * x[i, j - 1, k]
         )
 
 
 @numba.njit(cache=True, fastmath=True)
 def multiply(stencil, precision, x, out):  # type: ignore[no-untyped-def]
     """Write (prior + data precision) x into ``out``."""
-    before, after = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    total = np.empty(LANES, np.float32)
     for i in range(1, x.shape[0] - 1):
         for j in range(1, x.shape[1] - 1):
-            _set_before(stencil, x, i, j, before)
-            _set_after(stencil, x, i, j, after)
+            _add_coupled(stencil, x, i, j, total)
             own = stencil[0, i, j]
             for k in range(LANES):
-                out[i, j, k] = before[k] + after[k] + (own + precision[i, j, k]) * x[i, j, k]
-
-
-@numba.njit(cache=True, fastmath=True)
-def _relax_from_zero(stencil, inverse, b):  # type: ignore[no-untyped-def]
-    """Return the result of a forward Gauss-Seidel sweep that begins at zero; ``inverse``: of the diagonal."""
-    x, total = np.zeros_like(b), np.empty(LANES, np.float32)
-    for i in range(1, x.shape[0] - 1):
-        for j in range(1, x.shape[1] - 1):
-            _set_before(stencil, x, i, j, total)
-            for k in range(LANES):
-                x[i, j, k] = (b[i, j, k] - total[k]) * inverse[i, j, k]
-    return x
+                out[i, j, k] = total[k] + (own + precision[i, j, k]) * x[i, j, k]
 
 
 @numba.njit(cache=True, fastmath=True)
 def _relax(stencil, inverse, b, x, forward):  # type: ignore[no-untyped-def]
     """One Gauss-Seidel sweep; ``inverse``: of the diagonal."""
-    before, after = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    total = np.empty(LANES, np.float32)
     height, width = x.shape[0], x.shape[1]
     for row in range(1, height - 1):
         i = row if forward else height - 1 - row
         for column in range(1, width - 1):
             j = column if forward else width - 1 - column
-            _set_before(stencil, x, i, j, before)
-            _set_after(stencil, x, i, j, after)
+            _add_coupled(stencil, x, i, j, total)
             for k in range(LANES):
-                x[i, j, k] = (b[i, j, k] - before[k] - after[k]) * inverse[i, j, k]
+                x[i, j, k] = (b[i, j, k] - total[k]) * inverse[i, j, k]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _relax_from_zero(stencil, inverse, b):  # type: ignore[no-untyped-def]
+    """Return the result of a forward Gauss-Seidel sweep that begins at zero; ``inverse``: of the diagonal."""
+    x = np.zeros_like(b)
+    for i in range(1, x.shape[0] - 1):
+        for j in range(1, x.shape[1] - 1):
+            c1, c3, c5, c7 = (
+                stencil[1, i, j - 1],
+                stencil[2, i - 1, j],
+                stencil[3, i - 1, j - 1],
+                stencil[4, i - 1, j + 1],
+            )
+            for k in range(LANES):
+                coupled = c3 * x[i - 1, j, k] + c5 * x[i - 1, j - 1, k] + c7 * x[i - 1, j + 1, k] + c1 * x[i, j - 1, k]
+                x[i, j, k] = (b[i, j, k] - coupled) * inverse[i, j, k]
+    return x
 
 
 @numba.njit(cache=True)
@@ -170,12 +165,12 @@ def _residual_blocks(stencil, x):  # type: ignore[no-untyped-def]
     """
     height, width = x.shape[0] - 2, x.shape[1] - 2
     coarse = np.zeros(((height + 1) // 2 + 2, (width + 1) // 2 + 2, LANES), np.float32)
-    total = np.empty(LANES, np.float32)
     for i in range(1, height + 1):
         for j in range(1, width + 1):
-            _set_after(stencil, x, i, j, total)
+            c0, c2, c4, c6 = stencil[1, i, j], stencil[2, i, j], stencil[3, i, j], stencil[4, i, j]
             for k in range(LANES):
-                coarse[(i + 1) // 2, (j + 1) // 2, k] -= total[k]
+                coupled = c0 * x[i, j + 1, k] + c2 * x[i + 1, j, k] + c4 * x[i + 1, j + 1, k] + c6 * x[i + 1, j - 1, k]
+                coarse[(i + 1) // 2, (j + 1) // 2, k] -= coupled
     return coarse
 
 
