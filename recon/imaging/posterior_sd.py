@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.imaging.held_out import SplitSums, pixel_means
+from recon.imaging.held_out import CORRELATED_ERRORS, LOG_SCALES, SplitSums, pixel_means, scale_with_prior
 from recon.imaging.kernel_picture import smooth
 from recon.imaging.posterior_solver import LANES, build_stencil, draw_noise, multiply, solve
 from recon.imaging.stationary_prior import CentreDetail
@@ -31,12 +31,6 @@ DRAW_TOLERANCE = 0.1
 PRIOR_LOG_SD = 0.4
 """Standard deviation of the logarithm of a picture's variance about that of the fitted covariance. It was 0.4 to 0.5 in
 ten scenes with 10 photons a sample."""
-
-CORRELATED_ERRORS = 2.0
-"""Factor on the scatter of the squared errors: those of neighbouring held-out pixels are similar."""
-
-LOG_SCALES = np.linspace(-6.0, 7.0, 521)
-"""Logarithms of the scales of the variance that are compared."""
 
 DENSITY_WIDTH_PX = 8.0
 """Window in which the density of the scan is measured [px]."""
@@ -78,24 +72,20 @@ def measure_scale(samples: SplitSums, mean: Array, precision: Array, predicted: 
         predicted: variance of each pixel given all samples but its own.
         expected: factor by the covariance of the scene.
     """
-    scale = np.exp(LOG_SCALES)
-    log_density = -0.5 * ((LOG_SCALES - np.log(expected)) / PRIOR_LOG_SD) ** 2
     weights = _representative_weights(samples)
     used = weights > 0
-    if used.any():
-        residual = (pixel_means(samples.held_sums, samples.held_counts) - mean)[used]
-        noise, variance = 1.0 / (samples.held_counts * precision)[used], predicted[used]
-        own = 1.0 + (samples.kept_counts * precision)[used] * expected * variance
-        slope = variance / own**2
-        weight = weights[used] / (own**2 * (noise + expected * variance))
-        total = weight @ slope
-        found = expected + weight @ (residual**2 - noise - expected * variance / own) / total
-        scatter = [weight * noise, CORRELATED_ERRORS * weight * variance / own]
-        of_noise, cross, of_errors = 2.0 * np.array([scatter[i] @ scatter[j] for i, j in ((0, 0), (0, 1), (1, 1))])
-        spread = (of_noise + scale * (2.0 * cross + scale * of_errors)) / total**2
-        log_density -= 0.5 * ((found - scale) ** 2 / spread + np.log(spread))
-    density = np.exp(log_density - log_density.max())
-    return float(np.exp(density @ LOG_SCALES / density.sum()))
+    if not used.any():
+        return expected
+    residual = (pixel_means(samples.held_sums, samples.held_counts) - mean)[used]
+    noise, variance = 1.0 / (samples.held_counts * precision)[used], predicted[used]
+    own = 1.0 + (samples.kept_counts * precision)[used] * expected * variance
+    weight = weights[used] / (own**2 * (noise + expected * variance))
+    slope = weight @ (variance / own**2)
+    found = expected + weight @ (residual**2 - noise - expected * variance / own) / slope
+    of_noise, of_errors = weight * noise, CORRELATED_ERRORS * weight * variance / own
+    scale = np.exp(LOG_SCALES)
+    squares = of_noise @ of_noise + scale * (2.0 * of_noise @ of_errors + scale * (of_errors @ of_errors))
+    return scale_with_prior(float(found), 2.0 * squares / slope**2, expected, PRIOR_LOG_SD)
 
 
 def _representative_weights(samples: SplitSums) -> Array:
