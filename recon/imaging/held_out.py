@@ -28,6 +28,12 @@ MAX_WEIGHT = 10.0
 GOLDEN_RATIO = 0.618
 """Step of the segments' position within their part of the scan, which no period of the scan is in step with."""
 
+CORRELATED_ERRORS = 2.0
+"""Factor on the scatter of squared errors. Those of neighbouring held-out pixels are similar; their noise is not."""
+
+LOG_SCALES = np.linspace(-6.0, 7.0, 521)
+"""Logarithms of the scales of a variance that are compared."""
+
 
 class SplitSums(NamedTuple):
     """Samples of one detector by pixel.
@@ -122,5 +128,20 @@ def excess_variance(residual: Array, noise: Array, predicted: Array, weight: Arr
     """
     total = weight @ predicted
     ratio = float(weight @ (residual**2 - noise) / total)
-    scatter = 2.0 * weight * (noise + max(ratio, 0.5) * predicted)  # twice: neighbours in a segment err together
-    return ratio, float(np.sqrt(scatter @ scatter) / total)
+    scatter = weight * (noise + CORRELATED_ERRORS * max(ratio, 0.5) * predicted)
+    return ratio, float(np.sqrt(2.0 * scatter @ scatter) / total)
+
+
+def scale_with_prior(found: float, spread: Array | float, expected: float, log_sd: float) -> float:
+    """Return the scale of a variance from an estimate and a lognormal prior: the posterior mean of its logarithm.
+
+    Args:
+        found: estimate, which noise may make negative.
+        spread: variance of ``found`` for each of ``exp(LOG_SCALES)``, or the same for all.
+        expected: median of the prior.
+        log_sd: standard deviation of the logarithm in the prior.
+    """
+    log_density = -0.5 * ((LOG_SCALES - np.log(expected)) / log_sd) ** 2
+    log_density -= 0.5 * ((found - np.exp(LOG_SCALES)) ** 2 / spread + np.log(spread))
+    density = np.exp(log_density - log_density.max())
+    return float(np.exp(density @ LOG_SCALES / density.sum()))

@@ -33,9 +33,6 @@ MIN_WEIGHT = 1e-6
 PRIOR_SCALE = 1.0
 """Removed detail relative to the squared slope where no held-out sample measures it."""
 
-MIN_SCALE = 0.1
-"""Lower bound on the same where held-out samples measure it: any kernel removes some detail."""
-
 GLOBAL_FRACTION = 0.2
 """Fraction of the mean squared slope that is added everywhere: a flat part may hold detail that the kernel removed."""
 
@@ -136,8 +133,8 @@ def kernel_picture(samples: SplitSums, noise: SampleNoise, width: float | None =
         spread = of_samples / samples.held_counts[held] + of_samples * kept_squares[held] / kept_weight[held] ** 2
         residual = pixel_means(samples.held_sums, samples.held_counts)[held] - kept[held]
         removed = _slope_energy(kept, width)[held]
-        ratio, _ = excess_variance(residual, spread, removed, representative_weights(samples)[held])
-        scale = max(ratio, MIN_SCALE)
+        ratio, sd = excess_variance(residual, spread, removed, representative_weights(samples)[held])
+        scale = max(ratio, sd)
     sd = np.sqrt(variance + TAIL_FACTOR * scale * _slope_energy(image, width))
     share = np.divide(samples.counts * centre, weight, out=np.zeros(image.shape), where=reached)
     return PictureEstimate(np.where(reached, image, np.nan), np.where(reached, sd, np.nan), share, width)

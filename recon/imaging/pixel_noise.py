@@ -46,6 +46,10 @@ class SampleNoise(NamedTuple):
 def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> SampleNoise | None:
     """Noise of a sample from pairs of samples in one pixel; None without pairs.
 
+    The variance found at a level of intensity counts by its standard error: the scatter of the squared differences in
+    it, at least that of normal noise under a first fit. A standard error in proportion to the variance found itself
+    would favour the levels where it is too small by chance.
+
     Args:
         pixel: number of the pixel of each sample, negative outside the field, shape (n,).
         intensity: shape (n,); samples that are not finite are left out.
@@ -61,12 +65,19 @@ def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> S
     dark = float(mean.min())
     by_level = [part for part in np.array_split(np.argsort(mean), LEVELS) if part.size]
     level = np.array([mean[part].mean() - dark for part in by_level])
-    found = np.array([variance[part].mean() for part in by_level])
+    found, scatter = np.array([(variance[part].mean(), variance[part].std()) for part in by_level]).T
     if not found.any():
         return SampleNoise(0.0, 0.0, dark)
-    sd = np.maximum(found, found.mean() * 1e-6) / np.sqrt([part.size for part in by_level])
+    root = np.sqrt([part.size for part in by_level])
+    floor, slope = _fit_line(level, found, 1.0 / root)
+    normal_scatter = np.sqrt(2.0) * np.maximum(floor + slope * level, found.mean() * 1e-6)
+    return SampleNoise(*_fit_line(level, found, np.maximum(scatter, normal_scatter) / root), dark)
+
+
+def _fit_line(level: Array, found: Array, sd: Array) -> tuple[float, float]:
+    """Floor and slope, neither negative, of the variances ``found``; ``sd``: of these. All have the shape (n,)."""
     (floor, slope), _ = nnls(np.column_stack([np.ones_like(level), level]) / sd[:, None], found / sd)
-    return SampleNoise(float(floor), float(slope), dark)
+    return float(floor), float(slope)
 
 
 def measure_noise(

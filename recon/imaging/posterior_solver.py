@@ -100,6 +100,24 @@ def _relax(stencil, inverse, b, x, forward):  # type: ignore[no-untyped-def]
                 x[i, j, k] = (b[i, j, k] - total[k]) * inverse[i, j, k]
 
 
+@numba.njit(cache=True, fastmath=True)
+def _relax_from_zero(stencil, inverse, b):  # type: ignore[no-untyped-def]
+    """Return the result of a forward Gauss-Seidel sweep that begins at zero; ``inverse``: of the diagonal."""
+    x = np.zeros_like(b)
+    for i in range(1, x.shape[0] - 1):
+        for j in range(1, x.shape[1] - 1):
+            c1, c3, c5, c7 = (
+                stencil[1, i, j - 1],
+                stencil[2, i - 1, j],
+                stencil[3, i - 1, j - 1],
+                stencil[4, i - 1, j + 1],
+            )
+            for k in range(LANES):
+                coupled = c3 * x[i - 1, j, k] + c5 * x[i - 1, j - 1, k] + c7 * x[i - 1, j + 1, k] + c1 * x[i, j - 1, k]
+                x[i, j, k] = (b[i, j, k] - coupled) * inverse[i, j, k]
+    return x
+
+
 @numba.njit(cache=True)
 def _coarsen_stencil(stencil):  # type: ignore[no-untyped-def]
     """The stencil on blocks of 2 x 2 pixels."""
@@ -140,18 +158,19 @@ def _sum_blocks(fine):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, fastmath=True)
-def _residual_blocks(stencil, precision, b, x):  # type: ignore[no-untyped-def]
-    """Sums of the residual over blocks of 2 x 2 pixels."""
+def _residual_blocks(stencil, x):  # type: ignore[no-untyped-def]
+    """Sums over blocks of 2 x 2 pixels of the residual that a forward sweep from zero leaves.
+
+    A sweep satisfies the equation of each pixel with the values after it still zero: these alone are the residual.
+    """
     height, width = x.shape[0] - 2, x.shape[1] - 2
     coarse = np.zeros(((height + 1) // 2 + 2, (width + 1) // 2 + 2, LANES), np.float32)
-    total = np.empty(LANES, np.float32)
     for i in range(1, height + 1):
         for j in range(1, width + 1):
-            _add_coupled(stencil, x, i, j, total)
-            own = stencil[0, i, j]
+            c0, c2, c4, c6 = stencil[1, i, j], stencil[2, i, j], stencil[3, i, j], stencil[4, i, j]
             for k in range(LANES):
-                residual = b[i, j, k] - total[k] - (own + precision[i, j, k]) * x[i, j, k]
-                coarse[(i + 1) // 2, (j + 1) // 2, k] += residual
+                coupled = c0 * x[i, j + 1, k] + c2 * x[i + 1, j, k] + c4 * x[i + 1, j + 1, k] + c6 * x[i + 1, j - 1, k]
+                coarse[(i + 1) // 2, (j + 1) // 2, k] -= coupled
     return coarse
 
 
@@ -189,15 +208,15 @@ def _build_levels(stencil: Stencil, precision: Fields) -> list[Level]:
 
 def _cycle(levels: list[Level], b: Fields) -> Fields:
     """One V-cycle from zero: a symmetric approximation of the inverse."""
-    stencil, precision, inverse = levels[0]
-    x = np.zeros_like(b)
+    stencil, _, inverse = levels[0]
+    x = _relax_from_zero(stencil, inverse, b)
     if len(levels) == 1:
-        for _ in range(COARSEST_SWEEPS):
+        _relax(stencil, inverse, b, x, False)
+        for _ in range(COARSEST_SWEEPS - 1):
             _relax(stencil, inverse, b, x, True)
             _relax(stencil, inverse, b, x, False)
         return x
-    _relax(stencil, inverse, b, x, True)
-    _add_blocks(x, _cycle(levels[1:], _residual_blocks(stencil, precision, b, x)))
+    _add_blocks(x, _cycle(levels[1:], _residual_blocks(stencil, x)))
     _relax(stencil, inverse, b, x, False)
     return x
 

@@ -4,8 +4,7 @@ This is simple kriging. The prior of :mod:`recon.imaging.posterior_picture` know
 knows over which distances the scene is correlated, differently across and down. It serves textures, and scenes as
 smooth as the spot of a microscope.
 
-1. The covariance at each lag is the mean product of the pixels' deviations from the mean, over all pairs of visited
-   pixels at that lag. The noise of different pixels is independent, so it adds nothing.
+1. The covariance at each lag is measured from pairs of visited pixels (:mod:`recon.imaging.scene_covariance`).
 2. It is fitted by a sum of Gaussian covariances with non-negative variances, which is a valid covariance.
 3. The field has the type-2 cosine transform as modes, with the power spectrum of that sum. Conjugate gradients solve
    for its posterior mean.
@@ -15,25 +14,18 @@ Source: Cressie 1993, "Statistics for spatial data", chapters 2 and 3 (variogram
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.optimize import nnls
 
-from recon.imaging.held_out import pixel_means
+from recon.imaging.scene_covariance import SceneCovariance
 from scanner.arrays import Array
-
-MAX_LAG_PX = 24
-"""Largest lag at which the covariance is measured: gaps of a sparse frame are narrower [px]."""
 
 LENGTHS_PX = 2.0 ** np.arange(-0.5, 6.1, 0.75)
 """Correlation lengths of the Gaussian covariances, for each direction [px]: from less than a pixel to the width of a
 frame. Neighbours differ by a factor of 1.7, which their sums interpolate to a few percent."""
-
-MIN_PAIRS = 8.0
-"""Pairs of pixels below which a lag is left out."""
 
 RELATIVE_SPECTRUM_FLOOR = 1e-9
 """Least power of a mode, relative to the scene's variance: keeps the preconditioner finite."""
@@ -45,14 +37,26 @@ MAX_ITERATIONS = 40
 """Iterations after which the solution is used as it is."""
 
 
-def measure_spectrum(sums: Array, counts: Array) -> Array:
-    """Return the power spectrum of the scene by cosine mode, shape (height, width), in the square of its unit.
+class CentreDetail(NamedTuple):
+    """Unresolved detail at the pixels' centres, relative to that of the samples' means in the pixels.
 
-    Args:
-        sums, counts: of the samples by pixel, shape (height, width), at least one sample.
+    Attributes:
+        variance: at the centres.
+        covariance: of the centres with the means.
     """
-    variances = _fit_covariance(*_measure_covariance(sums, counts))
-    down, across = (_mode_powers(size) for size in sums.shape)
+
+    variance: float
+    covariance: float
+
+    def damped(self, weight: float) -> CentreDetail:
+        """Return the detail of a picture that follows the stationary prior with this weight, and has none otherwise."""
+        return CentreDetail(*(1.0 + weight * (each - 1.0) for each in self))
+
+
+def fit_spectrum(scene: SceneCovariance) -> Array:
+    """Return the power spectrum of the scene by cosine mode, shape (height, width), in the square of its unit."""
+    variances = _fit_covariance(scene)
+    down, across = (_mode_powers(size) for size in scene.shape)
     floor = max(RELATIVE_SPECTRUM_FLOOR * float(variances.sum()), float(np.finfo(np.float32).tiny))
     return np.asarray(down @ variances @ across.T + floor)
 
@@ -67,7 +71,7 @@ def stationary_mean(
     Args:
         means: of the samples by pixel; not used where ``precision`` is 0.
         precision: of ``means``.
-        spectrum: from :func:`measure_spectrum`.
+        spectrum: from :func:`fit_spectrum`.
         scene_mean: prior mean.
         start: a similar solution of the same spectrum, with which the iteration begins.
     """
@@ -101,52 +105,31 @@ def stationary_mean(
     return scene_mean + to_image(solution)
 
 
-def centre_variance_ratio(spectrum: Array, precision: float) -> float:
-    """Return the variance of unresolved detail at the pixels' centres over that of the samples' mean in the pixels.
+def measure_centre_detail(spectrum: Array, precision: float) -> CentreDetail:
+    """Return how much larger unresolved detail is at the pixels' centres than in the samples' means.
 
     Samples lie anywhere in a pixel. For a scene that is linear between the centres, their mean has the response
     3/4 + cos(k)/4 at wave number k in each direction: detail as fine as the pixels is larger at the centres.
 
     Args:
-        spectrum: from :func:`measure_spectrum`.
+        spectrum: from :func:`fit_spectrum`.
         precision: mean of that of the pixels; modes of more power than its inverse are resolved.
     """
     down, across = (0.75 + 0.25 * np.cos(np.pi * np.arange(size) / size) for size in spectrum.shape)
     unresolved = spectrum / (1.0 + spectrum * precision)
-    return float((unresolved / np.outer(down, across) ** 2).sum() / unresolved.sum())
+    of_means = float(unresolved.sum())
+    unresolved /= np.outer(down, across)
+    covariance = float(unresolved.sum()) / of_means
+    unresolved /= np.outer(down, across)
+    return CentreDetail(float(unresolved.sum()) / of_means, covariance)
 
 
-def _measure_covariance(sums: Array, counts: Array) -> tuple[Array, Array]:
-    """Covariance of the scene and number of pairs by lag, shape (lags down, lags across); lags of both signs as one."""
-    visited = counts > 0
-    deviation = np.where(visited, pixel_means(sums, counts) - sums.sum() / counts.sum(), 0.0)
-    lags = [min(MAX_LAG_PX, size - 1) + 1 for size in counts.shape]
-    shape = [fft.next_fast_len(size + lag, real=True) for size, lag in zip(counts.shape, lags, strict=True)]
-
-    def correlate(image: Array) -> Array:
-        full = fft.irfft2(np.abs(fft.rfft2(image, shape)) ** 2, shape)
-        return np.asarray((full + np.roll(full[::-1], 1, 0))[: lags[0], : lags[1]])
-
-    products, pairs = correlate(deviation), np.maximum(np.rint(correlate(visited.astype(float))), 0.0)
-    return np.divide(products, pairs, out=np.zeros_like(products), where=pairs > 0), pairs
-
-
-def _fit_covariance(covariance: Array, pairs: Array) -> Array:
-    """Variances of the Gaussian covariances, shape (lengths down, lengths across); lag 0, which has noise, is not used.
-
-    A lag counts by its number of pairs and the inverse square of its distance: the values near a pixel determine it.
-    All variances are 0 where no lag has enough pairs.
-    """
-    down, across = (np.arange(size)[:, None] for size in covariance.shape)
-    distance = np.hypot(down, across.T)
-    used = (pairs >= MIN_PAIRS) & (distance > 0) & (distance <= MAX_LAG_PX)
-    if not used.any():
-        return np.zeros((LENGTHS_PX.size, LENGTHS_PX.size))
+def _fit_covariance(scene: SceneCovariance) -> Array:
+    """Variances of the Gaussian covariances, shape (lengths down, lengths across)."""
+    down, across = (np.arange(size)[:, None] for size in scene.covariance.shape)
     shapes = [np.exp(-0.5 * (lag / LENGTHS_PX) ** 2) for lag in (down, across)]
-    basis = np.einsum("ip,jq->ijpq", *shapes)[used].reshape(np.count_nonzero(used), -1)
-    weight = np.sqrt(pairs[used]) / (1.0 + distance[used])
-    variances, _ = nnls(basis * weight[:, None], covariance[used] * weight, maxiter=30 * LENGTHS_PX.size**2)
-    return np.asarray(variances.reshape(LENGTHS_PX.size, -1))
+    basis = np.einsum("ip,jq->ijpq", *shapes).reshape(*scene.covariance.shape, -1)
+    return scene.fit(basis).reshape(LENGTHS_PX.size, -1)
 
 
 def _mode_powers(size: int) -> Array:

@@ -92,12 +92,13 @@ def test_intervals_hold_the_scene_in_visited_and_unvisited_pixels(kind: str) -> 
     scene = 20.0 * gaussian_filter(discs(), 1.0)
     for seed in range(3):
         estimated = estimate(kind, *scan(scene / 20.0, 20.0, 0.004, seed))
-        inside = np.abs(estimated.picture.image - scene) < 1.96 * estimated.sd
+        error = estimated.picture.image - scene
         visited = estimated.picture.coverage > 0
         for part in held:
-            held[part].append(float(inside[visited == part].mean()))
+            held[part].append(float(np.mean(np.abs(error) < 1.96 * estimated.sd, where=visited == part)))
+            assert rms(estimated.sd[visited == part]) < 2.0 * rms(error[visited == part])
     for part in held:
-        assert 0.88 < np.mean(held[part]) < 0.995
+        assert np.mean(held[part]) > 0.88
 
 
 def test_the_share_of_the_data_is_zero_where_no_sample_fell() -> None:
@@ -244,3 +245,13 @@ def test_drawn_noise_has_the_covariance_of_the_system() -> None:
     noise = np.concatenate(draws, axis=1)
     expected = dense_prior(weights, size) + np.diag(precision[1:-1, 1:-1, 0].ravel())
     assert np.abs(noise @ noise.T / noise.shape[1] - expected).max() < 0.05 * expected.max()
+
+
+def test_intervals_of_a_kernel_are_not_narrow_where_noise_hides_its_errors() -> None:
+    """Held-out samples of 2 photons may show less than no error by chance."""
+    scene = 2.0 * gaussian_filter(discs(), 2.0)
+    inside = []
+    for seed in range(8):
+        estimated = estimate("kernel", *scan(scene / 2.0, 2.0, 0.003, seed))
+        inside.append(float(np.mean(np.abs(estimated.picture.image - scene) < 1.96 * estimated.sd)))
+    assert min(inside) > 0.88

@@ -54,3 +54,16 @@ def test_the_noise_model_separates_photons_from_read_noise() -> None:
 
 def test_without_repeated_visits_there_is_no_noise_estimate() -> None:
     assert measure_sample_noise(np.arange(1000), np.ones(1000)) is None
+
+
+def test_the_noise_of_few_pairs_is_not_biased() -> None:
+    """Forty scenes with 1600 pairs each, 100 at a level of intensity."""
+    rng = np.random.default_rng(5)
+    pixel = np.tile(np.arange(1600), 2)
+    ratios = []
+    for _ in range(40):
+        level = rng.uniform(1.0, 10.0, 1600)
+        noise = measure_sample_noise(pixel, rng.poisson(level[pixel]).astype(float))
+        assert noise is not None
+        ratios.append(noise.variance(level).mean() / level.mean())
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.03)

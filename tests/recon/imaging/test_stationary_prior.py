@@ -10,7 +10,8 @@ from recon.imaging.held_out import SplitSums, pixel_means, representative_weight
 from recon.imaging.kernel_picture import find_reached, kernel_mean, smooth
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.posterior_picture import posterior_picture
-from recon.imaging.stationary_prior import centre_variance_ratio, measure_spectrum, stationary_mean
+from recon.imaging.scene_covariance import measure_covariance
+from recon.imaging.stationary_prior import fit_spectrum, measure_centre_detail, stationary_mean
 from scanner.arrays import Array
 
 SIZE = 128
@@ -43,7 +44,7 @@ def rms(values: Array) -> float:
 def test_the_measured_covariance_is_that_of_the_scene_without_its_noise() -> None:
     scattered = np.random.default_rng(2).random((SIZE, SIZE)) < 0.3
     samples = sample(texture(2.0, 4.0), scattered, sd=1.0)
-    spectrum = measure_spectrum(samples.sums, samples.counts)
+    spectrum = fit_spectrum(measure_covariance(samples.sums, samples.counts))
     assert spectrum.mean() == pytest.approx(1.0, rel=0.15)  # the mean over the modes is the variance
     wave_number = np.pi * np.arange(SIZE) / SIZE
     across, down = ((spectrum.sum(axis) @ wave_number**2 / spectrum.sum()) ** -0.5 for axis in (0, 1))
@@ -71,7 +72,7 @@ def test_a_texture_errs_less_than_with_any_kernel() -> None:
 
 def test_a_solution_begun_with_a_similar_one_is_the_same() -> None:
     samples = sample(texture(1.0, 2.5), lines(3))
-    spectrum = measure_spectrum(samples.sums, samples.counts)
+    spectrum = fit_spectrum(measure_covariance(samples.sums, samples.counts))
     arguments = pixel_means(samples.sums, samples.counts), samples.counts / NOISE**2, spectrum, 0.0
     solution = stationary_mean(*arguments)
     again = stationary_mean(*arguments, start=solution + 0.1 * texture(4.0, 4.0, seed=5))
@@ -80,7 +81,7 @@ def test_a_solution_begun_with_a_similar_one_is_the_same() -> None:
 
 def test_a_scene_without_structure_has_its_mean() -> None:
     samples = sample(np.full((SIZE, SIZE), 7.0), lines(2), sd=0.0)
-    spectrum = measure_spectrum(samples.sums, samples.counts)
+    spectrum = fit_spectrum(measure_covariance(samples.sums, samples.counts))
     means = pixel_means(samples.sums, samples.counts)
     assert stationary_mean(means, samples.counts, spectrum, 7.0) == pytest.approx(np.full((SIZE, SIZE), 7.0))
 
@@ -101,7 +102,9 @@ def test_samples_without_a_covariance_have_a_picture(visited: float, scene: str)
 
 def test_only_detail_of_the_size_of_a_pixel_is_larger_at_the_centres() -> None:
     fine, coarse = (
-        centre_variance_ratio(measure_spectrum(texture(width, width), np.ones((SIZE, SIZE))), 1e-6)
+        measure_centre_detail(
+            fit_spectrum(measure_covariance(texture(width, width), np.ones((SIZE, SIZE)))), 1e-6
+        ).variance
         for width in (0.7, 8.0)
     )
     assert coarse == pytest.approx(1.0, abs=0.02)
