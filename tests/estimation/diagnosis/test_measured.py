@@ -87,6 +87,16 @@ def test_no_law_is_named_where_a_drive_was_not_recorded(measured_data: Path) -> 
     assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "mechanics")]
 
 
+@pytest.mark.slow
+def test_weak_laws_beside_a_strong_one_stay_where_little_is_left(measured_data: Path) -> None:
+    """Two polynomial springs count as a series, but leave 0.04 % to a free correction of the beam's decay."""
+    (recording,), _, device = ROWS["beam"](measured_data)
+    diagnosis = diagnose([recording], device)
+    assert diagnosis.findings[0].effect == "cubic-stiffness"
+    loop = diagnosis.open_loop["sense_x"]
+    assert loop["improved"]["rmse"] < 0.04 * loop["nominal"]["rmse"]
+
+
 def test_a_device_without_a_drive_is_predicted_as_a_free_decay() -> None:
     rate, turn, fall = 5e3, 2 * np.pi * 40.0, 2.0
     time = np.arange(5000) / rate
