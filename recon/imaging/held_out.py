@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from scanner.arrays import Array
 
@@ -130,6 +131,11 @@ def excess_variance(residual: Array, noise: Array, predicted: Array, weight: Arr
     ratio = float(weight @ (residual**2 - noise) / total)
     scatter = weight * (noise + CORRELATED_ERRORS * max(ratio, 0.5) * predicted)
     return ratio, float(np.sqrt(2.0 * scatter @ scatter) / total)
+
+
+def positive_mean(found: float, sd: float) -> float:
+    """Return the posterior mean of a positive number from an estimate with normal errors, and no other knowledge."""
+    return found + sd * float(np.exp(norm.logpdf(found / sd) - norm.logcdf(found / sd)))
 
 
 def scale_with_prior(found: float, spread: Array | float, expected: float, log_sd: float) -> float:

@@ -10,7 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.held_out import SplitSums, excess_variance, log_average, pixel_means, representative_weights
+from recon.imaging.held_out import (
+    SplitSums,
+    excess_variance,
+    log_average,
+    pixel_means,
+    positive_mean,
+    representative_weights,
+)
 from recon.imaging.pixel_noise import SampleNoise
 from scanner.arrays import Array
 
@@ -133,8 +140,7 @@ def kernel_picture(samples: SplitSums, noise: SampleNoise, width: float | None =
         spread = of_samples / samples.held_counts[held] + of_samples * kept_squares[held] / kept_weight[held] ** 2
         residual = pixel_means(samples.held_sums, samples.held_counts)[held] - kept[held]
         removed = _slope_energy(kept, width)[held]
-        ratio, sd = excess_variance(residual, spread, removed, representative_weights(samples)[held])
-        scale = max(ratio, sd)
+        scale = positive_mean(*excess_variance(residual, spread, removed, representative_weights(samples)[held]))
     sd = np.sqrt(variance + TAIL_FACTOR * scale * _slope_energy(image, width))
     share = np.divide(samples.counts * centre, weight, out=np.zeros(image.shape), where=reached)
     return PictureEstimate(np.where(reached, image, np.nan), np.where(reached, sd, np.nan), share, width)
