@@ -4,7 +4,7 @@
    the error is large, and where it is small.
 2. The scale of that variance follows from the errors of held-out samples, in pixels that no other sample visited. In
    recordings of few photons they hardly exceed the noise, so the variance that a fit of the scene's covariance leaves
-   unresolved is the prior of the scale. Pixels that further samples visited show the noise of held-out samples.
+   unresolved is the prior of the scale.
 3. The pixel's own samples reduce the variance. They lie anywhere in the pixel, and the picture is the value at its
    centre.
 
@@ -31,10 +31,6 @@ DRAW_TOLERANCE = 0.1
 PRIOR_LOG_SD = 0.4
 """Standard deviation of the logarithm of a picture's variance about that of the fitted covariance. It was 0.4 to 0.5 in
 ten scenes with 10 photons a sample."""
-
-NOISE_EXCESS_SD = 0.5
-"""Prior standard deviation of the fraction by which detail within the pixels adds to the noise of held-out means: half
-of it, in pixels that the scan crosses with two samples."""
 
 DENSITY_WIDTH_PX = 8.0
 """Window in which the density of the scan is measured [px]."""
@@ -89,34 +85,7 @@ def measure_scale(samples: SplitSums, mean: Array, precision: Array, predicted: 
     of_noise, of_errors = weight * noise, CORRELATED_ERRORS * weight * variance / own
     scale = np.exp(LOG_SCALES)
     squares = of_noise @ of_noise + scale * (2.0 * of_noise @ of_errors + scale * (of_errors @ of_errors))
-    excess, excess_variance = _noise_excess(
-        residual, noise, expected * variance / own, weights[used] * (1.0 - 1.0 / own)
-    )
-    by_noise = float(weight @ noise / slope)
-    spread = 2.0 * squares / slope**2 + by_noise**2 * excess_variance
-    return scale_with_prior(float(found) - by_noise * excess, spread, expected, PRIOR_LOG_SD)
-
-
-def _noise_excess(residual: Array, noise: Array, variance: Array, weight: Array) -> tuple[float, float]:
-    """Return by which fraction the noise of held-out means exceeds that of independent samples, and its variance.
-
-    The samples of one crossing lie close together in their pixel, so detail within it does not average out. Taken for
-    an error of the picture, it would be multiplied in pixels with many samples, which err little.
-
-    Args:
-        residual: mean of the held-out samples less the picture without them, shape (n,).
-        noise: variance of that mean for independent samples, shape (n,).
-        variance: expected of the picture, shape (n,).
-        weight: of each pixel; largest where the picture follows the pixel's own samples, shape (n,).
-    """
-    total = float(weight.sum())
-    if total <= 0.0:
-        return 0.0, NOISE_EXCESS_SD**2
-    found = float(weight @ ((residual**2 - noise - variance) / noise)) / total
-    scatter = weight * (1.0 + CORRELATED_ERRORS * variance / noise)
-    found_variance = 2.0 * float(scatter @ scatter) / total**2
-    share = NOISE_EXCESS_SD**2 / (NOISE_EXCESS_SD**2 + found_variance)
-    return share * found, share * found_variance
+    return scale_with_prior(float(found), 2.0 * squares / slope**2, expected, PRIOR_LOG_SD)
 
 
 def _representative_weights(samples: SplitSums) -> Array:

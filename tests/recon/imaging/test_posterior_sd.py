@@ -48,17 +48,6 @@ def test_the_scale_is_the_expected_one_where_the_noise_hides_the_errors() -> Non
     assert measure_scale(nothing_held, picture, ones, ones, 2.0) == pytest.approx(2.0, rel=0.01)
 
 
-def test_detail_within_pixels_is_not_an_error_of_the_picture() -> None:
-    """Every pixel has eight further samples, so that its error is small; held-out means have twice their noise."""
-    rng = np.random.default_rng(2)
-    ones = np.ones((SIZE, SIZE))
-    held = ones * (rng.random(ones.shape) < 0.1)
-    errors = rng.normal(size=ones.shape) / np.sqrt(8.0 + 1.0 / 0.2)
-    samples = SplitSums(9.0 * ones, 9.0 * ones, held * np.sqrt(2.0) * rng.normal(size=ones.shape), held)
-    scale = measure_scale(samples, errors, ones, ones, expected=0.2)
-    assert 0.1 < scale < 0.4
-
-
 def test_the_dense_part_of_a_scan_does_not_determine_the_scale_alone() -> None:
     """A third of the field holds nine tenths of the samples, and has a tenth of the error variance."""
     rng = np.random.default_rng(1)
