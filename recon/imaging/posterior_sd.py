@@ -72,7 +72,7 @@ def measure_scale(samples: SplitSums, mean: Array, precision: Array, predicted: 
         predicted: variance of each pixel given all samples but its own.
         expected: factor by the covariance of the scene.
     """
-    weights = _representative_weights(samples)
+    weights = _area_weights(samples)
     used = weights > 0
     if not used.any():
         return expected
@@ -88,7 +88,7 @@ def measure_scale(samples: SplitSums, mean: Array, precision: Array, predicted: 
     return scale_with_prior(float(found), 2.0 * squares / slope**2, expected, PRIOR_LOG_SD)
 
 
-def _representative_weights(samples: SplitSums) -> Array:
+def _area_weights(samples: SplitSums) -> Array:
     """Weight of each held-out pixel, 0 in others, by which they represent the area of the picture.
 
     Pixels with and without further samples count as visited and unvisited pixels of the picture, and within each of the
