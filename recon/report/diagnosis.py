@@ -48,7 +48,8 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     errors = _phase_errors(search) if search is not None and diagnosis.findings else {}
     largest = max(errors.values(), key=lambda e: e.blur_px(e.before), default=None)
     blur = None if largest is None else (largest.blur_px(largest.before), largest.blur_px(largest.after))
-    sections = [_overview(diagnosis.findings)] if diagnosis.findings else []
+    sections = [_overview(diagnosis)] if diagnosis.findings else []
+    sections += [_open_loop_section(diagnosis.open_loop)] if diagnosis.open_loop else []
     sections += [_finding_section(finding, i, search) for i, finding in enumerate(diagnosis.findings)]
     if search is not None:
         sections += _motion_sections(diagnosis, search, errors)
@@ -57,20 +58,39 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     return render(f"Diagnosis of {diagnosis.device.name}", conclusion, sections, subject=f"From {', '.join(names)}.")
 
 
-def _overview(findings: Sequence[Finding]) -> Section:
+def _overview(diagnosis: Diagnosis) -> Section:
     rows = [
         [
             finding.effect,
             f"{finding.stage} of axis {finding.axis}",
             format_probability(finding.probability),
+            "" if finding.share is None else f"{finding.share:.1%}",
             f"{finding.heldout['before']:.3g}",
             f"{finding.heldout['after']:.3g}",
         ]
-        for finding in findings
+        for finding in diagnosis.findings
     ]
-    head = ["effect", "where", "probability", "misfit before", "misfit after"]
-    text = "Misfit: reduced chi-square on samples that were not used in the fit; noise alone gives 1."
+    if diagnosis.remainder is not None:
+        rest = diagnosis.remainder
+        rows.append(["not explained", f"{rest['channel']}, {rest['stage']}", "", f"{rest['share']:.1%}", "", ""])
+    head = ["effect", "where", "probability", "share of the misfit", "misfit before", "misfit after"]
+    text = (
+        "Misfit: reduced chi-square on samples that were not used in the fit; noise alone gives 1. Share: of the mean "
+        "square misfit of the nominal device on these samples, in the unit of the channel."
+    )
     return Section("Effects", text, Table(head, rows))
+
+
+def _open_loop_section(open_loop: Mapping[str, Any]) -> Section:
+    rows = [
+        [channel, *(f"{loop['rmse']:.3g} ({loop['fraction']:.1%})" for loop in loops.values())]
+        for channel, loops in open_loop.items()
+    ]
+    text = (
+        "Root mean square error of the prediction from the drive and the initial state alone, on samples that were not "
+        "used in a fit, in the unit of the channel and in percent of its standard deviation."
+    )
+    return Section("Prediction by the devices", text, Table(["channel", "nominal device", "improved device"], rows))
 
 
 def _finding_section(finding: Finding, index: int, search: SelectionResult | None) -> Section:

@@ -306,6 +306,9 @@ def test_diagnose_and_predict_write_the_documented_files_and_keys(
     report = (tmp_path / "out" / "report.html").read_text()
     assert "bench &lt;b&gt;" in report
     assert "bench <b>" not in report
+    assert f"<td>{finding['share']:.1%}</td>" in report
+    loops = written["open_loop"]["sense_x"].values()
+    assert all(f"<td>{loop['rmse']:.3g} ({loop['fraction']:.1%})</td>" in report for loop in loops)
 
     errors = {}
     for name, device in (("nominal", []), ("improved", ["--device", str(tmp_path / "out" / "device.toml")])):
