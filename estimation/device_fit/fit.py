@@ -154,16 +154,6 @@ class Likelihood:
         with np.errstate(over="ignore", invalid="ignore"):
             return self._residual(model, x, stop)
 
-    def low_frequency_excess_allowance(self, fit: Fit) -> float:
-        """Part of a fit's chi-square that slow noise may cause; see ``Whitener.low_frequency_excess_allowance``."""
-        total, first = 0.0, 0
-        fitted = np.where(fit.rows, fit.residual, 0.0)
-        for whitener in (whitener for row in self.whiteners for whitener in row):
-            if whitener.first > 1.0:
-                total += whitener.low_frequency_excess_allowance(fitted[first : first + whitener.samples])
-            first += whitener.samples
-        return total
-
     def _residual(self, model: Model, x: Array, stop: float) -> Array:
         parts = []
         for run, whiteners, signals in zip(self.runs, self.whiteners, model.outputs(x, stop), strict=True):
@@ -286,5 +276,5 @@ def _finalise_fit(likelihood: Likelihood, model: Model, x: Array, residual: Arra
     chi2, penalty = float(residual[rows] @ residual[rows]), float(model.precision @ (x * x))
     information = jacobian[rows].T @ jacobian[rows]
     evidence = laplace_neg2_log_evidence(chi2 + penalty, information, model.precision**-0.5)
-    evidence += sum(mains.cost for mains in model.mains)
+    evidence += sum(mains.cost for mains in model.mains) + sum(candidate.cost for candidate in model.candidates)
     return Fit(model, x, chi2, penalty, residual, jacobian, rows, likelihood.validation_rows, evidence)

@@ -13,7 +13,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
-from scipy.optimize import minimize_scalar
 
 from scanner.arrays import Array
 
@@ -33,10 +32,6 @@ the noise there by the mean of a log-normal level, so that slow noise is not rep
 
 EXCLUDED_LOW_HALF_BINS = 6
 """Number of half bins, from 0 Hz on, in which no noise is measured: such slow variation may be an effect, a drift."""
-
-SLOPE_PRIOR_SD = 0.6
-"""Prior standard deviation of the exponent by which slow noise may rise more steeply than extrapolated. Two medians of
-``MIN_BINS_PER_BAND`` bins determine the exponent no better."""
 
 
 @dataclass(frozen=True)
@@ -85,22 +80,6 @@ class Whitener:
         inside = residual[first : residual.size - last]
         mirrored = np.concatenate([inside[:first][::-1], inside, inside[inside.size - last :][::-1]])
         return np.asarray(idct(dct(mirrored, norm="ortho")[: self.samples] * self.weights, norm="ortho"))
-
-    def low_frequency_excess_allowance(self, residual: Array) -> float:
-        """Fall of -2 log likelihood if the noise below the measured band rises more steeply than extrapolated.
-
-        Args:
-            residual: whitened, zero where it does not count, shape (samples,).
-        """
-        bins = 0.5 * np.arange(1, 2 * int(np.ceil(self.first)) - 1)
-        reach = np.log(self.first / bins)
-        power = dct(residual, norm="ortho")[1 : bins.size + 1] ** 2
-        share = np.count_nonzero(residual) / residual.size
-
-        def neg2_log_likelihood_change(slope: float) -> float:
-            return float(power @ np.expm1(-slope * reach) + share * slope * reach.sum() + (slope / SLOPE_PRIOR_SD) ** 2)
-
-        return -min(0.0, minimize_scalar(neg2_log_likelihood_change, bounds=(0.0, 4.0), method="bounded").fun)
 
 
 def make_whitener(psd: Array, size: int, guard: tuple[int, int], first: float = 0.0) -> Whitener:

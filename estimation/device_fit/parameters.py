@@ -19,11 +19,16 @@ readout is a few per cent of the signal."""
 
 @dataclass(frozen=True)
 class Candidate:
-    """A term on one axis, and the channel on which it acts."""
+    """A term on one axis, and the channel on which it acts.
+
+    Attributes:
+        cost: -2 log of the prior probability of its free parameters, where they were chosen among others.
+    """
 
     term: Term
     axis: str
     channel: str
+    cost: float = 0.0
 
     @property
     def key(self) -> str:

@@ -28,11 +28,7 @@ error."""
 
 
 def prune_by_evidence(likelihood: Likelihood, fit: Fit) -> Fit | None:
-    """Refit with the required amplitudes of the last term, a discrepancy term; None if none is required.
-
-    The -2 log evidence of the result includes the choice of the amplitudes: every subset of the same size is equally
-    probable a priori.
-    """
+    """Refit with the required amplitudes of the last term, a discrepancy term; None if none is required."""
     candidate = fit.model.candidates[-1]
     indices = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
     required = _required_parameters(fit, indices)
@@ -40,18 +36,21 @@ def prune_by_evidence(likelihood: Likelihood, fit: Fit) -> Fit | None:
         return None
     pruned = with_free_parameters(candidate, {fit.model.parameters[i].name for i in required})
     model = Model(fit.model.runs, fit.model.device, [*fit.model.candidates[:-1], pruned], fit.model.mains)
-    refit = fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
-    choice = 2.0 * log(comb(len(indices), len(required)))
-    return replace(refit, neg2_log_evidence=refit.neg2_log_evidence + choice)
+    return fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
 
 
 def with_free_parameters(candidate: Candidate, names: Collection[str]) -> Candidate:
-    """A candidate of whose parameters only those with ``names`` are free; the others are fixed at 0."""
+    """A candidate of whose parameters only those with ``names`` are free; the others are fixed at 0.
+
+    Its cost is that of the choice: a priori every number of parameters is equally probable, and of it every subset.
+    """
+    possible = len(candidate.term.free_parameters)
     parameters = tuple(
         p if p.kind == "fixed" or p.name in names else replace(p, kind="fixed", scale=lambda scales: 0.0)
         for p in candidate.term.parameters
     )
-    return Candidate(replace(candidate.term, parameters=parameters), candidate.axis, candidate.channel)
+    cost = 2.0 * log(possible * comb(possible, len(names)))
+    return replace(candidate, term=replace(candidate.term, parameters=parameters), cost=cost)
 
 
 def _required_parameters(fit: Fit, indices: list[int]) -> list[int]:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.slow_noise import steeper_noise_gain
 
 DETECTION_THRESHOLD = 10.0
 """Decrease of -2 log evidence from which a term is detected: a factor of 150 in probability, with a margin for the
 choice among some fifty candidates."""
-
-COLOURED_NOISE_SAFETY_FACTOR = 2.5
-"""Factor on ``DETECTION_THRESHOLD`` if slow noise with a steeper spectrum explains most of a gain. In simulations the
-unexplained gain was 17 to 22 for false drifts and at least 32 for true ones."""
 
 UNIQUE_NAME_THRESHOLD = 6.0
 """Difference in -2 log evidence from which a term is reported as the only explanation: a factor of 20 in probability.
@@ -29,13 +26,9 @@ def satisfies_sign_constraints(fit: Fit) -> bool:
 def evidence_gain(likelihood: Likelihood, before: Fit, after: Fit) -> float:
     """Fall of -2 log evidence from ``before`` to ``after``, 0 below the detection threshold.
 
-    The part that slow noise with a steeper spectrum than extrapolated would also explain is subtracted.
+    Both are evaluated under the slow noise that suits them best, so that noise with a steeper spectrum than
+    extrapolated is no evidence for a drift.
     """
-    slow_noise_part = likelihood.low_frequency_excess_allowance(before) - likelihood.low_frequency_excess_allowance(
-        after
-    )
-    gain = before.neg2_log_evidence - after.neg2_log_evidence - slow_noise_part
-    # if slow noise explains most of the gain, the rest depends on the uncertain steepness of its spectrum
-    return (
-        gain if gain >= DETECTION_THRESHOLD * (COLOURED_NOISE_SAFETY_FACTOR if slow_noise_part > gain else 1.0) else 0.0
-    )
+    gain = before.neg2_log_evidence - after.neg2_log_evidence
+    gain += steeper_noise_gain(likelihood, after) - steeper_noise_gain(likelihood, before)
+    return gain if gain >= DETECTION_THRESHOLD else 0.0

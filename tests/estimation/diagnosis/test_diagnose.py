@@ -22,14 +22,16 @@ from estimation.device_fit.initial import (
 )
 from estimation.device_fit.interference import strongest_interfering_line
 from estimation.device_fit.model import Model
-from estimation.device_fit.noise import make_whitener, noise_psd
+from estimation.device_fit.noise import Whitener, make_whitener, noise_psd
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.resampling import decimate, resample_drive
+from estimation.device_fit.slow_noise import gain_of_steeper_noise
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.linearisation import linear_model
 from estimation.diagnosis.screening import all_candidates
 from recon.cli import main
+from scanner.arrays import Array
 from scanner.device import Device
 from scanner.recording import Recording
 from scanner.terms import catalogue
@@ -175,16 +177,19 @@ def test_low_frequency_misfit_is_attributed_to_noise_as_far_as_a_steeper_spectru
     n = 4000
     white = np.random.default_rng(5).normal(0.0, 1.0, n)
     turn = 2 * np.pi * np.arange(n) / n
-    whiten = make_whitener(np.full(n // 2 + 1, float(n)), n, (0, 0), first=10.0)
+    whitener = make_whitener(np.full(n // 2 + 1, float(n)), n, (0, 0), first=10.0)
     slow, measured = 4.0 * np.sqrt(2 / n) * np.cos(turn), 4.0 * np.sqrt(2 / n) * np.cos(12 * turn)
-    assert whiten.low_frequency_excess_allowance(white) < 2.0
-    assert whiten.low_frequency_excess_allowance(white + measured) < 2.0
-    chi2_by_noise = whiten.low_frequency_excess_allowance(white + slow)  # the slow cosine adds 16 to chi-square
-    assert 4.0 < chi2_by_noise < 16.0
-    assert (
-        whiten.low_frequency_excess_allowance(white + 10.0 * slow) < 0.99 * 1600.0
-    )  # a large drift is never attributed to noise entirely
-    assert replace(whiten, first=0.0).low_frequency_excess_allowance(white + slow) == 0.0
+
+    def gain(residual: Array, *sensitivities: Array, whitener: Whitener = whitener) -> float:
+        columns = np.column_stack([*sensitivities, residual])
+        return gain_of_steeper_noise([whitener], columns, np.ones(n, bool), np.full(len(sensitivities), 1e-4))
+
+    assert gain(white) < 2.0
+    assert gain(white + measured) < 2.0
+    assert 4.0 < gain(white + slow) < 16.0  # the slow cosine adds 16 to chi-square
+    assert gain(white + 10.0 * slow) < 0.99 * 1600.0  # a large drift is never attributed to noise entirely
+    assert gain(white + slow, whitener=replace(whitener, first=0.0)) == 0.0
+    assert gain(white + slow, slow) < 2.0  # nothing is left beside a drift that is fitted
 
 
 def test_red_noise_is_measured_between_the_lines_of_a_multisine() -> None:

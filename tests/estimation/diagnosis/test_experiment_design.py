@@ -85,7 +85,7 @@ def test_the_profile_rises_by_the_95_percent_threshold_at_the_interval_ends(fitt
 class Posterior:
     """The likelihood of a model of two parameters for two samples, both fitted, and that model."""
 
-    validation_rows, precision, mains = np.zeros(2, bool), np.full(2, 1e-12), ()
+    validation_rows, precision, mains, candidates = np.zeros(2, bool), np.full(2, 1e-12), (), ()
 
     def fitted(self, stop: float) -> np.ndarray:
         return ~self.validation_rows

@@ -1,0 +1,119 @@
+"""Slow noise that rises more steeply below the measured bands than its spectrum is extrapolated there.
+
+A drift of the baseline and 1/f noise fill the same few half bins at the low end of the spectrum. What a steeper
+spectrum explains of a misfit is no evidence for a drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.fft import idct
+from scipy.optimize import minimize_scalar
+
+from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.noise import Whitener
+from estimation.least_squares import gaussian_posterior
+from scanner.arrays import Array, Mask
+
+SLOPE_PRIOR_SD = 0.6
+"""Prior standard deviation of the exponent by which slow noise may rise more steeply than extrapolated. Two medians of
+``MIN_BINS_PER_BAND`` bins determine the exponent no better."""
+
+MAX_SLOPE = 2.0
+"""Largest exponent by which the spectrum may rise more steeply: that of a random walk above flat noise, which no drift
+of electronics exceeds for long."""
+
+
+class _SlowPart(NamedTuple):
+    """The slowest cosines of one whitened channel, in which the noise is extrapolated.
+
+    Attributes:
+        reach: logarithm of the lowest measured frequency over that of each cosine, shape (k,).
+        amplitudes: of the cosines in the columns, shape (k, q).
+        products: of the cosines with the columns over the fitted samples, shape (k, q).
+        overlap: of the cosines with each other over the fitted samples, shape (k, k).
+        share: of the samples that are fitted.
+    """
+
+    reach: Array
+    amplitudes: Array
+    products: Array
+    overlap: Array
+    share: float
+
+    def weakening(self, slope: float) -> Array:
+        """Change of the inner products of the columns with a spectrum that rises more steeply, shape (q, q)."""
+        removed = -np.expm1(-0.5 * slope * self.reach)[:, None] * self.amplitudes
+        mixed = self.products.T @ removed
+        return np.asarray(removed.T @ self.overlap @ removed - mixed - mixed.T)
+
+    def cost(self, slope: float) -> float:
+        """-2 log of the determinant and of the prior probability of a slope."""
+        return float(self.share * slope * self.reach.sum() + (slope / SLOPE_PRIOR_SD) ** 2)
+
+
+def steeper_noise_gain(likelihood: Likelihood, fit: Fit) -> float:
+    """Fall of a fit's -2 log evidence if the slow noise of every channel rises more steeply than extrapolated.
+
+    All parameters of the fit are estimated again under that noise, around the fit.
+    """
+    columns = np.column_stack([fit.jacobian, fit.residual - fit.jacobian @ fit.x])
+    whiteners = [whitener for row in likelihood.whiteners for whitener in row]
+    return gain_of_steeper_noise(whiteners, columns, fit.rows, fit.model.precision)
+
+
+def gain_of_steeper_noise(whiteners: Sequence[Whitener], columns: Array, rows: Mask, precision: Array) -> float:
+    """Fall of -2 log evidence of a linear model by the slope of every channel's slow noise, the best of each in turn.
+
+    Args:
+        whiteners: of all channels in order, n whitened samples together.
+        columns: whitened sensitivities to p parameters and, last, the residual with all of them at 0, shape (n, p + 1).
+        rows: samples that are fitted, shape (n,).
+        precision: of the parameters' priors, shape (p,).
+    """
+    fitted = columns[rows]
+    gram, gain = fitted.T @ fitted, 0.0
+    root = precision**-0.5
+
+    def neg2_log_evidence(inner_products: Array) -> float:
+        posterior = gaussian_posterior(inner_products[:-1, :-1], -inner_products[:-1, -1], root)
+        return float(inner_products[-1, -1]) + posterior.neg2_log_evidence
+
+    for part in _slow_parts(whiteners, columns, rows):
+        before = neg2_log_evidence(gram)
+
+        def change(slope: float, part: _SlowPart = part, gram: Array = gram, before: float = before) -> float:
+            return neg2_log_evidence(gram + part.weakening(slope)) + part.cost(slope) - before
+
+        best = minimize_scalar(change, bounds=(0.0, MAX_SLOPE), method="bounded")
+        if best.fun < 0.0:
+            gain, gram = gain - float(best.fun), gram + part.weakening(float(best.x))
+    return gain
+
+
+def _slow_parts(whiteners: Sequence[Whitener], columns: Array, rows: Mask) -> list[_SlowPart]:
+    """Of the channels whose noise is extrapolated at its low end."""
+    parts, first = [], 0
+    for whitener in whiteners:
+        samples = slice(first, first + whitener.samples)
+        first += whitener.samples
+        half_bins = np.arange(1, 2 * int(np.ceil(whitener.first)) - 1)
+        if not half_bins.size:
+            continue
+        spectrum = np.zeros((whitener.samples, half_bins.size))
+        spectrum[half_bins, half_bins - 1] = 1.0
+        cosines, used = idct(spectrum, norm="ortho", axis=0), rows[samples]
+        compared = cosines[used]
+        parts.append(
+            _SlowPart(
+                np.log(whitener.first / (0.5 * half_bins)),
+                cosines.T @ columns[samples],
+                compared.T @ columns[samples][used],
+                compared.T @ compared,
+                float(np.mean(used)),
+            )
+        )
+    return parts
