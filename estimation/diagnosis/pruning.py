@@ -44,13 +44,13 @@ def with_free_parameters(candidate: Candidate, names: Collection[str]) -> Candid
 
     Its cost is that of the choice: a priori every number of parameters is equally probable, and of it every subset.
     """
-    possible = len(candidate.term.free_parameters)
     parameters = tuple(
         p if p.kind == "fixed" or p.name in names else replace(p, kind="fixed", scale=lambda scales: 0.0)
         for p in candidate.term.parameters
     )
-    cost = 2.0 * log(possible * comb(possible, len(names)))
-    return replace(candidate, term=replace(candidate.term, parameters=parameters), cost=cost)
+    term = replace(candidate.term, parameters=parameters)
+    possible, kept = len(candidate.term.free_parameters), len(term.free_parameters)
+    return replace(candidate, term=term, cost=2.0 * log(possible * comb(possible, kept)))
 
 
 def _required_parameters(fit: Fit, indices: list[int]) -> list[int]:
