@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.held_out import SplitSums, log_average, pixel_means, representative_weights
+from recon.imaging.held_out import SplitSums, log_average, pixel_means, representative_weights, shrunk_weight
 from recon.imaging.kernel_picture import PictureEstimate, choose_width, find_reached
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.posterior_sd import measure_scale, variance_at_centres, variance_from_neighbours
@@ -149,11 +149,10 @@ def _add_stationary(
     """
     kept, kept_counts = pixel_means(samples.kept_sums, samples.kept_counts), samples.kept_counts
     scene_mean = float(samples.kept_sums.sum() / kept_counts.sum())
-    stationary = stationary_mean(kept, kept_counts * precision, spectrum, scene_mean)
+    stationary = stationary_mean(kept, kept_counts * precision, spectrum, scene_mean, mean)
     difference = stationary - mean
     residual = pixel_means(samples.held_sums, samples.held_counts) - mean
-    scale = float(np.vdot(judged * difference, difference))
-    weight = min(max(float(np.vdot(judged * difference, residual)) / scale, 0.0), 1.0) if scale > 0 else 0.0
+    weight = shrunk_weight(judged * difference, difference, residual)
     if weight < MIN_STATIONARY_WEIGHT:
         return image, mean, 0.0
     means, data = pixel_means(samples.sums, samples.counts), samples.counts * precision

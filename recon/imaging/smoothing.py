@@ -42,5 +42,17 @@ def smooth(image: NDArray[Any], width: float) -> Array:
 
 def kernel_mean(sums: Array, counts: Array, width: float) -> Array:
     """Return the kernel-weighted mean of the samples; where none is in reach, the mean of all."""
-    spread = smooth(np.dstack([sums, counts]), width)
-    return np.where(spread[..., 1] > 0, spread[..., 0] / np.maximum(spread[..., 1], 1e-30), sums.sum() / counts.sum())
+    total, weight = np.moveaxis(smooth(np.dstack([sums, counts]), width), -1, 0)
+    return mean_of_weighted(total, weight, sums.sum() / counts.sum())
+
+
+def mean_of_weighted(total: Array, weight: Array, otherwise: float) -> Array:
+    """Return the ratio of weighted sums and their weights, or a fixed value where the weight is not positive."""
+    return np.where(weight > 0, total / np.maximum(weight, 1e-30), otherwise)
+
+
+def centre_weight(width: float) -> float:
+    """Return the weight of the centre of the kernel of :func:`smooth`."""
+    import cv2
+
+    return float(cv2.getGaussianKernel(2 * max(int(REACH * width + 0.5), 1) + 1, width).max() ** 2)
