@@ -149,7 +149,7 @@ def _add_stationary(
     """
     kept, kept_counts = pixel_means(samples.kept_sums, samples.kept_counts), samples.kept_counts
     scene_mean = float(samples.kept_sums.sum() / kept_counts.sum())
-    stationary = stationary_mean(kept, kept_counts * precision, spectrum, scene_mean, mean)
+    stationary = stationary_mean(kept, kept_counts * precision, spectrum, scene_mean)
     difference = stationary - mean
     residual = pixel_means(samples.held_sums, samples.held_counts) - mean
     weight = shrunk_weight(judged * difference, difference, residual)

@@ -30,7 +30,7 @@ frame. Neighbours differ by a factor of 1.7, which their sums interpolate to a f
 RELATIVE_SPECTRUM_FLOOR = 1e-9
 """Least power of a mode, relative to the scene's variance: keeps the preconditioner finite."""
 
-TOLERANCE = 0.01
+TOLERANCE = 0.005
 """Relative residual of the solution, in the norm of the preconditioner. With 0.001 errors change by less than 2 %."""
 
 MAX_ITERATIONS = 40
