@@ -17,10 +17,11 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from recon.imaging.held_out import SplitSums, held_out_ranges
-from recon.imaging.kernel_picture import kernel_mean, kernel_picture
+from recon.imaging.kernel_picture import kernel_picture
 from recon.imaging.picture import Grid, Picture, fill_holes
 from recon.imaging.pixel_noise import measure_sample_noise
 from recon.imaging.posterior_picture import posterior_picture
+from recon.imaging.smoothing import kernel_mean
 from scanner.arrays import Array
 
 PIXELS = 256

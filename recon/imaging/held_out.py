@@ -118,6 +118,25 @@ def log_average(values: Array, misfits: Array) -> tuple[float, Array]:
     return float(np.exp(weights @ np.log(values))), weights
 
 
+def shrunk_weight(judged: Array, difference: Array, residual: Array) -> float:
+    """Weight in [0, 1] of ``difference`` in ``residual`` by least squares, shrunk by its error (James & Stein 1961).
+
+    A weight within its standard deviation of 0 is 0. That deviation includes the scatter of the residuals, which is
+    larger where both pictures miss an edge.
+
+    Args:
+        judged: ``difference``, weighted for the fit.
+        difference, residual: by pixel.
+    """
+    scale = float(np.vdot(judged, difference))
+    if not scale > 0.0:
+        return 0.0
+    weight = float(np.vdot(judged, residual)) / scale
+    rest = residual - min(max(weight, 0.0), 1.0) * difference
+    variance = float(np.sum((judged * rest) ** 2)) / scale**2
+    return min(max(weight - variance / weight, 0.0), 1.0) if weight > 0.0 else 0.0
+
+
 def excess_variance(residual: Array, noise: Array, predicted: Array, weight: Array) -> tuple[float, float]:
     """Return the error variance of held-out pixels as a multiple of the predicted one, and its standard deviation.
 

@@ -1,8 +1,8 @@
 """The standard deviation of every pixel of a picture of means, from the scatter of the samples in it.
 
 The variance of a sample is modelled as a + b · intensity, read noise and photon noise. Both are measured from pairs of
-samples that fell into one pixel in different passes of the beam. The scene is the same for both, so half of the squared
-difference is the variance.
+crossings of one pixel in different passes of the beam. The pixel is the same for both, so half of the squared
+difference of their means is the variance of a mean.
 """
 
 from __future__ import annotations
@@ -25,43 +25,82 @@ MAX_NOISE_SAMPLES = 1 << 20
 """Samples from which the noise is measured: 10^5 pairs determine a variance to 0.5 %."""
 
 MIN_PASS_SAMPLES = 8
-"""Samples between those of a pair: neighbours within one pass share the noise of a slow detector."""
+"""Samples from one crossing of a pair to the other at least: neighbours within one pass share the noise of a slow
+detector."""
 
 LEVELS = 16
 """Levels of intensity at which the variance is compared with the model a + b · intensity."""
 
 
 class SampleNoise(NamedTuple):
-    """Variance of a sample: ``floor + slope * (intensity - dark)``, in the square of the intensity's unit."""
+    """Variance of a sample: ``floor + slope * (intensity - dark)``, in the square of the intensity's unit.
+
+    ``relative_sd`` is the standard error of that variance, relative to it.
+    """
 
     floor: float
     slope: float
     dark: float
+    relative_sd: float = 0.0
 
     def variance(self, intensity: Array) -> Array:
         """Variance of a sample of the mean ``intensity``, of any shape."""
         return self.floor + self.slope * np.maximum(intensity - self.dark, 0.0)
 
 
+class Crossings(NamedTuple):
+    """Crossings of pixels by the beam, each of consecutive samples in one pixel, in the order of time.
+
+    Attributes:
+        pixel: that is crossed, shape (n,).
+        mean: of the samples, shape (n,).
+        size: number of samples, shape (n,).
+        first: number of the first sample, shape (n,).
+    """
+
+    pixel: NDArray[np.integer[Any]]
+    mean: Array
+    size: NDArray[np.intp]
+    first: NDArray[np.intp]
+
+    def select(self, part: NDArray[Any]) -> Crossings:
+        """Return those of the crossings that an index selects."""
+        return Crossings(self.pixel[part], self.mean[part], self.size[part], self.first[part])
+
+
+def find_crossings(pixel: NDArray[np.integer[Any]], intensity: Array) -> Crossings:
+    """Return the crossings of a scan; arguments as for :func:`measure_sample_noise`, with at least one sample used."""
+    used = np.flatnonzero((pixel >= 0) & np.isfinite(intensity))
+    starts = np.flatnonzero(np.r_[True, (np.diff(pixel[used]) != 0) | (np.diff(used) != 1)])
+    size = np.diff(np.r_[starts, used.size])
+    return Crossings(pixel[used[starts]], np.add.reduceat(intensity[used], starts) / size, size, used[starts])
+
+
 def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> SampleNoise | None:
-    """Noise of a sample from pairs of samples in one pixel; None without pairs.
+    """Noise of a sample from pairs of crossings of one pixel; None without pairs.
+
+    It is the variance that makes the mean of n samples vary by a n-th of it from crossing to crossing. What the samples
+    of a crossing have in common, the noise of a slow detector and detail within the pixel, is thus a part of it.
 
     The variance found at a level of intensity counts by its standard error: the scatter of the squared differences in
     it, at least that of normal noise under a first fit. A standard error in proportion to the variance found itself
-    would favour the levels where it is too small by chance.
+    would favour the levels where it is too small by chance. Detail within pixels is not a function of the level, so the
+    fit is scaled to the mean of the variances found.
 
     Args:
         pixel: number of the pixel of each sample, negative outside the field, shape (n,).
         intensity: shape (n,); samples that are not finite are left out.
     """
-    used = np.flatnonzero((pixel >= 0) & np.isfinite(intensity))
-    order = used[np.argsort(pixel[used], kind="stable")]
-    first, second = order[:-1], order[1:]
-    paired = (pixel[first] == pixel[second]) & (second - first >= MIN_PASS_SAMPLES)
-    first, second = first[paired], second[paired]
-    if first.size < 2 * LEVELS:
+    if not np.any((pixel >= 0) & np.isfinite(intensity)):
         return None
-    mean, variance = 0.5 * (intensity[first] + intensity[second]), 0.5 * (intensity[first] - intensity[second]) ** 2
+    crossings = find_crossings(pixel, intensity)
+    order = np.argsort(crossings.pixel, kind="stable")
+    one, two = crossings.select(order[:-1]), crossings.select(order[1:])
+    paired = (one.pixel == two.pixel) & (two.first - one.first - one.size >= MIN_PASS_SAMPLES - 1)
+    if paired.sum() < 2 * LEVELS:
+        return None
+    one, two = one.select(paired), two.select(paired)
+    mean, variance = 0.5 * (one.mean + two.mean), (one.mean - two.mean) ** 2 / (1.0 / one.size + 1.0 / two.size)
     dark = float(mean.min())
     by_level = [part for part in np.array_split(np.argsort(mean), LEVELS) if part.size]
     level = np.array([mean[part].mean() - dark for part in by_level])
@@ -71,7 +110,10 @@ def measure_sample_noise(pixel: NDArray[np.integer[Any]], intensity: Array) -> S
     root = np.sqrt([part.size for part in by_level])
     floor, slope = _fit_line(level, found, 1.0 / root)
     normal_scatter = np.sqrt(2.0) * np.maximum(floor + slope * level, found.mean() * 1e-6)
-    return SampleNoise(*_fit_line(level, found, np.maximum(scatter, normal_scatter) / root), dark)
+    floor, slope = _fit_line(level, found, np.maximum(scatter, normal_scatter) / root)
+    factor = float(variance.mean() / np.mean(floor + slope * (mean - dark)))
+    relative_sd = float(variance.std() / (variance.mean() * np.sqrt(variance.size)))
+    return SampleNoise(factor * floor, factor * slope, dark, relative_sd)
 
 
 def _fit_line(level: Array, found: Array, sd: Array) -> tuple[float, float]:

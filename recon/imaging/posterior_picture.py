@@ -22,19 +22,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.held_out import SplitSums, log_average, pixel_means, representative_weights
-from recon.imaging.kernel_picture import (
-    PictureEstimate,
-    choose_width,
-    find_reached,
-    kernel_mean,
-    smooth,
-)
+from recon.imaging.held_out import SplitSums, log_average, pixel_means, representative_weights, shrunk_weight
+from recon.imaging.kernel_picture import PictureEstimate, choose_width, find_reached
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.posterior_sd import measure_scale, variance_at_centres, variance_from_neighbours
 from recon.imaging.posterior_solver import LANES, Fields, Stencil, build_stencil, solve
 from recon.imaging.scene_covariance import measure_covariance, unresolved_variance
-from recon.imaging.stationary_prior import CentreDetail, fit_spectrum, measure_centre_detail, stationary_mean
+from recon.imaging.smoothing import kernel_mean, smooth
+from recon.imaging.stationary_prior import fit_spectrum, measure_centre_detail, stationary_mean
 from scanner.arrays import Array
 
 GRADIENT_SMOOTHING = 0.6
@@ -78,6 +73,10 @@ narrower: gaps between the lines of a scan are seldom wider."""
 MIN_STATIONARY_WEIGHT = 0.05
 """Weight of the picture under the stationary prior below which it is left out: it gains less than 1 %."""
 
+CURVATURE_WIDTH_PX = 1.5
+"""Window in which the squared difference of the pixels' centres and means is averaged: the picture determines its size
+nearby, but its value in no pixel [px]."""
+
 COARSE_TOLERANCE, FINE_TOLERANCE = 0.15, 0.03
 """Relative residuals of the solutions: for the comparison of strengths, and for the picture."""
 
@@ -118,22 +117,24 @@ def posterior_picture(samples: SplitSums, noise: SampleNoise, initial_strength: 
     solved = _posterior_means(stencil, means, samples.counts * precision, strengths, start, FINE_TOLERANCE)
     image = _inner(solved) @ weights
     scene = measure_covariance(samples.kept_sums, kept_counts)
-    image, mean, detail = _add_stationary(image, mean, samples, judged, precision, fit_spectrum(scene))
+    data, spectrum = samples.counts * precision, fit_spectrum(scene)
+    image, mean, weight = _add_stationary(image, mean, samples, judged, precision, spectrum)
 
-    data = samples.counts * precision
     predicted = variance_from_neighbours(_weights(gradients, SD_POWER), kept_counts * precision, strength)
     expected = float(unresolved_variance(scene, data).mean() / predicted.mean())
     predicted *= measure_scale(samples, mean, precision, predicted, expected)
+    detail = measure_centre_detail(spectrum, float(data.mean())).damped(weight)
     variance, share = variance_at_centres(predicted, data, detail)
+    curvature = smooth((_mean_over_pixel(image) - image) ** 2, CURVATURE_WIDTH_PX)
     reached = find_reached(samples.counts, max(width, MIN_REACH_WIDTH_PX))
-    sd = np.sqrt(variance + (_mean_over_pixel(image) - image) ** 2)
+    sd = np.sqrt(variance + (1.0 - weight) * curvature)
     image, sd = np.where(reached, image, np.nan), np.where(reached, sd, np.nan)
     return PictureEstimate(image, sd, share, width, strength)
 
 
 def _add_stationary(
     image: Array, mean: Array, samples: SplitSums, judged: Array, precision: Array, spectrum: Array
-) -> tuple[Array, Array, CentreDetail]:
+) -> tuple[Array, Array, float]:
     """Average pictures with those under the stationary prior.
 
     Args:
@@ -144,21 +145,19 @@ def _add_stationary(
         spectrum: of the stationary prior.
 
     Returns:
-        Both averages, and the detail at the pixels' centres.
+        Both averages, and the weight of the stationary prior.
     """
     kept, kept_counts = pixel_means(samples.kept_sums, samples.kept_counts), samples.kept_counts
     scene_mean = float(samples.kept_sums.sum() / kept_counts.sum())
     stationary = stationary_mean(kept, kept_counts * precision, spectrum, scene_mean)
     difference = stationary - mean
     residual = pixel_means(samples.held_sums, samples.held_counts) - mean
-    scale = float(np.vdot(judged * difference, difference))
-    weight = min(max(float(np.vdot(judged * difference, residual)) / scale, 0.0), 1.0) if scale > 0 else 0.0
+    weight = shrunk_weight(judged * difference, difference, residual)
     if weight < MIN_STATIONARY_WEIGHT:
-        return image, mean, CentreDetail(1.0, 1.0)
+        return image, mean, 0.0
     means, data = pixel_means(samples.sums, samples.counts), samples.counts * precision
-    detail = measure_centre_detail(spectrum, float(data.mean())).damped(weight)
     stationary = stationary_mean(means, data, spectrum, scene_mean, stationary)
-    return image + weight * (stationary - image), mean + weight * difference, detail
+    return image + weight * (stationary - image), mean + weight * difference, weight
 
 
 def _sample_precision(mean: Array, noise: SampleNoise, scene_variance: float) -> Array:

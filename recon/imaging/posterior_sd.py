@@ -17,8 +17,8 @@ from __future__ import annotations
 import numpy as np
 
 from recon.imaging.held_out import CORRELATED_ERRORS, LOG_SCALES, SplitSums, pixel_means, scale_with_prior
-from recon.imaging.kernel_picture import smooth
 from recon.imaging.posterior_solver import LANES, build_stencil, draw_noise, multiply, solve
+from recon.imaging.smoothing import smooth
 from recon.imaging.stationary_prior import CentreDetail
 from scanner.arrays import Array
 

@@ -23,9 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.imaging.held_out import SplitSums
-from recon.imaging.kernel_picture import PictureEstimate, smooth
+from recon.imaging.kernel_picture import PictureEstimate
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.posterior_picture import MIN_VARIANCE_OF_SCENE, NOISE_LEVEL_WIDTH_PX, posterior_picture
+from recon.imaging.smoothing import smooth
 from scanner.arrays import Array
 
 BLOCK_WIDTHS_PX = (1.5, 3.0, 6.0)
@@ -39,9 +40,9 @@ a factor of 4 are as fine as a single residual determines a variance."""
 PRIOR_UNCHANGED = 0.5
 """Fraction of unchanged blocks in the prior of the fractions. The changes share the rest equally."""
 
-PRIOR_WEIGHT = 0.2
+PRIOR_WEIGHT = 0.05
 """Weight of that prior in the estimated fractions. It keeps a change possible in a scene that was at rest so far. With
-0.5, ten earlier frames gain 0.6 dB less at rest."""
+0.2, ten earlier frames gain 0.3 dB less at rest, and changes that nothing showed make the intervals too wide."""
 
 ITERATIONS = 10
 """Iterations of expectation maximisation. More of them change the fractions by less than the prior does."""

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.imaging.kernel_picture import REACH
+from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
 
 FOLDS = 8

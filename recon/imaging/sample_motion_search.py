@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from recon.imaging.kernel_picture import REACH
 from recon.imaging.sample_motion_equations import ScanSamples
+from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
 
 CELL_PX = 2.0

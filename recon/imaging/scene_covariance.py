@@ -16,7 +16,7 @@ from scipy import fft
 from scipy.optimize import nnls
 
 from recon.imaging.held_out import pixel_means
-from recon.imaging.kernel_picture import smooth
+from recon.imaging.smoothing import smooth
 from scanner.arrays import Array
 
 MAX_LAG_PX = 24

@@ -149,6 +149,7 @@ def test_a_posterior_frame_uses_earlier_frames_unless_they_are_independent(resul
     posterior = replace(result, picture_kind="posterior")
     with_earlier, independent = (list(frames(posterior, 3, independent=alone).estimates()) for alone in (False, True))
     assert np.array_equal(with_earlier[0].picture.image, independent[0].picture.image)
+    assert np.median(with_earlier[2].sd) < 0.9 * np.median(independent[2].sd)
     whole = result.picture.image
     errors = [np.nanstd(each[2].picture.image - whole) for each in (with_earlier, independent)]
     assert errors[0] < 0.8 * errors[1]

@@ -67,3 +67,26 @@ def test_the_noise_of_few_pairs_is_not_biased() -> None:
         assert noise is not None
         ratios.append(noise.variance(level).mean() / level.mean())
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.03)
+
+
+def test_what_the_samples_of_a_crossing_share_is_noise_of_their_mean() -> None:
+    """Ten samples in a crossing, whose mean varies by detail within the pixel from crossing to crossing."""
+    rng = np.random.default_rng(6)
+    crossed = np.tile(np.arange(500), 12)
+    shared = rng.normal(0.0, 2.0, crossed.size)
+    noise = measure_sample_noise(crossed.repeat(10), shared.repeat(10) + rng.normal(0.0, 1.0, 10 * crossed.size))
+    assert noise is not None
+    mean_variance = noise.variance(np.array(0.0)) / 10
+    assert mean_variance == pytest.approx(2.0**2 + 0.1, rel=0.05)
+    assert noise.relative_sd == pytest.approx(np.sqrt(2.0 / (500 * 11)), rel=0.3)
+
+
+def test_noise_that_does_not_follow_the_intensity_is_right_in_the_mean() -> None:
+    """Detail within the pixels is strong at medium intensity."""
+    rng = np.random.default_rng(7)
+    pixel = np.tile(np.arange(3000), 8)
+    level = np.linspace(0.0, 100.0, 3000)
+    sd = 1.0 + 4.0 * (np.abs(level - 50.0) < 15.0)
+    noise = measure_sample_noise(pixel, level[pixel] + sd[pixel] * rng.normal(size=pixel.size))
+    assert noise is not None
+    assert noise.variance(level).mean() == pytest.approx(np.mean(sd**2), rel=0.05)

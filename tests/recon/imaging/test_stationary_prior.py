@@ -7,10 +7,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from recon.imaging.held_out import SplitSums, pixel_means, representative_weights
-from recon.imaging.kernel_picture import find_reached, kernel_mean, smooth
+from recon.imaging.kernel_picture import find_reached
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.posterior_picture import posterior_picture
 from recon.imaging.scene_covariance import measure_covariance
+from recon.imaging.smoothing import kernel_mean, smooth
 from recon.imaging.stationary_prior import fit_spectrum, measure_centre_detail, stationary_mean
 from scanner.arrays import Array
 
