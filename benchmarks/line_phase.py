@@ -111,7 +111,7 @@ def _common_bound(frame: Array, fill: float, shift: float, photons: float, frame
     """Bound of an error common to all frames of a film whose picture and fill are not known [px].
 
     A line of one direction is compared with the mean of its neighbours of the other direction, all frames added up.
-    What differs between lines of the picture is noise then, of the spectrum along the lines that it has in this picture.
+    What differs between lines of the picture is noise then, whose spectrum along the lines is that of the picture.
 
     Args:
         frame: mean brightness without a shift. shift: between the directions at the middle [px].
