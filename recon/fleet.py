@@ -57,7 +57,7 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
     """Return the files, and the recordings (``*.h5``) in the folders, in the order of their names.
 
     Raises:
-        BadInput: a folder holds no recording.
+        BadInput: a folder holds no recording, or nothing of all that is there.
     """
     found: list[Path] = []
     for place in places:
@@ -65,6 +65,8 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
         if not inside:
             raise BadInput("holds no recording (*.h5)", file=place, hint="name the folder of the recordings")
         found += inside
+    if not any(path.exists() for path in found):
+        raise BadInput("no such file or folder", file=places[0], hint="name recordings (HDF5), or their folder")
     return list(dict.fromkeys(found))
 
 
