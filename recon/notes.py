@@ -32,6 +32,9 @@ COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative."""
 
 
+LOGARITHMIC_UNIT = "dB"
+"""Beginning of the units of logarithms: dB, dBm, dBV."""
+
 MIN_NEGATIVE_SHARE = 0.95
 """Share of negative samples from which a voltage is taken for that of an inverting detector. A detector that is coupled
 without its mean has about a half."""
@@ -143,7 +146,7 @@ def describe_lower_rail(intensity: Channel) -> list[str]:
 def describe_polarity(intensity: Channel) -> list[str]:
     """A line for each detector of which nearly all samples are negative; counts have ``describe_negative_counts``."""
     values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
-    if intensity.unit in COUNT_UNITS:
+    if intensity.unit in COUNT_UNITS or intensity.unit.startswith(LOGARITHMIC_UNIT):
         return []
     shares = np.mean(values.reshape(len(values), -1) < 0.0, axis=0)
     return [
@@ -161,7 +164,17 @@ def _detector_names(intensity: Channel) -> list[str]:
 
 def describe_intensity(intensity: Channel) -> list[str]:
     """Lines on the values of an intensity that are doubtful."""
-    return [*describe_negative_counts(intensity), *describe_polarity(intensity)]
+    return [*describe_negative_counts(intensity), *describe_polarity(intensity), *describe_logarithms(intensity)]
+
+
+def describe_logarithms(intensity: Channel) -> list[str]:
+    """A line for an intensity in decibels, whose means are no means of the light."""
+    if not intensity.unit.startswith(LOGARITHMIC_UNIT):
+        return []
+    return [
+        f"intensity: is in {intensity.unit}, and a pixel is the mean of logarithms, in which noise makes dark places "
+        "darker: convert the samples to a linear unit first"
+    ]
 
 
 def describe_negative_counts(intensity: Channel) -> list[str]:

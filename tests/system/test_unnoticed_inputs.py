@@ -12,8 +12,9 @@ import lissajous
 from recon.cli import main
 from recon.quality.overflow import count_overflows
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.recording import Recording
-from tests.support.two_axis_scan import EDGES, FIELD, RATE_HZ, READOUTS, SAMPLES, angles, light, sensors
+from tests.support.two_axis_scan import EDGES, FIELD, RATE_HZ, READOUTS, SAMPLES, angles, crossings, light, sensors
 
 
 @cache
@@ -94,6 +95,22 @@ def test_an_intensity_too_slow_for_the_motion_is_noted() -> None:
     (line,) = [note for note in notes if "record at a higher rate" in note]
     assert line.startswith("intensity: at 20000 Hz the beam moves by ")
     assert "of the field in x and" in line
+
+
+def test_an_intensity_in_decibels_is_noted_and_not_called_inverted() -> None:
+    level = 20.0 * np.log10(np.maximum(channels()["intensity"][0], 1e-3))
+    _, notes = limits_and_notes({**channels(), "intensity": (level, "dB", RATE_HZ)})
+    assert [note for note in notes if note.startswith("intensity: is in dB, and a pixel is the mean of logarithms")]
+    assert not any("invert the channel" in note for note in notes)
+
+
+@pytest.mark.parametrize("event", ["zero-crossing-up", "turn"])
+def test_an_event_at_one_place_and_an_angle_at_another_are_refused(event: str) -> None:
+    """A detector beside the centre that gives upward edges would be taken for one in the centre."""
+    times = crossings("x")
+    with pytest.raises(BadInput, match=f"sync_x: states event {event}, which is at the .* and a detector at 0.03 rad"):
+        Recording.from_arrays({"sync_x": (times, "s", {"event": event, "angle": 0.03})}, Device.from_toml(EDGES))
+    Recording.from_arrays({"sync_x": (times, "s", {"event": event, "angle": 0.0})}, Device.from_toml(EDGES))
 
 
 def test_a_dead_detector_is_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
