@@ -176,6 +176,15 @@ def test_no_command_overwrites_what_it_reads(tmp_path: Path, capsys: pytest.Capt
     assert before == (table.read_bytes(), device.read_bytes())
 
 
+def test_times_of_day_are_named_as_no_numbers(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    lines = "".join(f"12:00:00.{k:06d},{k}\n" for k in range(40))
+    (tmp_path / "log.csv").write_text("Time,CH1 (V)\n" + lines, encoding="utf-8")
+    words = "holds no table of numbers: in line 2 '12:00:00.000000' is no number"
+    refused(
+        ["convert", str(tmp_path / "log.csv"), "--channel", "sense_x=CH1", "-o", str(tmp_path / "o")], words, capsys
+    )
+
+
 def test_combs_driven_at_the_resonance_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     known = ["--resonance-x", "10000", "--drive-frequency-x", "10000"]
     words = "combs move the mirror at half of that; its resonance is 10000 Hz; drive it near 20000 Hz"
