@@ -16,11 +16,16 @@ def lock_in_amplitude(recording: Recording, axis: Axis) -> tuple[Array, Array, b
     """Times [s] and amplitude of an axis, shape (n,), and whether the amplitude is in rad.
 
     A voltage is converted by the gain of a sensor of the motion, at the resonance for velocity and acceleration; behind
-    another readout it stays a voltage.
+    another readout it stays a voltage. A constant amplitude, as under a control loop, is one.
+
+    Raises:
+        BadInput: it holds no sample that can be used, or is zero.
     """
     channel = recording[f"amplitude_{axis.name}"]
-    check_signal(channel, gaps_ok=True)
+    check_signal(channel, constant_ok=True, gaps_ok=True)
     values = channel.read()
+    if not np.nan_to_num(values).any():
+        raise BadInput("is 0 throughout", file=channel.file, channel=channel.name, hint="check that it was connected")
     if channel.unit == "rad" or not isinstance(axis.readout, MotionSensor):
         return channel.time(), values, channel.unit == "rad"
     rate = 2 * np.pi * axis.resonance if axis.readout.order else 1.0

@@ -144,6 +144,17 @@ def test_a_lock_in_amplifier_of_the_cosine_is_named() -> None:
         assert f"check unit, sign and reference of phase_{axis}, which belongs to the sine" in line
 
 
+def test_a_controlled_amplitude_is_constant_and_one_of_zero_is_refused() -> None:
+    held = lock_in(0.0)
+    for axis in "xy":
+        amplitude, *about = held[f"amplitude_{axis}"]
+        held[f"amplitude_{axis}"] = (np.full(amplitude.size, amplitude.mean()), *about)
+    limits, _ = limits_and_notes(held, EDGES)
+    assert limits == []
+    with pytest.raises(BadInput, match="amplitude_y: is 0 throughout; check that it was connected"):
+        limits_and_notes({**held, "amplitude_y": (0.0 * held["amplitude_y"][0], *held["amplitude_y"][1:])}, EDGES)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
