@@ -39,10 +39,12 @@ class Fleet:
     Attributes:
         folders: by recording.
         done: recordings whose folders an earlier run has completed.
+        made: the output folder, if there was none before; None else.
     """
 
     folders: Mapping[Path, Path]
     done: frozenset[Path]
+    made: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
         BadInput: ``output`` cannot be written, or holds results of other options or of a recording that has changed.
     """
     check_folder(output)
+    made = None if output.exists() else output
     output.mkdir(exist_ok=True)
     before = {} if overwrite else _read_job(output)
     hint = "add --overwrite, or name another folder with -o"
@@ -108,7 +111,7 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
             done.add(path)
     with replacing(output / JOB_FILE) as beside:
         write_json(beside, {"options": options, "recordings": known})
-    return Fleet(folders, frozenset(done))
+    return Fleet(folders, frozenset(done), made)
 
 
 def run_fleet(
@@ -141,6 +144,11 @@ def run_fleet(
             for path in left:
                 if _run_round([path], fleet, work, scheduler, 1, failures, bar):
                     failures[path] = Failure(f"{path}: its worker was killed (out of memory?)", 1)
+        except BadInput:
+            if fleet.made is not None and list(fleet.made.iterdir()) == [fleet.made / JOB_FILE]:  # no scheduler answers
+                (fleet.made / JOB_FILE).unlink()
+                fleet.made.rmdir()
+            raise
         except KeyboardInterrupt:
             reason = f"interrupted; {bar.n} of {len(fleet.folders)} recordings are done, the same command continues"
             raise InterruptedError(errno.EINTR, reason, str(next(iter(fleet.folders.values())).parent)) from None

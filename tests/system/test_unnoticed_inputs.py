@@ -205,6 +205,17 @@ def test_combs_driven_at_the_resonance_are_refused(tmp_path: Path, capsys: pytes
     assert main(["new-device", "--kind", "electromagnetic", *known, "-o", str(output)]) == 0
 
 
+def test_a_scheduler_that_does_not_answer_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    pytest.importorskip("distributed")
+    for name in ("first", "second"):
+        Recording.from_arrays(channels(), Device.from_toml(READOUTS + FIELD)).write(tmp_path / f"{name}.h5")
+    for made in (False, True):
+        (tmp_path / "out").mkdir() if made else None
+        arguments = ["reconstruct", str(tmp_path), "-o", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9"]
+        refused(arguments, "no Dask scheduler answers at tcp://127.0.0.1:9", capsys)
+        assert (tmp_path / "out").exists() == made
+
+
 def test_a_fleet_that_is_not_there_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     refused(
         ["diagnose", "--each", str(tmp_path / "none"), "-o", str(tmp_path / "out")], "no such file or folder", capsys
