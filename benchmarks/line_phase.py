@@ -1,6 +1,6 @@
 """Line phase of simulated resonant raster films: this program beside two methods that microscopists use.
 
-    python -m benchmarks.line_phase [--frames 40] [--photons 20] [--first SEED]
+    python -m benchmarks.line_phase [--frames 40] [--photons 20] [--first SEED] [--bounds]
 
 Films of 512 x 512 pixels whose phase drifts as a random walk. Each method's figure is the displacement between the two
 directions that its correction leaves, rms over columns and frames. Whole-pixel phase correlation is one shift a film
@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tifffile
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from phantoms.raster_film import count_photons, scan_raster_frame
 from phantoms.targets import TISSUES, load_tissue
@@ -35,6 +35,10 @@ BLUR_PX = 1.0
 WALK_PX = 0.02
 """Standard deviation of the phase's step from frame to frame."""
 FILLS = (0.0, 0.85)
+MEAN_SHIFT_PX = 3.5
+"""Mean size of the shift in the films, for the bound of the fill [px]."""
+COMMON_SMOOTHING_PX = 8
+"""Distance, and number of frequencies to either side, over which the differences of lines are averaged [px]."""
 
 
 def draw_cells(seed: int) -> Array:
@@ -103,6 +107,37 @@ def _smoothed_bound(bound: float) -> float:
     return float(np.sqrt(walk * noise / np.sqrt(walk**2 + 4.0 * walk * noise)))
 
 
+def _common_bound(frame: Array, fill: float, shift: float, photons: float, frames: int) -> float:
+    """Bound of an error common to all frames of a film whose picture and fill are not known [px].
+
+    A line of one direction is compared with the mean of its neighbours of the other direction, all frames added up.
+    What differs between lines of the picture is noise then, whose spectrum along the lines is that of the picture.
+
+    Args:
+        frame: mean brightness without a shift. shift: between the directions at the middle [px].
+    """
+    u, counts = column_places(SIDE_PX), frame * (photons / frame.mean())
+    line, neighbours = counts[1:-1:2], 0.5 * (counts[:-2:2] + counts[2::2])
+    photon_noise = 1.5 * line / frames
+    scale = np.sqrt(gaussian_filter((line - neighbours) ** 2, COMMON_SMOOTHING_PX) + photon_noise)
+    power = np.mean(np.abs(np.fft.fft((line - neighbours) / scale, axis=1)) ** 2, axis=0) / SIDE_PX
+    power = uniform_filter1d(power + np.mean(photon_noise / scale**2), 2 * COMMON_SMOOTHING_PX + 1, mode="wrap")
+    step = 1e-4
+    by_fill = shift * (lag_at(u, fill**2 + step) - lag_at(u, fill**2)) / step
+    slopes = [np.gradient(line, axis=1) * each / scale for each in ([lag_at(u, fill**2), by_fill] if fill else [1.0])]
+    lines = [np.fft.fft(each, axis=1) / np.sqrt(SIDE_PX) for each in slopes]
+    information = [[float(np.sum((a.conj() * b).real / power)) for b in lines] for a in lines]
+    return float(np.sqrt(np.linalg.inv(information)[0, 0]))
+
+
+def bounds(scene: str, fill: float, seed: int, frames: int, photons: float) -> list[str]:
+    """One row of the table of bounds."""
+    frame = scan_raster_frame(draw_scene(scene, seed), (SIDE_PX, SIDE_PX), 0.0, fill)
+    smoothed = _smoothed_bound(_bound(frame, lag_at(column_places(SIDE_PX), fill**2), photons))
+    common = _common_bound(frame, fill, MEAN_SHIFT_PX, photons, frames)
+    return [scene, f"{fill:g}", *(f"{each:.4f}" for each in (smoothed, common, np.hypot(smoothed, common)))]
+
+
 def measure(scene: str, fill: float, seed: int, frames: int, photons: float) -> list[str]:
     """One row of the table."""
     rng = np.random.default_rng(seed)
@@ -147,16 +182,21 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--photons", type=float, default=20.0)
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
+    parser.add_argument("--bounds", action="store_true", help="print bounds alone")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     warnings.simplefilter("ignore", RuntimeWarning)
     head = ["scene", "fill", "measured", "uncorrected", "whole pixel", "deinterlacing", "lissajous"]
     head += ["bound of a frame", "error of a frame alone", "bound smoothed", "smoothed", "stated sd"]
     head += ["95 % intervals hold: alone, smoothed"]
+    if args.bounds:
+        head = ["scene", "fill", "smoothed, picture and fill known", "common, both unknown", "together"]
     print("| " + " | ".join(head) + " |\n|" + " --- |" * len(head))
     for k, scene in enumerate(("cells", *TISSUES)):
         for m, fill in enumerate(FILLS):
-            row = measure(scene, fill, args.first + 1000 * (2 * k + m), args.frames, args.photons)
+            row = (bounds if args.bounds else measure)(
+                scene, fill, args.first + 1000 * (2 * k + m), args.frames, args.photons
+            )
             print("| " + " | ".join(row) + " |", flush=True)
 
 

@@ -16,11 +16,16 @@ def lock_in_amplitude(recording: Recording, axis: Axis) -> tuple[Array, Array, b
     """Times [s] and amplitude of an axis, shape (n,), and whether the amplitude is in rad.
 
     A voltage is converted by the gain of a sensor of the motion, at the resonance for velocity and acceleration; behind
-    another readout it stays a voltage.
+    another readout it stays a voltage. A constant amplitude, as under a control loop, is one.
+
+    Raises:
+        BadInput: it holds no sample that can be used, or is zero.
     """
     channel = recording[f"amplitude_{axis.name}"]
-    check_signal(channel, gaps_ok=True)
+    check_signal(channel, constant_ok=True, gaps_ok=True)
     values = channel.read()
+    if not np.nan_to_num(values).any():
+        raise BadInput("is 0 throughout", file=channel.file, channel=channel.name, hint="check that it was connected")
     if channel.unit == "rad" or not isinstance(axis.readout, MotionSensor):
         return channel.time(), values, channel.unit == "rad"
     rate = 2 * np.pi * axis.resonance if axis.readout.order else 1.0
@@ -39,9 +44,22 @@ def lock_in_angle(recording: Recording, axis: Axis, time: Array) -> Array:
         raise BadInput("is a voltage behind no sensor of the motion", channel=f"amplitude_{axis.name}", hint=hint)
     phase = recording.require(f"phase_{axis.name}", "the angle needs it beside the amplitude")
     unwrapped = np.unwrap(phase.read())
-    turn, _ = _reference_turn(recording, axis, time)
+    turn, _ = reference_turn(recording, axis, time)
     size = np.interp(time, at, amplitude)
     return np.asarray(size * np.sin(turn + np.interp(time, phase.time(), unwrapped)))
+
+
+def lock_in_values(recording: Recording, axis: Axis) -> tuple[Array, Complex]:
+    """Times (n,) [s] and amplitude exp(i phase) (n,) [rad or V], as recorded; values that are not finite are left out.
+
+    Raises:
+        ChannelMissing: no phase.
+    """
+    time, amplitude, _ = lock_in_amplitude(recording, axis)
+    phase = recording.require(f"phase_{axis.name}", "the frequency of the motion needs it beside the amplitude")
+    values = amplitude * np.exp(1j * np.interp(time, phase.time(), np.unwrap(phase.read())))
+    known = np.isfinite(values)
+    return time[known], values[known]
 
 
 def lock_in_phasor(recording: Recording, axis: Axis) -> tuple[Array, Complex, float]:
@@ -50,15 +68,12 @@ def lock_in_phasor(recording: Recording, axis: Axis) -> tuple[Array, Complex, fl
     Raises:
         ChannelMissing: no phase. BadInput: no reference frequency is stated.
     """
-    time, amplitude, _ = lock_in_amplitude(recording, axis)
-    phase = recording.require(f"phase_{axis.name}", "the frequency of the decay needs it beside the amplitude")
-    turn, frequency = _reference_turn(recording, axis, time)
-    angle = np.interp(time, phase.time(), np.unwrap(phase.read())) + turn - 2 * np.pi * frequency * time
-    known = np.isfinite(amplitude) & np.isfinite(angle)
-    return time[known], amplitude[known] * np.exp(1j * angle[known]), frequency
+    time, values = lock_in_values(recording, axis)
+    turn, frequency = reference_turn(recording, axis, time)
+    return time, values * np.exp(1j * (turn - 2 * np.pi * frequency * time)), frequency
 
 
-def _reference_turn(recording: Recording, axis: Axis, time: Array) -> tuple[Array, float]:
+def reference_turn(recording: Recording, axis: Axis, time: Array) -> tuple[Array, float]:
     """Phase of the reference at ``time`` [rad], and its mean frequency [Hz]."""
     phase = recording[f"phase_{axis.name}"]
     reference = phase.reference if phase.reference is not None else recording[f"amplitude_{axis.name}"].reference

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,7 +146,9 @@ def reconstruct(
     from recon.pipeline import reconstruct as reconstruct_recording
     from recon.reconstruction import Options
 
-    if not isinstance(pixels, Sequence) or len(pixels) != 2:
+    if not (
+        isinstance(pixels, Sequence) and len(pixels) == 2 and all(isinstance(n, Integral) and n > 0 for n in pixels)
+    ):
         raise BadInput(f"is {pixels!r}", channel="pixels", hint="give width and height, as (400, 400)")
     options = Options(
         estimator=estimator,

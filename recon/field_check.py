@@ -76,13 +76,13 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[s
         what = f"{share:.0%} of the samples lie outside the field of view ({sizes}; {grid.angle} angles)"
         if share > MAX_OUTSIDE_FRACTION_ALLOWED and not allow_outside:
             fields = "half_angle_x and half_angle_y, or angle, in [scan]"
-            hint = f"correct {fields}; --allow-outside makes the picture anyway"
+            hint = f"correct {fields}, or the gain of the sensors; --allow-outside makes the picture anyway"
             if max(amplitude) > MAX_MIRROR_ANGLE_RAD:
                 hint = (
                     f"no mirror turns so far: check gain in [x.readout], in V/rad, or the unit of the angles; or {hint}"
                 )
             raise DeviceInvalid(what, channel="scan", hint=hint)
-        notes.append(f"{what}; check [scan] of the device")
+        notes.append(f"{what}; check [scan] and the gain of the sensors in the device")
     notes += _describe_centres(grid, motion)
     if any(a < MIN_AMPLITUDE_FRACTION * h for a, h in zip(amplitude, half, strict=True)):
         notes.append(

@@ -39,10 +39,12 @@ class Fleet:
     Attributes:
         folders: by recording.
         done: recordings whose folders an earlier run has completed.
+        made: the output folder, if there was none before; None else.
     """
 
     folders: Mapping[Path, Path]
     done: frozenset[Path]
+    made: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
     """Return the files, and the recordings (``*.h5``) in the folders, in the order of their names.
 
     Raises:
-        BadInput: a folder holds no recording.
+        BadInput: a folder holds no recording, or nothing of all that is there.
     """
     found: list[Path] = []
     for place in places:
@@ -65,6 +67,8 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
         if not inside:
             raise BadInput("holds no recording (*.h5)", file=place, hint="name the folder of the recordings")
         found += inside
+    if not any(path.exists() for path in found):
+        raise BadInput("no such file or folder", file=places[0], hint="name recordings (HDF5), or their folder")
     return list(dict.fromkeys(found))
 
 
@@ -82,6 +86,7 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
         BadInput: ``output`` cannot be written, or holds results of other options or of a recording that has changed.
     """
     check_folder(output)
+    made = None if output.exists() else output
     output.mkdir(exist_ok=True)
     before = {} if overwrite else _read_job(output)
     hint = "add --overwrite, or name another folder with -o"
@@ -106,7 +111,7 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
             done.add(path)
     with replacing(output / JOB_FILE) as beside:
         write_json(beside, {"options": options, "recordings": known})
-    return Fleet(folders, frozenset(done))
+    return Fleet(folders, frozenset(done), made)
 
 
 def run_fleet(
@@ -139,6 +144,11 @@ def run_fleet(
             for path in left:
                 if _run_round([path], fleet, work, scheduler, 1, failures, bar):
                     failures[path] = Failure(f"{path}: its worker was killed (out of memory?)", 1)
+        except BadInput:
+            if fleet.made is not None and list(fleet.made.iterdir()) == [fleet.made / JOB_FILE]:  # no scheduler answers
+                (fleet.made / JOB_FILE).unlink()
+                fleet.made.rmdir()
+            raise
         except KeyboardInterrupt:
             reason = f"interrupted; {bar.n} of {len(fleet.folders)} recordings are done, the same command continues"
             raise InterruptedError(errno.EINTR, reason, str(next(iter(fleet.folders.values())).parent)) from None

@@ -32,9 +32,19 @@ COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative."""
 
 
+LOGARITHMIC_UNIT = "dB"
+"""Beginning of the units of logarithms: dB, dBm, dBV."""
+
 MIN_NEGATIVE_SHARE = 0.95
 """Share of negative samples from which a voltage is taken for that of an inverting detector. A detector that is coupled
 without its mean has about a half."""
+
+MAX_STEP_OF_FIELD = 0.1
+"""Way of the beam between two samples, of the field's width, from which a note says so: ten samples from edge to edge
+show no picture if each is an average over the way."""
+
+STEP_QUANTILE = 0.9
+"""Quantile of the ways that is compared: the flyback of a raster is left out."""
 
 MAX_SCANNER_HZ = 1e5
 """Frequency above which a motion is doubted: mirrors, fibres and stages that scan light resonate below 0.1 MHz."""
@@ -136,7 +146,7 @@ def describe_lower_rail(intensity: Channel) -> list[str]:
 def describe_polarity(intensity: Channel) -> list[str]:
     """A line for each detector of which nearly all samples are negative; counts have ``describe_negative_counts``."""
     values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
-    if intensity.unit in COUNT_UNITS:
+    if intensity.unit in COUNT_UNITS or intensity.unit.startswith(LOGARITHMIC_UNIT):
         return []
     shares = np.mean(values.reshape(len(values), -1) < 0.0, axis=0)
     return [
@@ -154,7 +164,17 @@ def _detector_names(intensity: Channel) -> list[str]:
 
 def describe_intensity(intensity: Channel) -> list[str]:
     """Lines on the values of an intensity that are doubtful."""
-    return [*describe_negative_counts(intensity), *describe_polarity(intensity)]
+    return [*describe_negative_counts(intensity), *describe_polarity(intensity), *describe_logarithms(intensity)]
+
+
+def describe_logarithms(intensity: Channel) -> list[str]:
+    """A line for an intensity in decibels, whose means are no means of the light."""
+    if not intensity.unit.startswith(LOGARITHMIC_UNIT):
+        return []
+    return [
+        f"intensity: is in {intensity.unit}, and a pixel is the mean of logarithms, in which noise makes dark places "
+        "darker: convert the samples to a linear unit first"
+    ]
 
 
 def describe_negative_counts(intensity: Channel) -> list[str]:
@@ -165,6 +185,22 @@ def describe_negative_counts(intensity: Channel) -> list[str]:
     return [
         f"intensity: {np.mean(values < 0.0):.2g} of the samples are negative, down to {np.nanmin(values):.4g} "
         f"{intensity.unit}, which counts cannot be: check the offset and whether the integers are unsigned"
+    ]
+
+
+def describe_coarse_sampling(beam: Motion, intensity: Channel, grid: Grid) -> list[str]:
+    """A line if the beam crosses much of the field between two samples: nothing smaller is resolved along that way."""
+    steps = {}
+    for axis, half_angle in zip(AXES, (grid.half_angle_x, grid.half_angle_y), strict=True):
+        moved = np.abs(np.diff(beam.axes[axis].angle.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))))
+        moved = moved[np.isfinite(moved)]
+        steps[axis] = float(np.quantile(moved, STEP_QUANTILE)) / (2.0 * half_angle) if moved.size else 0.0
+    coarse = [f"{step:.0%} of the field in {axis}" for axis, step in steps.items() if step > MAX_STEP_OF_FIELD]
+    if not coarse:
+        return []
+    return [
+        f"intensity: at {intensity.sample_rate:.6g} Hz the beam moves by {' and '.join(coarse)} from one sample to the "
+        "next: if the detector averages over that time, the picture shows nothing smaller; record at a higher rate"
     ]
 
 

@@ -27,6 +27,7 @@ from recon.imaging.sample_motion_correction import describe_sample_motion, measu
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.notes import (
     describe_clock_jumps,
+    describe_coarse_sampling,
     describe_intensity,
     describe_limits,
     describe_long_frames,
@@ -38,8 +39,10 @@ from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
 from recon.quality.dropped_samples import find_timing_break, restore_timing, slices_aligned
+from recon.quality.overflow import describe_overflows
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
+from recon.quality.structure import describe_unstructured
 from recon.reconstruction import Options, Reconstruction
 from recon.registration_segments import registration_segments
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
@@ -200,7 +203,11 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         defects=list(prepared.defects),
         unlocated_samples=sum(stop - first for first, stop in gridded.unlocated),
         affected=gridded.affected,
-        limits=[*describe_limits(*samples, prepared.defects), *estimate.limits],
+        limits=[
+            *describe_overflows(prepared.uncorrected),
+            *describe_limits(*samples, prepared.defects),
+            *(estimate.limits or describe_unstructured(gridded.picture, intensity)),
+        ],
         notes=[
             *estimated.field_notes,
             *gridded.field_notes,
@@ -210,6 +217,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_motion(motion, intensity),
             *describe_defects(prepared.defects),
             *describe_intensity(intensity),
+            *describe_coarse_sampling(beam, intensity, estimated.grid),
             *estimate.notes,
             *describe_long_frames(options.frame_time, intensity),
             *describe_unlocated(gridded.unlocated, intensity),

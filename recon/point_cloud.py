@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.rail import upper_rail
 from recon.estimated_motion import EstimatedMotion
 from recon.phase_and_drift import correct_readout_phase
 from recon.pipeline import estimate_motion
@@ -30,6 +31,10 @@ ANGLE_STEP_RAD = 1e-5
 
 MAX_RANGE_M = 2000.0
 """Range above which a note asks for the unit: small mirrors collect too little light from further away [m]."""
+
+
+MIN_RANGE_M = 1e-3
+"""Largest range below which a note asks for the unit: no range finder measures so near [m]."""
 
 
 @dataclass(frozen=True)
@@ -192,6 +197,13 @@ def _notes(geometry: Geometry, assumed: bool, distance: Array, estimated: Estima
         notes.append("[geometry] states no range_sd: the covariance holds the part of the angles alone")
     if (farthest := float(np.nanmax(distance))) > MAX_RANGE_M:
         notes.append(f"range: reaches {farthest:.4g} m; if these are millimetres, state the unit mm")
+    if farthest < MIN_RANGE_M:
+        notes.append(f"range: reaches {farthest:.3g} m only; it is a distance in metres, not a time of flight")
+    if (rail := upper_rail(distance[np.isfinite(distance)])) is not None:
+        notes.append(
+            f"range: {rail[1] / distance.size:.0%} of the values are exactly {rail[0]:.6g} m, the largest one: if that "
+            "stands for no return, store nan in its place"
+        )
     if zero := int(np.count_nonzero(distance <= 0.0)):
         notes.append(f"range: {zero} values of 0 or less were taken as no return")
     for axis in AXES:

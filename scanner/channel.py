@@ -305,8 +305,10 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
             lowest, highest = float(values[finite].min()), float(values[finite].max())
         low, high = min(low, lowest), max(high, highest)
     if low > high:
-        hint = "check that it was recorded"
-        raise BadInput("holds no sample that can be used", file=signal.file, channel=signal.name, hint=hint)
+        what, hint = "holds no sample that can be used", "check that it was recorded"
+        if dead := _dead_columns(signal):
+            what, hint = f"{' and '.join(dead)} hold{'s' * (len(dead) == 1)} no sample that can be used", "leave it out"
+        raise BadInput(what, file=signal.file, channel=signal.name, hint=hint)
     if missing and not gaps_ok:
         what = f"sample {earliest} at {signal.start + earliest / signal.sample_rate:.9g} s is not finite"
         others = f"is 1 other of {signal.size}" if missing == 2 else f"are {missing - 1} others of {signal.size}"
@@ -320,6 +322,17 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
     if low == high and not constant_ok:
         what = f"is constant, {low:.9g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check that it was connected")
+
+
+def _dead_columns(signal: Channel) -> list[str]:
+    """Names of the columns without a finite sample, where others have some."""
+    if len(signal.shape) == 1:
+        return []
+    alive = np.zeros(signal.shape[1], bool)
+    for first in range(0, signal.size, READ_CHUNK_SAMPLES):
+        alive |= np.isfinite(signal.stored(first, first + READ_CHUNK_SAMPLES)).any(axis=0)
+    names = signal.detectors or [f"detector {number}" for number in range(alive.size)]
+    return [name for name, live in zip(names, alive, strict=True) if not live] if alive.any() else []
 
 
 def _is_number(value: object) -> bool:

@@ -156,6 +156,8 @@ def new_device(
             what = f"is {each.resonance:g} Hz, and no {kind} scanner resonates below {MIN_RESONANCE_HZ:g} Hz"
             hint = f"{each.resonance:g} kHz are {1e3 * each.resonance:g} Hz"
             raise BadInput(what, channel=f"--resonance-{axis}", hint=hint)
+        if kind == "parametric" and each.resonance and each.drive_frequency:
+            _check_parametric_drive(axis, each.resonance, each.drive_frequency)
     filled = {axis: _fill(scanner, getattr(scanner, axis), axes[axis]) for axis in AXES}
     parts = [_heading(kind, scanner, filled), f"name = {json.dumps(name or kind)}"]
     if frequencies_only:
@@ -167,6 +169,18 @@ def new_device(
         parts.append(SHARED_READOUT)
     parts.append(_scan(scanner, axes, filled))
     return _aligned("\n\n".join(parts))
+
+
+def _check_parametric_drive(axis: str, resonance: float, drive: float) -> None:
+    """Check that combs, which move a mirror at half the drive's frequency, are not driven at the resonance itself.
+
+    Raises:
+        BadInput: the drive is nearer to the resonance than to twice the resonance.
+    """
+    if drive < sqrt(2.0) * resonance:
+        what = f"is {drive:g} Hz, and combs move the mirror at half of that; its resonance is {resonance:g} Hz"
+        hint = f"drive it near {2.0 * resonance:g} Hz, or state another kind"
+        raise BadInput(what, channel=f"--drive-frequency-{axis}", hint=hint)
 
 
 def _aligned(text: str) -> str:

@@ -68,7 +68,7 @@ def make_edges(name: str, values: ArrayLike, stated: Mapping[str, Any], file: st
 
     Raises:
         UnitUnknown: the unit is missing or no unit of time.
-        BadInput: no list of finite, increasing times, or neither event nor angle is stated.
+        BadInput: no list of finite, increasing times, neither event nor angle is stated, or they contradict each other.
     """
 
     def bad(what: str, hint: str) -> BadInput:
@@ -88,6 +88,10 @@ def make_edges(name: str, values: ArrayLike, stated: Mapping[str, Any], file: st
     for key in {"angle", "hysteresis"} & stated.keys():
         if not isinstance(stated[key], (int, float)) or isinstance(stated[key], bool) or not isfinite(stated[key]):
             raise bad(f"{key} is {stated[key]!r}, not a finite number", f"state {key} in rad")
+    if angle and event != "both-edges":
+        place = "the turning points" if event == "turn" else "the centre"
+        hint = "state one of them; an angle alone means the edges of both directions"
+        raise bad(f"states event {event}, which is at {place}, and a detector at {angle:g} rad", hint)
     times = times.astype(np.float64) * EDGE_UNITS[unit]
     if not np.isfinite(times).all():
         raise bad(f"edge {int(np.argmin(np.isfinite(times)))} is not finite", "remove it from the list")

@@ -35,6 +35,16 @@ def check_place(path: Path) -> None:
     check_writable(path.parent)
 
 
+def check_no_input(output: Path, *inputs: Path) -> None:
+    """Check that an output file is none of the files that the command reads, which it would destroy.
+
+    Raises:
+        BadInput: it is.
+    """
+    if output.exists() and any(each.exists() and output.samefile(each) for each in inputs):
+        raise BadInput("is read by this command and would be overwritten", file=output, hint="name another with -o")
+
+
 def check_writable(folder: Path) -> None:
     """Check that files can be made in a folder.
 

@@ -20,13 +20,15 @@ from estimation.identification.decay_without_angle import fit_decay_without_angl
 from estimation.identification.fits import (
     DrivenRecord,
     IdentifiedValue,
+    combine_values,
     fit_capacitance_profile,
     fit_mechanics,
     fit_ringdown,
 )
 from estimation.identification.lock_in_decay import fit_lock_in_decay
 from estimation.identification.reference_angle import ReferenceAngle, find_reference_angle, with_angle
-from estimation.identification.sweep import UNKNOWN_FILTER, SweptRecord, fit_swept
+from estimation.identification.sweep import SweptRecord
+from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
 from estimation.reference import drive_reference
 from estimation.slow.response import Response, frequency_responses
 from estimation.slow.response_selection import select_effects
@@ -186,10 +188,10 @@ class _AxisIdentification:
         electrostatic = self.axis.require_drive().kind == "electrostatic"
         phase = drive_reference(recording[f"drive_{self.name}"], "half-drive" if electrostatic else "drive")
         rate = 1.0 / float(time[1] - time[0])
-        self.driven += steady_segments(angle, drive, phase.frequency_at(time), rate)
-        held = recording.channels.get(reference.source) if reference.source.startswith("amplitude") else None
-        averaged = max(1, round(rate / held.sample_rate)) if held is not None else 1
-        self.swept.append(SweptRecord(DrivenRecord(angle, drive, phase.frequency, rate), time, phase, averaged))
+        lock_in = lock_in_output(recording, self.axis) if reference.source.startswith("amplitude") else None
+        self.swept.append(SweptRecord(DrivenRecord(angle, drive, phase.frequency, rate), time, phase, lock_in))
+        if lock_in is None:
+            self.driven += steady_segments(angle, drive, phase.frequency_at(time), rate)
         self.gain_tolerance = max(self.gain_tolerance, reference.gain_tolerance)
         return phase.frequency
 
@@ -242,10 +244,10 @@ class _AxisIdentification:
             self._take(axis, lambda axis: fit_mechanics(axis, self.driven))
         elif self.swept:
             before = dict(self.values)
-            self._take(axis, lambda axis: fit_swept(axis, self.swept))
+            fit = fit_swept_motion(axis, self.swept)
+            self._take(axis, lambda each: (fit if each is axis else fit_swept_motion(each, self.swept)).values)
             several = self.values != before
-            if several and any(record.averaged > 1 for record in self.swept):
-                self.notes.append(f"{self.name}: {UNKNOWN_FILTER}")
+            self.notes += [f"{self.name}: {line}" for line in fit.filters]
         if self.swept and not several:
             self.notes.append(
                 f"{self.name}: the driven motion does not determine J; record two or more drive frequencies, or a "
@@ -295,17 +297,6 @@ class _AxisIdentification:
                 key: abs(self.values[key].sd / self.values[key].value) for key in keys if self.values[key].value
             }
         return replace(axis, tolerance=tolerance)
-
-
-def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, IdentifiedValue]:
-    """Values of several recordings; those of one parameter are averaged with inverse variances as weights."""
-    values: dict[str, IdentifiedValue] = {}
-    for key in dict.fromkeys(key for each in found for key in each):
-        same = [each[key] for each in found if key in each]
-        weights = np.array([1.0 / each.sd**2 for each in same]) if len(same) > 1 else np.ones(1)
-        mean = float(np.average([each.value for each in same], weights=weights))
-        values[key] = IdentifiedValue(mean, float(weights.sum() ** -0.5) if len(same) > 1 else same[0].sd)
-    return values
 
 
 def fit_steady_tones(response: Response) -> dict[str, IdentifiedValue]:

@@ -118,6 +118,17 @@ def values_from_ratios(ratios: Array, covariance: Array) -> dict[str, Identified
     return {key: IdentifiedValue(float(values[key]), float(np.sqrt(g @ covariance @ g))) for key, g in jacobian.items()}
 
 
+def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, IdentifiedValue]:
+    """Values of several recordings; those of one parameter are averaged with inverse variances as weights."""
+    values: dict[str, IdentifiedValue] = {}
+    for key in dict.fromkeys(key for each in found for key in each):
+        same = [each[key] for each in found if key in each]
+        weights = np.array([1.0 / each.sd**2 for each in same]) if len(same) > 1 else np.ones(1)
+        mean = float(np.average([each.value for each in same], weights=weights))
+        values[key] = IdentifiedValue(mean, float(weights.sum() ** -0.5) if len(same) > 1 else same[0].sd)
+    return values
+
+
 def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, IdentifiedValue], Array]:
     """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, under a bias, ``J`` from a free decay, by fitting its trajectory.
 

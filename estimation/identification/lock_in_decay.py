@@ -11,8 +11,10 @@ from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
-DECAY_START = 0.97
-"""Amplitude over the largest at which the decay begins: the drive is off by then."""
+DECAY_START = 0.8
+"""Amplitude over the largest at which the decay begins. The drive is off by then, and the filter of the amplifier,
+which rounds the beginning, has settled if its response is short against the decay: with a delay of an eighth of the
+decay time Q is 0.02 % off, and 0.13 % from 0.97 on."""
 
 
 def fit_lock_in_decay(recording: Recording, axis: Axis) -> dict[str, IdentifiedValue]:

@@ -9,8 +9,8 @@ the rate of a swept reference in place of w, the average of a product would be t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,11 +30,22 @@ HOPS_PER_WINDOW = 16
 MIN_INVERSE_INERTIA_SDS = 3.0
 """Estimate of 1/J over its standard deviation from which J is reported: below, its interval includes infinity."""
 
-UNKNOWN_FILTER = (
-    "the lock-in amplifier is taken to average over the time between two values; the intervals include the difference "
-    "from a filter without effect"
-)
-"""Note on motion that a lock-in amplifier recorded."""
+
+@dataclass(frozen=True)
+class LockInOutput:
+    """Amplitude and phase of a motion behind a lock-in amplifier.
+
+    Attributes:
+        time: shape (m,) [s].
+        values: amplitude exp(i phase), shape (m,) [rad].
+        turn: phase of the reference at given times [rad].
+        frequency: mean frequency of the reference [Hz].
+    """
+
+    time: Array
+    values: Complex
+    turn: Callable[[Array], Array]
+    frequency: float
 
 
 @dataclass(frozen=True)
@@ -45,20 +56,17 @@ class SweptRecord:
         driven: angle and drive voltage.
         time: of its samples, shape (n,) [s].
         reference: phase of the motion's drive.
-        averaged: samples over which the complex amplitude of the angle was averaged, as by a lock-in amplifier.
+        lock_in: what a lock-in amplifier recorded, where the angle is interpolated from that.
     """
 
     driven: DrivenRecord
     time: Array
     reference: PhaseReference
-    averaged: int = 1
+    lock_in: LockInOutput | None = None
 
 
 def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, IdentifiedValue]:
     """``J``, ``b``, ``k``, ``k_over_J`` and ``b_over_J`` from swept or transient motion.
-
-    The torque is averaged as the angle was. No recording states the filter of a lock-in amplifier, so that the standard
-    deviations include the difference from a filter that averages over much less than the time between two values.
 
     Args:
         axis: its drive and its capacitance set the torque; its mechanics are not used.
@@ -75,14 +83,7 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
     stiffness, _, inverse = ratios
     if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
-    values = values_from_ratios(ratios, covariance)
-    if all(record.averaged == 1 for record in records):
-        return values
-    sharp = fit_swept(axis, [replace(record, averaged=1) for record in records])
-    return {
-        key: IdentifiedValue(value.value, float(np.hypot(value.sd, value.value - sharp.get(key, value).value)))
-        for key, value in values.items()
-    }
+    return values_from_ratios(ratios, covariance)
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,6 @@ class _Equations:
 
 def _equations(axis: Axis, record: SweptRecord) -> _Equations:
     """The equations of a record at its overlapping windows."""
-    from scipy.ndimage import uniform_filter1d
-
     rate = record.driven.rate
     hop = max(1, round(WINDOW_CYCLES * rate / record.reference.frequency / HOPS_PER_WINDOW))
     w = 2.0 * np.pi * _strongest_frequency(record, hop)
@@ -112,7 +111,6 @@ def _equations(axis: Axis, record: SweptRecord) -> _Equations:
     angle, torque = (
         (values - values.mean()) * carrier for values in (record.driven.angle, drive_torque(axis, record.driven))
     )
-    torque = uniform_filter1d(torque.real, record.averaged) + 1j * uniform_filter1d(torque.imag, record.averaged)
     hann, first, second = _windows(hop, rate)
     windows = tuple(
         np.asarray(each, np.complex128) for each in (hann, 1j * w * hann + first, second + 2j * w * first - w**2 * hann)

@@ -49,9 +49,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from phantoms.optics import Detector
     from phantoms.waveforms import Sine
     from scanner import devices
-    from scanner.files import check_place
+    from scanner.files import check_no_input, check_place
 
     check_place(args.output)
+    check_no_input(args.output, Path(args.device), Path(args.target))
 
     experiment = Experiment(
         device=devices.find(args.device),

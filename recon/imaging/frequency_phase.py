@@ -49,6 +49,10 @@ PERIODS_PER_SEARCH = 12
 """Periods of the slower axis in which the phases are searched at once: enough to cross most of the field, and half of a
 slice of the registration, within which the phase drifts less."""
 
+MIN_PERIODS_OF_SEARCH = 0.75 * PERIODS_PER_SEARCH
+"""Periods of the slower axis from which a failed search has another cause than its length: a recording is cut into
+slices of 0.75 times ``PERIODS_PER_SEARCH`` at least, unless it is shorter as a whole."""
+
 MAX_CLOSED_PERIODS = PERIODS_PER_SEARCH // 4
 """Periods of the slower axis after which a figure that repeats is named as the cause of a failed search."""
 
@@ -105,7 +109,7 @@ def phases_from_picture(
     axes = _axes(references, phases, logs, intensity)
     axes = {name: axis.negated() if flips.get(name, False) else axis for name, axis in axes.items()}
     if not any(measured.values()):
-        raise BadInput(_describe_failure(references, found, slices, intensity), channel="intensity", hint=SEARCH_HINT)
+        raise _search_failure(references, found, slices, intensity)
     info = {"picture": {"rounds": rounds, "slices": len(errors), "told": measured}}
     return replace(motion, axes=axes, info={**motion.info, **info}), [*_notes(measured, len(errors)), *notes]
 
@@ -172,7 +176,7 @@ def _phases_of_slices(
             phases[name] = _knots(np.array([time for time, _ in clear]), value)
             notes += [] if is_unique else [AMBIGUOUS.format(name=name)]
     if not phases:
-        raise BadInput(_describe_failure(references, found, slices, intensity), channel="intensity", hint=SEARCH_HINT)
+        raise _search_failure(references, found, slices, intensity)
     return {name: phases.get(name, _constant(0.0, intensity, UNKNOWN_PHASE_SD)) for name in AXES}, notes
 
 
@@ -185,22 +189,36 @@ SEARCH_HINT = (
     "sense or angle channel is then needed"
 )
 
+SHORT_HINT = (
+    "record for longer, or record a sense or angle channel of both axes; or record both drives and state J, b and k of "
+    "both axes, which give phases to about 10 degrees"
+)
 
-def _describe_failure(
+
+def _search_failure(
     references: Mapping[str, PhaseReference],
     found: list[SliceFound],
     slices: list[tuple[int, int]],
     intensity: Channel,
-) -> str:
-    """What the search found, with what it would have needed."""
+) -> BadInput:
+    """What the search found, with what it would have needed: a longer recording before anything else."""
+    slower = min(AXES, key=lambda name: references[name].frequency)
+    length = (slices[0][1] - slices[0][0]) / intensity.sample_rate
+    periods = length * references[slower].frequency
+    if periods < MIN_PERIODS_OF_SEARCH:
+        what = (
+            f"holds {periods:.3g} periods of {slower} at {references[slower].frequency:.6g} Hz, and nothing else shows "
+            f"the motion; the search of its phases in the picture needs about {PERIODS_PER_SEARCH}"
+        )
+        return BadInput(what, file=intensity.file, channel=intensity.name, hint=SHORT_HINT)
     best = max((getattr(each, name).correlation for each in found for name in AXES), default=0.0)
     at = " and ".join(f"{references[name].frequency:.8g} Hz in {name}" for name in AXES)
-    length = (slices[0][1] - slices[0][0]) / intensity.sample_rate
-    return (
+    what = (
         f"forward and backward half-periods agree for no phase, with motions at {at} (best correlation "
         f"{min(best, 1.0):.2f}; frequencies have to be right within {0.1 / length:.2g} Hz)"
         f"{_describe_closed_figure(references, length)}"
     )
+    return BadInput(what, file=intensity.file, channel=intensity.name, hint=SEARCH_HINT)
 
 
 def _describe_closed_figure(references: Mapping[str, PhaseReference], length: float) -> str:
@@ -209,8 +227,9 @@ def _describe_closed_figure(references: Mapping[str, PhaseReference], length: fl
     for q in range(1, MAX_CLOSED_PERIODS + 1):
         p = round(q * max(x, y) / min(x, y))
         if abs(q * max(x, y) - p * min(x, y)) * length < 1.0:
+            repeats = round(length * min(x, y) / q)
             return (
-                f"; the frequencies are nearly {p} : {q}, so that the figure repeats itself {PERIODS_PER_SEARCH // q} "
+                f"; the frequencies are nearly {p} : {q}, so that the figure repeats itself {repeats} "
                 "times while phases are searched, and crosses little of the field: choose others, see lissajous design"
             )
     return ""

@@ -28,7 +28,7 @@ from recon.imaging.phase_search import (
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
-from scanner.motion import Motion
+from scanner.motion import AxisMotion, Motion
 
 PERIODS_PER_SLICE = 25
 """Periods of the slower axis whose samples are compared: they cover the field, and clocks hardly run apart in them."""
@@ -146,7 +146,7 @@ def describe_contradictions(beam: Motion, intensity: Channel) -> list[str]:
     """
     slices = match_slices(beam, intensity)
     found, unfollowed = judge_slices(slices)
-    lines = [_describe(each, float(np.median(beam.axes[each.axis].frequency))) for each in found]
+    lines = [_describe(each, beam.axes[each.axis]) for each in found]
     if unfollowed and not found:
         lines.append(
             "intensity: samples of one place differ between forward and backward half-periods at any phase, so that "
@@ -172,9 +172,9 @@ def describe_contradictions(beam: Motion, intensity: Channel) -> list[str]:
     return lines
 
 
-def _describe(found: Contradiction, frequency: float) -> str:
-    """The line on one axis, which moves at ``frequency`` [Hz]."""
-    name = found.axis
+def _describe(found: Contradiction, moved: AxisMotion) -> str:
+    """The line on one axis with its motion."""
+    name, frequency = found.axis, float(np.median(moved.frequency))
     what = (
         f"{name}: forward and backward half-periods disagree (correlation {found.agreement:.2f}), so that the picture "
         f"is wrong; "
@@ -193,6 +193,11 @@ def _describe(found: Contradiction, frequency: float) -> str:
             f"different during the scan: check that the sample rates of intensity and sensors are right"
         )
     line = what + f"they agree at a phase {np.degrees(typical):+.0f}° away (correlation {found.best:.2f}): "
+    if moved.sign == f"known: phase_{name}":
+        return line + (
+            f"check unit, sign and reference of phase_{name}, which belongs to the sine: angle = amplitude "
+            "sin(2π reference t + phase)"
+        )
     if abs(typical) > pi / 2 - SEARCH_REACH_RAD:
         return line + f"check kind in [{name}.readout], as velocity and position differ by 90°, or start of channels"
     late = 1e6 * typical / (2 * pi * frequency)

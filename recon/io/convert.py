@@ -38,7 +38,7 @@ from scanner.channel import AMPLITUDE_CHANNELS, PHASE_CHANNELS, Channel, LazySam
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput
-from scanner.files import read_toml
+from scanner.files import check_no_input, read_toml
 from scanner.hdf5 import check_ends
 from scanner.recording import Recording
 
@@ -80,6 +80,7 @@ def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, 
     Raises:
         BadInput: as :func:`convert`.
     """
+    check_no_input(output, source, *([] if isinstance(mapping, Mapping) else [mapping]))
     check_ends(source)
     plan, plan_source = _plan(mapping)
     contents = _contents(source, plan, plan_source)

@@ -13,11 +13,11 @@ import numpy as np
 
 from estimation.reference import tone_frequency
 from estimation.signs import sign_from_edges
-from scanner.channel import Channel, check_signal
+from scanner.channel import Channel, LazySamples, check_signal
 from scanner.device import AXES, Axis, Device
 from scanner.edges import Edges
 from scanner.errors import BadInput
-from scanner.motion import Motion
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from scanner.stages import Mechanics, MotionSensor
 
@@ -72,7 +72,8 @@ def describe_inverted_sensors(recording: Recording, device: Device) -> Iterator[
 def describe_unconfirmed_signs(recording: Recording, device: Device, motion: Motion) -> Iterator[str]:
     """Yield a line for every axis whose sign rests on the gain in the device file alone, or contradicts edges.
 
-    One line more names all axes whose sign rests on what is stated of their edges.
+    A motion from edges is compared with a sensor and a linear drive of the same axis. One line more names all axes
+    whose sign rests on what is stated of their edges.
 
     Args:
         recording: that the motion was estimated from.
@@ -107,12 +108,29 @@ def describe_unconfirmed_signs(recording: Recording, device: Device, motion: Mot
             f"a wrong sign mirrors the picture in {axis}, and --flip-{axis} turns it"
             + (f"; a recorded drive_{axis} would confirm it" if linear else "")
         )
-    yield from _describe_signs_by_edges(recording, motion)
+    yield from _describe_signs_by_edges(recording, device, motion)
 
 
-def _describe_signs_by_edges(recording: Recording, motion: Motion) -> Iterator[str]:
-    """Yield one line if the sign of any axis is that of its edges: half a turn off, they give the mirrored picture."""
-    decisive = {a: recording.edges[f"sync_{a}"] for a, moved in motion.axes.items() if moved.sign == f"known: sync_{a}"}
+def _describe_signs_by_edges(recording: Recording, device: Device, motion: Motion) -> Iterator[str]:
+    """Yield a line for every axis whose edges contradict a sensor or a drive, and one for all that nothing confirms.
+
+    Edges that are half a turn off give the mirrored picture.
+    """
+    decisive = {}
+    for axis, moved in motion.axes.items():
+        if moved.sign != f"known: sync_{axis}":
+            continue
+        edges, signs = recording.edges[f"sync_{axis}"], _signs_beside_edges(recording, device, axis, moved)
+        opposed = [name for name, sign in signs.items() if sign < 0]
+        if opposed:
+            key, value, opposite = _stated_side(edges)
+            yield (
+                f"{edges.name}: its edges move opposite to {' and '.join(opposed)}: {key} = {value} is wrong, or "
+                f"{' or '.join(opposed)} or its gain is inverted; if the edges, the picture is mirrored in {axis}: "
+                f"state {key} = {opposite} or give --flip-{axis}"
+            )
+        elif not any(signs.values()):
+            decisive[axis] = edges
     if not decisive:
         return
     stated, remedies = [], []
@@ -124,6 +142,20 @@ def _describe_signs_by_edges(recording: Recording, motion: Motion) -> Iterator[s
         f"the sign of {' and '.join(decisive)} rests on {' and '.join(stated)}, and the picture of the opposite is the "
         f"mirror image: compare it with a known target; {'; '.join(remedies)}"
     )
+
+
+def _signs_beside_edges(recording: Recording, device: Device, axis: str, moved: AxisMotion) -> dict[str, int]:
+    """By sensor and drive of an axis: 1 if it confirms the sign of a motion from edges, -1 if it opposes it, else 0."""
+    own, angle = device.axis(axis), moved.angle
+    samples = LazySamples((angle.size,), np.dtype(float), angle.read)
+    motion = Channel(f"sync_{axis}", "rad", angle.sample_rate, angle.start, samples, 0, angle.size)
+    sensor, signs = _sensor(recording, own, axis), {}
+    if sensor is not None:
+        signs[sensor[0].name] = _sign_by_reference(*sensor, motion)
+    lead = _lead_of_torque(recording, own, axis, motion, 1.0, 0)
+    if lead is not None:
+        signs[f"the torque of drive_{axis}"] = _sign_by_torque(device, axis, *lead)
+    return signs
 
 
 def _stated_side(edges: Edges) -> tuple[str, str, str]:
@@ -193,6 +225,11 @@ def _sign_by_angle(recording: Recording, axis: Axis, name: str) -> int:
     readout, channel, angle = axis.readout, recording.channels.get(f"sense_{name}"), recording[f"angle_{name}"]
     if channel is None or not isinstance(readout, MotionSensor):
         return 0
+    return _sign_by_reference(channel, readout.gain, readout.order, angle)
+
+
+def _sign_by_reference(channel: Channel, gain: float, order: int, angle: Channel) -> int:
+    """1 if a sensor of the ``order``-th derivative moves as an angle, -1 if opposite, 0 if neither."""
     try:
         check_signal(channel, gaps_ok=True)
         check_signal(angle, gaps_ok=True)
@@ -201,7 +238,7 @@ def _sign_by_angle(recording: Recording, axis: Axis, name: str) -> int:
         return 0
     if phasors is None or 0.5 * abs(phasors[0]) ** 2 <= MIN_DRIVEN_FRACTION * phasors[2]:
         return 0
-    cosine = np.cos(np.angle(phasors[0] / (readout.gain * 1j**readout.order) / phasors[1]))
+    cosine = np.cos(np.angle(phasors[0] / (gain * 1j**order) / phasors[1]))
     return int(np.sign(cosine)) if abs(cosine) > MIN_PHASE_SHARE else 0
 
 

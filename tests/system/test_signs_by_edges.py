@@ -14,6 +14,9 @@ from scanner.device import Device
 from scanner.recording import Recording
 from tests.support.two_axis_scan import EDGES, RATE_HZ, angles, crossings, edges, reconstruct
 
+UP = {"event": "zero-crossing-up"}
+READOUT_X = '[x.readout]\nkind = "position"\ngain = 20.0\nnoise_sd = 2e-3\n'
+
 
 def downward(axis: str) -> np.ndarray:
     """Times at which the axis passes the centre towards negative angles [s]."""
@@ -77,3 +80,53 @@ def test_the_summary_states_what_the_signs_by_edges_rest_on(tmp_path: Path, caps
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert summary["sign"]["x"] == "known: sync_x"
     assert len(sign_notes(summary["notes"])) == 1
+
+
+REFERENCES = {"angle_x": (0, "rad", EDGES), "velocity_x": (1, "rad/s", EDGES), "sense_x": (0, "V", EDGES + READOUT_X)}
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_a_sensor_of_the_same_axis_confirms_or_contradicts_the_edges(name: str) -> None:
+    order, unit, device = REFERENCES[name]
+    gain = 20.0 if unit == "V" else 1.0
+    signal = gain * (np.gradient(angles()["x"], 1.0 / RATE_HZ) if order else angles()["x"])
+    channels = edges(crossings("x"), crossings("y")) | {name: (signal, unit, RATE_HZ)}
+    for times, opposed in ((crossings("x"), False), (downward("x"), True)):
+        recording = Recording.from_arrays(channels | {"sync_x": (times, "s", UP)}, Device.from_toml(device))
+        notes = lissajous.reconstruct(recording, estimator="edges", pixels=(80, 80)).notes
+        assert any(note.startswith(f"sync_x: its edges move opposite to {name}") for note in notes) == opposed
+        (note,) = sign_notes(notes)
+        assert note.startswith("the sign of y rests on")
+
+
+@pytest.mark.parametrize("lag_deg", [40.0, 90.0, 140.0])
+def test_a_linear_drive_confirms_or_contradicts_the_edges(lag_deg: float) -> None:
+    drive = np.sin(2 * np.pi * 1870.0 * np.arange(angles()["x"].size) / RATE_HZ + 0.4 + np.radians(lag_deg))
+    channels = edges(crossings("x"), crossings("y")) | {"drive_x": (drive, "V", RATE_HZ)}
+    device = EDGES.replace("[y]", '[x.drive]\nkind = "linear"\ntorque_per_volt = 1e-9\n[y]')
+    for times, opposed in ((crossings("x"), False), (downward("x"), True)):
+        recording = Recording.from_arrays(channels | {"sync_x": (times, "s", UP)}, Device.from_toml(device))
+        notes = lissajous.reconstruct(recording, estimator="edges", pixels=(80, 80)).notes
+        found = [note for note in notes if note.startswith("sync_x: its edges move opposite to the torque of drive_x")]
+        assert len(found) == opposed
+        assert not opposed or "state event = zero-crossing-down or give --flip-x" in found[0]
+        (note,) = sign_notes(notes)
+        assert note.startswith("the sign of y rests on")
+
+
+@pytest.mark.parametrize("drive", ["electrostatic", "none", "in phase"])
+def test_without_sensor_and_deciding_drive_the_sign_rests_on_the_edges(drive: str) -> None:
+    """Combs, no drive, and a torque in phase with the motion do not decide the sign."""
+    channels = edges(crossings("x"), crossings("y"))
+    device = EDGES
+    if drive != "none":
+        kind = 'kind = "linear"\ntorque_per_volt = 1e-9' if drive == "in phase" else 'kind = "electrostatic"'
+        device = EDGES.replace("[y]", f"[x.drive]\n{kind}\n[y]")
+        volts = np.sin(2 * np.pi * 1870.0 * np.arange(angles()["x"].size) / RATE_HZ + 0.4)
+        if drive == "in phase":
+            channels["drive_x"] = (volts, "V", RATE_HZ)
+        else:
+            channels["drive_x"] = (volts**2, "V", RATE_HZ)
+    recording = Recording.from_arrays(channels, Device.from_toml(device))
+    (note,) = sign_notes(lissajous.reconstruct(recording, estimator="edges", pixels=(80, 80)).notes)
+    assert note.startswith("the sign of x and y rests on")

@@ -354,7 +354,12 @@ def test_masked_samples_are_missing_samples() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
-    [({"device": {"x": 1}}, "is a dict, no device"), ({"pixels": 400}, "pixels: is 400; give width and height")],
+    [
+        ({"device": {"x": 1}}, "is a dict, no device"),
+        ({"pixels": 400}, "pixels: is 400; give width and height"),
+        ({"pixels": (50.5, 50)}, "pixels: is .50.5, 50.; give width and height"),
+        ({"pixels": (50, 0)}, "pixels: is .50, 0.; give width and height"),
+    ],
 )
 def test_arguments_of_a_wrong_type_are_named(arguments: dict, words: str) -> None:
     with pytest.raises(BadInput, match=words):

@@ -90,7 +90,8 @@ def read_csv(path: Path) -> Contents:
     else:
         first = next((at for at, line in enumerate(head) if is_numeric(line, *_marks(line))), None)
         if first is None:
-            raise BadInput("holds no table of numbers", file=path, hint="name its format in the mapping")
+            what = f"holds no table of numbers{_describe_other_field(head)}"
+            raise BadInput(what, file=path, hint="name its format in the mapping, or make every column numbers")
         separator, decimal = _marks(head[first])
         head = [_single_blanks(line, separator) for line in head]
         above = [split_fields(line.lstrip("#"), separator) for line in head[:first]]
@@ -131,6 +132,17 @@ def _marks(line: str) -> tuple[str, str]:
         if separator in line:
             return separator, "," if "," in line else "."
     return (" " if "," not in line and len(line.split()) > 1 else ","), "."
+
+
+def _describe_other_field(lines: Sequence[str]) -> str:
+    """Words on the first line that holds a number: its field that is none, as a time of day; empty without one."""
+    for number, line in enumerate(lines, 1):
+        separator, decimal = _marks(line)
+        parts = [part.strip() for part in line.split(separator)]
+        known = [parse_number(part, decimal) is not None for part in parts]
+        if any(part and good for part, good in zip(parts, known, strict=True)) and not all(known):
+            return f": in line {number} {parts[known.index(False)][:40]!r} is no number"
+    return ""
 
 
 def _single_blanks(line: str, separator: str) -> str:

@@ -134,6 +134,20 @@ def test_wrong_frequencies_are_refused(scale: float) -> None:
     assert f"{X * scale:.8g} Hz in x" in str(error.value)
 
 
+@pytest.mark.parametrize("channels", [("drive_x", "drive_y"), ()])
+@pytest.mark.parametrize("periods", [1.0, 1.5, 5.0])
+def test_a_recording_of_few_periods_is_refused_with_what_is_missing(periods: float, channels: tuple[str, ...]) -> None:
+    short = scan(*channels).slice(0.0, periods / Y + 1e-6)
+    with pytest.raises(BadInput) as error:
+        reconstruct(short, Options(pixels=(60, 60)), quiet=True)
+    line = str(error.value)
+    assert f"holds {periods:g} periods of y at 32" in line
+    assert "Hz, and nothing else shows the motion" in line
+    assert "needs about 12; record for longer, or record a sense or angle channel of both axes" in line
+    assert "J, b and k" in line
+    assert "nearly 4 : 1" not in line
+
+
 def test_a_device_without_frequency_or_field_is_refused() -> None:
     text = frequencies_only().to_toml()
     lines = [line for line in text.splitlines() if not line.startswith("frequency")]
