@@ -82,7 +82,7 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[s
                     f"no mirror turns so far: check gain in [x.readout], in V/rad, or the unit of the angles; or {hint}"
                 )
             raise DeviceInvalid(what, channel="scan", hint=hint)
-        notes.append(f"{what}; check [scan] and the gain of the sensors in the device")
+        notes.append(f"{what}; check [scan] and the gain")
     notes += _describe_centres(grid, motion)
     if any(a < MIN_AMPLITUDE_FRACTION * h for a, h in zip(amplitude, half, strict=True)):
         notes.append(

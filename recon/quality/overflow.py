@@ -22,9 +22,9 @@ WRAP_SHARE = 0.75
 MIN_WRAP_FRACTION = 0.8
 """Fraction of the jumps that exceed ``WRAP_SHARE``. Pulses of a detector jump by all sizes, few by the whole range."""
 
-MAX_EXTREME_FRACTION = 0.1
-"""Fraction of samples exactly at the two extreme values below which a signal passes all values between: a square wave
-has most samples there."""
+MIN_MIDDLE_FRACTION = 0.1
+"""Fraction of samples in the middle half of the range from which a signal passes all values between: a square wave and
+a scene of two levels have fewer there, an oscillation has a third."""
 
 
 def describe_overflows(recording: Recording) -> list[str]:
@@ -50,7 +50,7 @@ def count_overflows(values: Array) -> int:
     if finite.size < 2:
         return 0
     low, high = finite.min(), finite.max()
-    if np.mean((finite == low) | (finite == high)) > MAX_EXTREME_FRACTION:
+    if np.mean(np.abs(finite - 0.5 * (low + high)) < 0.25 * (high - low)) < MIN_MIDDLE_FRACTION:
         return 0
     steps = np.diff(finite) / (high - low)
     jumps = steps[np.abs(steps) > JUMP_SHARE]
