@@ -152,21 +152,21 @@ def _choose_terms(
     """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
     around_drift = _choose_around_drift(likelihood, nominal, stops[0], pool, progress)
     if around_drift is not None:
-        return _with_nonlinear_term(around_drift, nominal, pool, progress)
+        return _with_nonlinear_term(around_drift, nominal, pool, stops[0], progress)
     groups = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
     anchor, tried = fit_anchor(likelihood, nominal, early, stops, [group for group in groups if group])
     selected = _choose_laws(anchor, nominal, pool, progress)
     if selected is not None:
-        selected = _with_nonlinear_term(selected, nominal, pool, progress)
+        selected = _with_nonlinear_term(selected, nominal, pool, stops[0], progress)
         if selected.certain:
             return selected
     progress("discrepancy terms")
     of_discrepancy = [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])]
     discrepancy = _choose_discrepancy(anchor, of_discrepancy, nominal, pool)
     if discrepancy is None:
-        return _with_nonlinear_term(_Selected(likelihood, nominal, nominal), nominal, pool, progress)
+        return _with_nonlinear_term(_Selected(likelihood, nominal, nominal), nominal, pool, stops[0], progress)
     laws = _choose_laws(discrepancy.fit, nominal, pool, progress)
-    return _with_nonlinear_term(laws if laws and laws.certain else discrepancy, nominal, pool, progress)
+    return _with_nonlinear_term(laws if laws and laws.certain else discrepancy, nominal, pool, stops[0], progress)
 
 
 def _choose_around_drift(
@@ -244,11 +244,17 @@ def _nonlinear_starts(likelihood: Likelihood, base: Fit, pool: Sequence[Candidat
     return sorted(promising, key=lambda score: -score.predicted_gain)[:MAX_NONLINEAR_STARTS]
 
 
-def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected:
+def _with_nonlinear_term(
+    selected: _Selected, nominal: Fit, pool: Sequence[Candidate], first: float, progress: Progress
+) -> _Selected:
     """The selection with a law that is linear in no amplitude, as a clip level or a mode that grows, where one gains.
 
     The named laws are chosen again beside it. Where free corrections beside the selected laws have no evidence, such a
     law has none either; where they take the bulk of the misfit, it is sought beside them and not in their place.
+
+    Args:
+        first: end of the first window of a fit over growing windows, as a fraction of the recordings. A mode that grows
+            is determined early, while the misfit of the whole recording has several minima.
     """
     if selected.leaves_nothing:
         return selected
@@ -270,7 +276,8 @@ def _with_nonlinear_term(selected: _Selected, nominal: Fit, pool: Sequence[Candi
     need = need_of_laws(beside, laws, misfit(base) - misfit(best), alone)
     if not need.possible:
         return selected
-    best = fit_to_convergence(selected.likelihood, best.model, best.x)
+    converged = fit_to_convergence(selected.likelihood, best.model, best.x)
+    best = min(converged, fit_growing(selected.likelihood, best.model, converged.x, first), key=misfit)
     progress(f"laws beside {best.model.candidates[-1].key}")
     with_laws = _choose_laws(best, nominal, pool, progress)
     if with_laws is not None:
