@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from estimation.device_fit.fit import fit_model
 from estimation.device_fit.model import Model
-from estimation.diagnosis.diagnose import Diagnosis, Finding, diagnose, nominal_device
+from estimation.diagnosis.diagnose import Diagnosis, diagnose, nominal_device
+from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.selection import Progress
 from estimation.slow.diagnose import diagnose_decays, slow_decays
 from estimation.slow.diagnose_response import diagnose_responses

@@ -18,7 +18,7 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, flat_psd, make_whitener
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
-from estimation.diagnosis.shares import MAX_HELD_OUT_CHI2
+from estimation.diagnosis.shares import residual_is_noise
 from scanner.arrays import Array
 from scanner.errors import BadInput
 from scanner.terms import Term
@@ -72,7 +72,7 @@ def _has_absorbed_misfit(fit: Fit) -> bool:
     senses_alone = all(output.kind == "sense" for run in model.runs for output in run.outputs)
     if not (senses_alone and all(model.device.axes[axis].capacitance for axis in model.axes)):
         return False
-    return nominal_values_are_improbable(fit) and fit.validation_chi2 > MAX_HELD_OUT_CHI2
+    return nominal_values_are_improbable(fit) and not residual_is_noise(fit)
 
 
 @dataclass(frozen=True)

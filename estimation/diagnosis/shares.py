@@ -11,7 +11,7 @@ import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, held_out_samples
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.screening import all_candidates, score_candidates
+from estimation.diagnosis.screening import ScoreTest, all_candidates, score_candidates
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 
 MAX_HELD_OUT_CHI2 = 1.3
@@ -52,11 +52,16 @@ def misfit_by_channel(fit: Fit) -> dict[str, float]:
 
 
 def noise_by_channel(likelihood: Likelihood) -> dict[str, float]:
-    """Variance of every channel's noise in the compared band, averaged over its runs."""
+    """Variance of every channel's noise in the compared band, averaged over its runs.
+
+    Below the lowest bin that was measured, its level is used: the extrapolated level is an upper limit.
+    """
     values: dict[str, list[float]] = {}
     for run, whiteners in zip(likelihood.runs, likelihood.whiteners, strict=True):
         for output, whitener in zip(run.outputs, whiteners, strict=True):
-            variance = float(np.sum(whitener.psd)) * 2.0 / output.data.size**2
+            lowest = int(np.ceil(whitener.first))
+            power = float(np.sum(whitener.psd[lowest:])) + lowest * float(whitener.psd[lowest])
+            variance = power * 2.0 / output.data.size**2
             values.setdefault(output.name, []).append(variance)
     return {name: float(np.mean(runs)) for name, runs in values.items()}
 
@@ -68,6 +73,11 @@ def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
     return explained_share(without, complete, nominal, noise[name])
 
 
+def residual_is_noise(fit: Fit) -> bool:
+    """Whether the residual of a fit is called noise."""
+    return fit.validation_chi2 < MAX_HELD_OUT_CHI2
+
+
 def _channel(result: SelectionResult, step: SelectionStep) -> str:
     """The channel on which the term of a finding acts, or else the first that contains the motion of its axis."""
     candidate = step.candidate
@@ -76,34 +86,41 @@ def _channel(result: SelectionResult, step: SelectionStep) -> str:
     return (acted_on or [output.name for output in outputs])[0]
 
 
-def find_remainder(result: SelectionResult) -> dict[str, Any] | None:
-    """The largest unexplained share of a channel's misfit, and the stage whose discrepancy term would reduce it most.
+def find_correction(result: SelectionResult) -> ScoreTest | None:
+    """Score test of the discrepancy term that would explain most of what the final fit leaves.
 
-    Returns:
-        ``share``, ``stage`` and ``channel``; None if the residual is noise.
+    None if the residual is noise, or if the fit contains all discrepancy terms.
     """
     final = result.final
-    if final.validation_chi2 < MAX_HELD_OUT_CHI2:
-        return None
-    noise = noise_by_channel(result.likelihood)
-    complete, nominal = misfit_by_channel(final), misfit_by_channel(result.nominal)
-    share, name = max((remaining_share(complete[key], nominal[key], noise[key]), key) for key in complete)
-    if share < MIN_REMAINDER_SHARE:
+    if residual_is_noise(final):
         return None
     present = {candidate.key for candidate in final.model.candidates}
     discrepancies = all_candidates(final.model.device, final.model, DISCREPANCY_TERMS.values())
     scores = score_candidates(result.likelihood, final, [c for c in discrepancies if c.key not in present])
-    best = max(scores, key=lambda score: score.predicted_gain, default=None)
-    stage = "readout" if best is None else best.candidate.term.stage
-    return {"share": share, "stage": stage, "channel": name}
+    return max(scores, key=lambda score: score.predicted_gain, default=None)
+
+
+def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dict[str, Any] | None:
+    """The largest unexplained share of a channel's misfit, and the stage of the correction that would reduce it most.
+
+    Returns:
+        ``share``, ``stage`` and ``channel``; None if the residual is noise.
+    """
+    if residual_is_noise(result.final):
+        return None
+    noise = noise_by_channel(result.likelihood)
+    complete, nominal = misfit_by_channel(result.final), misfit_by_channel(result.nominal)
+    share, name = max((remaining_share(complete[key], nominal[key], noise[key]), key) for key in complete)
+    if share < MIN_REMAINDER_SHARE:
+        return None
+    return {"share": share, "stage": correction.candidate.term.stage if correction else "readout", "channel": name}
 
 
 def describe_unexplained(result: SelectionResult) -> str | None:
     """The unexplained misfit in words; None if the final fit is consistent with the noise."""
-    chi2 = result.final.validation_chi2
-    if chi2 <= MAX_HELD_OUT_CHI2:
+    if residual_is_noise(result.final):
         return None
-    parts = [f"held-out reduced chi-square is still {chi2:.2f}"]
+    parts = [f"held-out reduced chi-square is still {result.final.validation_chi2:.2f}"]
     noise = noise_by_channel(result.likelihood)
     for name, misfit in misfit_by_channel(result.final).items():
         data = [output.data for run in result.likelihood.runs for output in run.outputs if output.name == name]

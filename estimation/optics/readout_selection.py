@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from estimation.diagnosis.diagnose import Finding, ParameterEstimate
+from estimation.diagnosis.finding import Finding, ParameterEstimate
 from estimation.diagnosis.significance import DETECTION_THRESHOLD
 from estimation.least_squares import eliminate_backward
 from estimation.optics.readout_effects import (

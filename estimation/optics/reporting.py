@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.diagnosis.diagnose import Finding, ParameterEstimate, Rival
+from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
 from estimation.optics.candidates import OpticsEffect, natural_scales
 from estimation.optics.fit import UNRESOLVED_SD_CELLS, validation_error

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.diagnosis.diagnose import Finding
+from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
 from estimation.diagnosis.significance import DETECTION_THRESHOLD
 from estimation.least_squares import GaussianPosterior, eliminate_backward, gaussian_posterior

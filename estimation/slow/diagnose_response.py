@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimation.diagnosis.diagnose import Diagnosis, Finding, ParameterEstimate, Rival
+from estimation.diagnosis.diagnose import Diagnosis
+from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.slow.response import AMPLITUDE_LAWS, FEEDTHROUGH, SECOND_MODE, Response, ResponseFit, fit_response
 from estimation.slow.response_selection import fit_subsets, prediction_error, select_effects, with_common_modes
 from scanner.device import Axis, Device

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from estimation.device_fit.posterior import PICTURE_HALF_WIDTH_PX, PhaseError, phase_error, phase_portrait, waveform
-from estimation.diagnosis.diagnose import Diagnosis, Finding
+from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.effect_curve import effect_curve
+from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability, detectability
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from recon.report.conclusions import conclude_diagnosis, conclude_plan

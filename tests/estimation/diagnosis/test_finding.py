@@ -1,0 +1,42 @@
+"""Probability of a finding among its rivals and beside a residual that no law explains."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from estimation.diagnosis.finding import find_probabilities
+
+
+def step(effect: str, *rivals: tuple[str, float], gain: float = 100.0) -> SimpleNamespace:
+    """A selected law with rivals, whose -2 log evidence is larger by the given gaps."""
+
+    def candidate(name: str) -> SimpleNamespace:
+        return SimpleNamespace(term=SimpleNamespace(effect=name, free_parameters=("size",)))
+
+    fitted = tuple(SimpleNamespace(candidate=candidate(name), evidence_gap=gap) for name, gap in rivals)
+    before, after = SimpleNamespace(neg2_log_evidence=gain), SimpleNamespace(neg2_log_evidence=0.0)
+    return SimpleNamespace(candidate=candidate(effect), rivals=fitted, before=before, after=after)
+
+
+def test_probabilities_follow_the_evidence_of_law_rival_and_no_effect() -> None:
+    found = find_probabilities(step("second-mode", ("drive-lag", 2.0), gain=4.0), 0.0)
+    evidence = [1.0, 0.36788, 0.13534]  # exp of -0, -1 and -2
+    assert found == {
+        "second-mode": pytest.approx(evidence[0] / sum(evidence), rel=1e-4),
+        "drive-lag": pytest.approx(evidence[1] / sum(evidence), rel=1e-4),
+    }
+
+
+def test_a_law_that_explains_a_hundredth_of_what_it_leaves_is_improbable() -> None:
+    found = find_probabilities(step("second-mode", ("drive-lag", 2.0), gain=100.0), 9900.0)
+    assert found["unknown"] == pytest.approx(0.99)
+    assert found["second-mode"] == pytest.approx(0.01 / 1.36788, rel=1e-4)
+    assert sum(found.values()) == pytest.approx(1.0)
+
+
+def test_what_is_certain_without_a_fit_stays_certain_beside_a_remainder() -> None:
+    clipped = step("saturation")
+    clipped.candidate.term.free_parameters = ()
+    assert find_probabilities(clipped, 9900.0) == {"saturation": 1.0}
