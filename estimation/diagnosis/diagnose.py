@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from estimation.device_fit.data import prepare_run
+from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.open_loop import open_loop
 from estimation.diagnosis.finding import METRIC, Finding, find_effect
@@ -94,13 +94,25 @@ def diagnose(
     nominal = nominal_device(recordings, device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
     extended = with_driven_modes(runs, nominal)
-    diagnosis = build_diagnosis(select_terms(runs, extended, catalogue(), progress))
+    diagnosis = _diagnose_runs(runs, extended, progress)
     if extended is nominal:
         return diagnosis
     nominal_loops = {name: loop.to_json() for name, loop in open_loop(runs, nominal).items()}
     loops = {name: {**both, "nominal": nominal_loops[name]} for name, both in diagnosis.open_loop.items()}
     modes = describe_modes(runs, nominal, extended)
     return replace(diagnosis, verdict="mismatch", open_loop=loops, further_modes=modes)
+
+
+def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress) -> Diagnosis:
+    """The diagnosis of prepared recordings. Where every selected law is rejected, the others are selected from."""
+    terms = dict(catalogue())
+    while True:
+        result = select_terms(runs, device, terms, progress)
+        diagnosis = build_diagnosis(result)
+        if not result.steps or (diagnosis.search and diagnosis.search.steps):
+            return diagnosis
+        for step in result.steps:
+            terms.pop(step.candidate.term.effect)
 
 
 def nominal_device(recordings: Sequence[Recording], device: Device | None) -> Device:

@@ -15,6 +15,7 @@ from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
+from estimation.diagnosis.shares import residual_is_noise
 from scanner.device import Axis, Device
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 
@@ -47,7 +48,8 @@ def improve(result: SelectionResult) -> Improvement:
 
     As long as the device with all findings predicts worse than the nominal one, beyond the uncertainty of the
     comparison, the weakest finding is removed; a rail at which samples stand is certain and stays. Within that
-    uncertainty findings stay, but the nominal device takes the place of one with a larger error. A discrepancy term
+    uncertainty findings stay if they leave noise alone, but the nominal device takes the place of one with a larger
+    error; findings that leave more than noise have to improve the prediction. A discrepancy term
     always remains a finding, but if the device with its measured law predicts any channel of any run worse, the device
     with the named laws alone is returned, or the nominal one if that is worse too.
     """
@@ -61,8 +63,9 @@ def improve(result: SelectionResult) -> Improvement:
             options = [device, *([_without_discrepancy(result)] if unnamed and len(result.steps) > 1 else [])]
             better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
-        if not is_worse(nominal, improved):
-            if has_larger_error(nominal, improved):
+        larger = has_larger_error(nominal, improved)
+        if not larger or (residual_is_noise(result.final) and not is_worse(nominal, improved)):
+            if larger:
                 device, improved = stated, nominal
             return Improvement(result, device, nominal, improved)
         result = without_weakest(result)
