@@ -211,9 +211,13 @@ class Model:
         return tuple(terms)
 
     def outputs(self, x: Array, stop: float = 1.0) -> list[list[Array]]:
-        """Every compared channel of every run, up to the fraction ``stop`` of the recording."""
+        """Every compared channel of every run, up to the fraction ``stop`` of the recording.
+
+        Those of a diverging trajectory are not finite.
+        """
         axes = {name: self.nominal(name, x) for name in self.axes}
-        return [self._run_outputs(run, r, axes, x, stop) for r, run in enumerate(self.runs)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [self._run_outputs(run, r, axes, x, stop) for r, run in enumerate(self.runs)]
 
     def full_signals(self, x: Array, r: int = 0) -> list[Array]:
         """Every channel of one run on the integration grid, each shape (n + 1,), without additive waveforms."""
