@@ -136,7 +136,8 @@ def picture_caption(name: str, summary: Mapping[str, Any]) -> str:
     """A picture's name with its phase errors."""
     if not all("phase_rmse_deg" in summary[a] for a in AXES):
         return name
-    return f"{name}: phase error {summary['x']['phase_rmse_deg']:.2f}° in x, {summary['y']['phase_rmse_deg']:.2f}° in y"
+    x, y = (f"{summary[axis]['phase_rmse_deg']:.2g}°" for axis in AXES)
+    return f"{name}: phase error {x} in x, {y} in y"
 
 
 def picture_data_uri(image: Any, limits: tuple[float, float] | None = None) -> str:
