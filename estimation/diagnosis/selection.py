@@ -270,14 +270,14 @@ def _with_nonlinear_term(
     base, best = min(possible, key=lambda pair: pair[1].neg2_log_evidence, default=(None, None))
     if base is None or best is None or not evidence_gain(selected.likelihood, selected.fit, best):
         return selected
+    converged = fit_to_convergence(selected.likelihood, best.model, best.x)
+    best = min(converged, fit_growing(selected.likelihood, best.model, converged.x, first), key=misfit)
     discrepancies = list(filter(is_discrepancy, pool))
     without, beside = (linear_model(selected.likelihood, fit, discrepancies) for fit in (base, best))
     laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
     need = need_of_laws(beside, laws, misfit(base) - misfit(best), alone)
     if not need.possible:
         return selected
-    converged = fit_to_convergence(selected.likelihood, best.model, best.x)
-    best = min(converged, fit_growing(selected.likelihood, best.model, converged.x, first), key=misfit)
     progress(f"laws beside {best.model.candidates[-1].key}")
     with_laws = _choose_laws(best, nominal, pool, progress)
     if with_laws is not None:
