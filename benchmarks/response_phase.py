@@ -13,7 +13,6 @@ import numpy as np
 import lissajous
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.waveforms import Sine
-from recon.evaluation import truth_from_simulation
 from scanner import devices
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
@@ -71,9 +70,7 @@ def main() -> None:
         stripped = lissajous.Recording.from_arrays(stored, replace(device, axes=axes, readout=None))
         head = f"| {kind} | {seed} | {100 * off[0]:+.2f} %, {100 * off[1]:+.2f} % |"
         try:
-            result = lissajous.reconstruct(
-                stripped, truth=truth_from_simulation(truth), pixels=(200, 200), allow_outside=True
-            )
+            result = lissajous.reconstruct(stripped, truth=truth, pixels=(200, 200), allow_outside=True)
         except lissajous.BadInput as error:
             print(head, f"refused: {error} | | |", flush=True)
             continue

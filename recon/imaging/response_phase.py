@@ -1,9 +1,9 @@
 """The phase that drive, J, b and k give, compared with the phase that the picture shows, over half a turn.
 
 The registration corrects errors up to 15°. A stiffness off by its tolerance turns the phase of a resonance by more. The
-phases are therefore searched first (:mod:`recon.imaging.phase_search`). Where they differ and a stiffness within the
-tolerance explains them, the motion starts with them. Where none does and they are beyond the registration's reach,
-picture and device contradict each other.
+phases are therefore searched first (:mod:`recon.imaging.phase_search`). Where they are beyond that reach and a
+stiffness within the tolerance explains them, the motion starts with them. Where none does, picture and device
+contradict each other.
 """
 
 from __future__ import annotations
@@ -38,18 +38,14 @@ from scanner.recording import Recording
 SEARCHED_PHASE_SD = pi / PHASE_CELLS
 """Standard deviation of a phase by the search, one cell of it [rad]. The registration measures it anew."""
 
-MIN_PHASE_ERROR_SD = 3.0
-"""Phase error in these standard deviations from which the motion starts anew with the phases of the search: with its
-phase the amplitude is off, by up to tens of percent, which the registration does not correct."""
-
 
 class ResponseCheck(NamedTuple):
     """What the picture shows of the phases of a motion computed from drive and device.
 
     Attributes:
-        phases: of axes whose phase differs and is explained by a stiffness within the tolerance.
+        phases: of axes beyond the registration's reach that a stiffness within the tolerance explains.
         contradicted: axes that none explains.
-        notes: a line on each axis beyond the registration's reach.
+        notes: a line on each of both.
     """
 
     phases: dict[str, PhaseMeasurement]
@@ -77,16 +73,13 @@ def check_response(
             continue
         time = np.array([middle for middle, _ in clear])
         error = _nearest_errors([each for _, each in clear])
-        typical = abs(float(np.median(error)))
-        if typical <= MIN_PHASE_ERROR_SD * SEARCHED_PHASE_SD:
+        if abs(float(np.median(error))) <= SEARCH_REACH_RAD:
             continue
         axis = motion.axes[name]
         phase = np.interp(time, axis.time, axis.phase) + error - (pi if flips.get(name, False) else 0.0)
         explained = explain_phase(recording, device, name, float(phase[0]))
         away = f"{name}: the picture shows a phase {np.degrees(np.median(error)):+.0f}° from that of drive and device"
         allowed = f"{100 * TOLERANCE_REACH * stiffness_sd(device, name):.2g} %"
-        if explained is None and typical <= SEARCH_REACH_RAD:
-            continue
         if explained is None:
             check.contradicted.append(name)
             check.notes.append(
@@ -97,8 +90,6 @@ def check_response(
         turned, stiffness = explained
         phases = PhaseMeasurement(time, phase + (turned - phase[0]), np.full(time.size, SEARCHED_PHASE_SD))
         check.phases[name] = phases
-        if typical <= SEARCH_REACH_RAD:
-            continue
         check.notes.append(
             f"{away}; a stiffness {100 * stiffness:+.2f} % from k of the device explains it (allowed: {allowed}), and "
             "determines the amplitude"
