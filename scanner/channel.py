@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from math import isfinite, pi
@@ -72,6 +72,12 @@ def suggest_name(name: str) -> str:
     known = (*CHANNEL_UNITS, *AMPLITUDE_CHANNELS, "intensity", "sync_x", "sync_y")
     near = [] if name in known else get_close_matches(name.lower(), known, 1, MIN_NAME_SIMILARITY)
     return f"; is it {near[0]}?" if near else ""
+
+
+def list_names(names: Iterable[str]) -> str:
+    """The names of a recording's channels and what misspelt ones may be, as the end of a message."""
+    listed = sorted(names)
+    return ", ".join(listed) + "".join(f"; {name}{suggest_name(name)}" for name in listed if suggest_name(name))
 
 
 class SampleSource(Protocol):
@@ -318,6 +324,9 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
     low, high = sorted((signal.gain * low + signal.offset, signal.gain * high + signal.offset))
     if max(-low, high) > MAX_MAGNITUDE:
         what = f"reaches {max(-low, high):.3g} {signal.unit}"
+        raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
+    if 0.0 < high - low < 1.0 / MAX_MAGNITUDE:
+        what = f"changes by {high - low:.3g} {signal.unit} only"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:
         what = f"is constant, {low:.9g} {signal.unit}"

@@ -14,6 +14,7 @@ from scanner.errors import DeviceInvalid
 FINITE = {"must": "be a finite number"}
 POSITIVE = {"must": "be a number greater than 0"}
 NOT_NEGATIVE = {"must": "be a number, 0 or greater"}
+UNCERTAINTY = {"must": "be a number from 0 to 1, as it is relative: 5 % is 0.05"}
 NONZERO = {"must": "be a number other than 0"}
 WHOLE = {"must": "be a whole number greater than 0"}
 CAN_BE_OFF = {"optional": True}
@@ -22,6 +23,7 @@ _CONDITIONS: dict[str, Callable[[Any], bool]] = {
     FINITE["must"]: lambda number: True,
     POSITIVE["must"]: lambda number: number > 0,
     NOT_NEGATIVE["must"]: lambda number: number >= 0,
+    UNCERTAINTY["must"]: lambda number: 0 <= number <= 1,
     NONZERO["must"]: lambda number: number != 0,
     WHOLE["must"]: lambda number: isinstance(number, int) and number > 0,
 }
@@ -137,9 +139,9 @@ class Table:
         except DeviceInvalid as error:
             raise self.wrong(error) from None
 
-    def take_numbers(self, must: Mapping[str, Any] = FINITE) -> dict[str, float]:
-        """Read all numbers of the table, and leave texts, lists and tables."""
-        names = [name for name, value in self.rest.items() if not isinstance(value, (str, list, dict))]
+    def take_numbers(self, must: Mapping[str, Any] = FINITE, only: bool = False) -> dict[str, float]:
+        """Read all numbers of the table, and leave texts, lists and tables; those are wrong with ``only``."""
+        names = [name for name, value in self.rest.items() if only or not isinstance(value, (str, list, dict))]
         try:
             return {name: checked_number(self.rest.pop(name), must["must"], name) for name in names}
         except DeviceInvalid as error:

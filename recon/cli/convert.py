@@ -60,7 +60,7 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
     hint = "as --channel sense_x=CH2 --unit V --rate 5e6, or write a --mapping"
     channels: dict[str, dict[str, Any]] = {}
     for text in args.channel:
-        name, given, variable = text.partition("=")
+        name, given, variable = (part.strip() for part in text.partition("="))
         if not (name and given and variable) or name in channels:
             raise BadInput(f"{text!r} is not NAME=VARIABLE, or repeats a channel", channel="--channel", hint=hint)
         channels[name] = {"variable": variable.split(",") if "," in variable else variable}

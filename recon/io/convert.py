@@ -68,6 +68,18 @@ def open_any(path: Path, mapping: Path | Plan | None = None, growing: bool = Fal
     return Recording.open(path, growing) if mapping is None else convert(path, mapping)
 
 
+def check_different(paths: Sequence[Path]) -> None:
+    """Check that no recording is given twice: fitted together, it would count as two measurements.
+
+    Raises:
+        BadInput: one is.
+    """
+    files = [path.resolve() for path in paths]
+    for at, file in enumerate(files):
+        if file in files[:at]:
+            raise BadInput("is given twice", file=paths[at], hint="name each recording once")
+
+
 def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, Any]:
     """Write the recording that ``mapping`` makes of ``source``, chunk by chunk.
 
