@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from math import isfinite, pi
@@ -59,25 +59,6 @@ PHASE_CHANNELS = ("phase_x", "phase_y")
 
 DBM_LEVEL_V = float(np.sqrt(2.0 * 50.0 * 1e-3))
 """Amplitude of a sine of 1 mW in 50 ohm [V]: 0 dBm as spectrum analysers and lock-in amplifiers state it."""
-
-
-MIN_NAME_SIMILARITY = 0.8
-"""Similarity (``difflib``) from which an unknown channel name counts as misspelt: one or two letters of six."""
-
-
-def suggest_name(name: str) -> str:
-    """The known channel name nearest to an unknown one, as the end of a message; empty if none is near."""
-    from difflib import get_close_matches
-
-    known = (*CHANNEL_UNITS, *AMPLITUDE_CHANNELS, "intensity", "sync_x", "sync_y")
-    near = [] if name in known else get_close_matches(name.lower(), known, 1, MIN_NAME_SIMILARITY)
-    return f"; is it {near[0]}?" if near else ""
-
-
-def list_names(names: Iterable[str]) -> str:
-    """The names of a recording's channels and what misspelt ones may be, as the end of a message."""
-    listed = sorted(names)
-    return ", ".join(listed) + "".join(f"; {name}{suggest_name(name)}" for name in listed if suggest_name(name))
 
 
 class SampleSource(Protocol):

@@ -14,7 +14,7 @@ from typing import Any
 import tomli_w
 
 from scanner import device_toml
-from scanner.device_toml import UNCERTAINTY
+from scanner.device_toml import NOT_NEGATIVE
 from scanner.errors import DeviceInvalid
 from scanner.files import parse_toml, read_toml
 from scanner.geometry import Geometry
@@ -257,4 +257,4 @@ def _readout(table: device_toml.Table) -> Readout | None:
 
 def _tolerance(table: device_toml.Table) -> dict[str, float]:
     tolerance = table.take_table("tolerance")
-    return {} if tolerance is None else tolerance.take_numbers(UNCERTAINTY, only=True)
+    return {} if tolerance is None else tolerance.take_numbers(NOT_NEGATIVE, only=True)

@@ -14,7 +14,6 @@ from scanner.errors import DeviceInvalid
 FINITE = {"must": "be a finite number"}
 POSITIVE = {"must": "be a number greater than 0"}
 NOT_NEGATIVE = {"must": "be a number, 0 or greater"}
-UNCERTAINTY = {"must": "be a number from 0 to 1, as it is relative: 5 % is 0.05"}
 NONZERO = {"must": "be a number other than 0"}
 WHOLE = {"must": "be a whole number greater than 0"}
 CAN_BE_OFF = {"optional": True}
@@ -23,7 +22,6 @@ _CONDITIONS: dict[str, Callable[[Any], bool]] = {
     FINITE["must"]: lambda number: True,
     POSITIVE["must"]: lambda number: number > 0,
     NOT_NEGATIVE["must"]: lambda number: number >= 0,
-    UNCERTAINTY["must"]: lambda number: 0 <= number <= 1,
     NONZERO["must"]: lambda number: number != 0,
     WHOLE["must"]: lambda number: isinstance(number, int) and number > 0,
 }

@@ -18,7 +18,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scanner.channel import READ_CHUNK_SAMPLES, Channel, list_names, make_channel
+from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
+from scanner.channel_names import list_names
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput, ChannelMissing

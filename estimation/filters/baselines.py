@@ -20,7 +20,8 @@ from estimation.signals import (
     white_noise_sd,
 )
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal, list_names, make_channel
+from scanner.channel import Channel, check_signal, make_channel
+from scanner.channel_names import list_names
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block, unwrap_phase

@@ -33,8 +33,9 @@ import numpy as np
 from recon.io.readers import read
 from recon.io.readers.column_names import TIME_UNITS, split_label
 from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock, matrix_row
+from recon.io.sampled_edges import find_edges
 from scanner.arrays import Array
-from scanner.channel import AMPLITUDE_CHANNELS, PHASE_CHANNELS, Channel, LazySamples, make_channel
+from scanner.channel import AMPLITUDE_CHANNELS, CONVERSIONS, PHASE_CHANNELS, Channel, LazySamples, make_channel
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput
@@ -286,6 +287,10 @@ def _edges(name: str, spec: Any, contents: Contents, source: Path, plan_source: 
     variable = contents.variables[spec["variable"]]
     times = flatten_row(variable.raw)[0 : variable.raw.shape[-1]]
     stated = {"unit": variable.unit} | {key: value for key, value in spec.items() if key != "variable"}
+    if stated["unit"] in CONVERSIONS["V"] and variable.sample_rate:  # the sync signal itself
+        event = str(stated.get("event", "both-edges"))
+        times = find_edges(np.asarray(times, np.float64), variable.sample_rate, variable.start or 0.0, event)
+        stated["unit"] = "s"
     return make_edges(name, times, stated, f"{source} by {plan_source}")
 
 
