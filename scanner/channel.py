@@ -348,5 +348,7 @@ def _channel_unit(name: str, unit: object, file: str | None) -> tuple[str, float
     if unit not in CONVERSIONS[channel_unit]:
         what = "unit is missing" if unit is None else f"unit {unit!r} is unknown"
         hint = f"accepted units: {', '.join(CONVERSIONS[channel_unit])}"
+        if channel_unit != "m" and str(unit).startswith(("m/s", "mm/s", "um/s")):
+            hint += "; divide a motion in metres by the distance of the spot from the axis"
         raise UnitUnknown(what, file=file, channel=name, hint=hint)
     return channel_unit, CONVERSIONS[channel_unit][str(unit)]

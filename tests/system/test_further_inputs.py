@@ -222,6 +222,12 @@ def test_a_sampled_sync_signal_gives_its_edges(
     assert np.abs(error - np.round(error)).max() * step / 2000.0 < 0.5e-6
 
 
+def test_a_velocity_in_metres_needs_the_distance_from_the_axis(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "ldv.csv").write_text("Time (s),CH1 (m/s)\n" + "".join(f"{k}e-6,{k % 7}\n" for k in range(40)))
+    words = "velocity_x: unit 'm/s' is unknown; accepted units: rad/s, mrad/s, deg/s; divide a motion in metres by"
+    refused(["convert", str(tmp_path / "ldv.csv"), "--channel", "velocity_x=CH1"], tmp_path, words, capsys)
+
+
 def test_a_sync_signal_needs_its_event(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "scope.csv").write_text("Time (s),CH1 (V)\n" + "".join(f"{k}e-6,{k % 7}\n" for k in range(40)))
     words = "sync_x: states neither event nor angle; state event as one of zero-crossing-up"
