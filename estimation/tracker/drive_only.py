@@ -157,9 +157,17 @@ def steady_state_estimate(observations: BlockObservations, device: Device) -> St
     motion = steady_motion_at(observations, stiffness, phase, log)
     x, P = np.zeros(AXIS_STATES + 1), np.zeros((AXIS_STATES + 1, AXIS_STATES + 1))
     x[PHASE], x[LOG_AMPLITUDE], x[STIFFNESS] = motion.phase, motion.log_amplitude, stiffness
-    triple, pair = [PHASE, LOG_AMPLITUDE, STIFFNESS], [PHASE, LOG_AMPLITUDE]
-    deviations = np.array([values - values[here] for values in (branch.phase, branch.log_amplitude, branch.stiffness)])
-    P[np.ix_(triple, triple)] = deviations * probability @ deviations.T
+    pair = [PHASE, LOG_AMPLITUDE]
+    is_measured = bool(np.isfinite(observations.signal.external_var).any())
+    stiffness_var = float(probability @ (branch.stiffness - stiffness) ** 2)
+    if is_measured:  # the filter follows the slope, and measurements correct it
+        change = np.array([*motion.by_parameters[:, 0], 1.0])
+        spread = stiffness_var * np.outer(change, change)
+    else:
+        each = (branch.phase, branch.log_amplitude, branch.stiffness)
+        deviations = np.array([values - values[here] for values in each])
+        spread = deviations * probability @ deviations.T
+    P[np.ix_([*pair, STIFFNESS], [*pair, STIFFNESS])] = spread
     # The calibrated damping is used as it is: it determines the amplitude, which the picture does not show.
     by_damping, damping_var = motion.by_parameters[:, 1], device.tolerance(name, "b") ** 2
     P[np.ix_(pair, pair)] += damping_var * np.outer(by_damping, by_damping) + np.diag(np.square(INITIAL_SD))
@@ -224,15 +232,18 @@ def _select_motion(observations: BlockObservations, branch: SteadyBranch) -> tup
     """Number of the steady motion at the start, and the probabilities of all, shape (n,).
 
     It is that of the device's stiffness, or of the mean one where the device's sustains no motion. Where a phase was
-    measured, it is the most probable one.
+    measured that it does not explain, it is the most probable one.
     """
     measured = observations.signal.external_phase[np.isfinite(observations.signal.external_var[:, 0]), 0]
+    is_sustained = branch.stiffness[0] <= 0.0 <= branch.stiffness[-1]
+    nominal = branch.nearest(0.0 if is_sustained else float(branch.probability @ branch.stiffness))
     if measured.size == 0:
-        is_sustained = branch.stiffness[0] <= 0.0 <= branch.stiffness[-1]
-        return branch.nearest(0.0 if is_sustained else float(branch.probability @ branch.stiffness)), branch.probability
+        return nominal, branch.probability
     period = 2 * np.pi / observations.signal.main_order
     error = branch.phase - measured[0]
     error -= period * np.round(error / period)
+    if abs(error[nominal]) < FIRST_PHASE_SD_RAD:  # the drift until then is no error of the stiffness at the start
+        return nominal, branch.probability
     log = np.log(branch.probability) - 0.5 * (error / FIRST_PHASE_SD_RAD) ** 2
     probability = np.exp(log - log.max())
     return int(np.argmax(log)), probability / probability.sum()
