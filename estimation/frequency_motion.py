@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import pi, sqrt
+from math import pi
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +10,12 @@ import numpy as np
 from estimation.reference import PhaseReference
 from estimation.signals import phase_reference
 from estimation.tracker.angle_synthesis import PhasorAngle, PhasorMotion
+from estimation.tracker.phase_measurements import UNKNOWN_PHASE_SD
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
-
-UNKNOWN_PHASE_SD = pi / sqrt(12)
-"""Standard deviation of a phase of which nothing is known but that it lies within half a turn [rad]."""
 
 
 class SlowCurve(NamedTuple):
@@ -35,9 +33,21 @@ class SlowCurve(NamedTuple):
     sd: Array
 
 
+def missing_for_motion(recording: Recording, device: Device) -> str | None:
+    """What the drives need to determine the motion and is not there, in words; None where nothing is missing."""
+    for name, axis in device.axes.items():
+        if axis.mechanics is None:
+            return f"[{name}.mechanics] is not stated"
+        if f"drive_{name}" not in recording:
+            return f"drive_{name} was not recorded"
+        if axis.capacitance is None and (axis.drive is None or axis.drive.kind == "electrostatic"):
+            return f"[{name}.capacitance] is not stated"
+    return None
+
+
 def is_motion_computable(recording: Recording, device: Device) -> bool:
-    """Whether the drives were recorded and the mechanics are stated, so that the drives determine the motion."""
-    return all(axis.mechanics and f"drive_{name}" in recording for name, axis in device.axes.items())
+    """Whether the drives were recorded and the device states their torque and the mechanics."""
+    return missing_for_motion(recording, device) is None
 
 
 def frequency_motion(recording: Recording, device: Device) -> Motion:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,10 @@ from scanner.terms import Term
 
 CHUNK_S = 0.01
 """Length integrated at a time [s]: 2 MB an axis at 10 MHz, so memory does not grow with the recording."""
+
+MIN_STEPS_PER_PERIOD = 8
+"""Steps of the integration in a period of the resonance. From 2 on the motion diverges; with 8 its damping is right to
+some percent of that of Q = 100."""
 
 START_ANGLE_RAD = 0.15
 """Angle from which a driven motion starts [rad]. The large branch of a parametric resonance is reached only from an
@@ -242,6 +247,21 @@ def _motion_pieces(
     yield {name: path.from_step(first) for name, path in paths.items()}
 
 
+def _check_steps(device: Device, plan: Plan) -> None:
+    """Check that the steps of the integration resolve the motion.
+
+    Raises:
+        BadInput: they do not.
+    """
+    for name, axis in device.axes.items():
+        mechanics = axis.require_mechanics()
+        frequency = float(np.sqrt(mechanics.k / mechanics.J)) / (2 * np.pi)
+        if plan.sample_rate * plan.substeps < MIN_STEPS_PER_PERIOD * frequency:
+            least = MIN_STEPS_PER_PERIOD * frequency / plan.substeps
+            what = f"{plan.sample_rate:g} samples a second are too few for {name}, of a resonance of {frequency:.6g} Hz"
+            raise BadInput(what, hint=f"simulate with {ceil(least)} or more")
+
+
 def _settling_steps(readout: Readout, step: float) -> int:
     """Steps after which the transients of a readout's sections are negligible; 2 for the derivatives of a motion."""
     if isinstance(readout, MotionSensor):
@@ -277,6 +297,7 @@ def simulate(
     if round(plan.duration * plan.sample_rate) < 2:
         what = f"{plan.duration:g} s at {plan.sample_rate:g} samples a second make no recording"
         raise BadInput(what, hint="simulate for longer, or faster")
+    _check_steps(device, plan)
     rng = np.random.default_rng(seed)
     parts: dict[str, list[Array]] = {}
     lead: dict[str, AxisTrajectory] = {}

@@ -164,7 +164,23 @@ def _detector_names(intensity: Channel) -> list[str]:
 
 def describe_intensity(intensity: Channel) -> list[str]:
     """Lines on the values of an intensity that are doubtful."""
-    return [*describe_negative_counts(intensity), *describe_polarity(intensity), *describe_logarithms(intensity)]
+    return [
+        *describe_infinite(intensity),
+        *describe_negative_counts(intensity),
+        *describe_polarity(intensity),
+        *describe_logarithms(intensity),
+    ]
+
+
+def describe_infinite(intensity: Channel) -> list[str]:
+    """A line for infinite samples, which are those of the most light where a type of small range made them."""
+    infinite = np.isinf(intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES)))
+    if not infinite.any():
+        return []
+    return [
+        f"intensity: {infinite.mean():.2g} of the samples are infinite and left out: if they were too large for their "
+        "type (float16 ends at 65504), bright places are too dark; store them in another type"
+    ]
 
 
 def describe_logarithms(intensity: Channel) -> list[str]:

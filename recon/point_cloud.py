@@ -101,7 +101,8 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
     if len(shots.shape) != 1:
         raise BadInput(f"has the shape {shots.shape}", channel="range", hint="one range a shot is needed, shape (n,)")
     if not _returned(shots.read()).any():
-        raise BadInput("holds no usable return", channel="range", hint="ranges are positive numbers in metres")
+        hint = "ranges are positive numbers in metres, and nan where there was no return"
+        raise BadInput("holds no usable return", file=recording.path, channel="range", hint=hint)
     stated = recording.channels.get("intensity")
     if stated is None:
         check_signal(shots, gaps_ok=True)
@@ -195,7 +196,7 @@ def _notes(geometry: Geometry, assumed: bool, distance: Array, estimated: Estima
         notes.append("the device states no [geometry]: one mirror, the beam along its normal, no lens")
     if not geometry.range_sd:
         notes.append("[geometry] states no range_sd: the covariance holds the part of the angles alone")
-    if (farthest := float(np.nanmax(distance))) > MAX_RANGE_M:
+    if (farthest := float(distance[_returned(distance)].max())) > MAX_RANGE_M:
         notes.append(f"range: reaches {farthest:.4g} m; if these are millimetres, state the unit mm")
     if farthest < MIN_RANGE_M:
         notes.append(f"range: reaches {farthest:.3g} m only; it is a distance in metres, not a time of flight")
@@ -204,8 +205,9 @@ def _notes(geometry: Geometry, assumed: bool, distance: Array, estimated: Estima
             f"range: {rail[1] / distance.size:.0%} of the values are exactly {rail[0]:.6g} m, the largest one: if that "
             "stands for no return, store nan in its place"
         )
-    if zero := int(np.count_nonzero(distance <= 0.0)):
-        notes.append(f"range: {zero} values of 0 or less were taken as no return")
+    for what, left_out in (("of 0 or less", distance <= 0.0), ("that are infinite", distance == np.inf)):
+        if count := int(np.count_nonzero(left_out)):
+            notes.append(f"range: {count} values {what} were taken as no return")
     for axis in AXES:
         if estimated.motion.axes[axis].sign.startswith("ambiguous"):
             notes.append(f"the sign of {axis} is not known: --flip-{axis} mirrors the points")

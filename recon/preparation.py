@@ -16,8 +16,9 @@ from recon.quality.drive_check import check_drives, check_rates, check_signals
 from recon.quality.duration_check import check_duration
 from recon.quality.sensor_sign import describe_inverted_sensors
 from scanner import devices
-from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS, Channel, check_signal, suggest_name
-from scanner.device import AXES, Device
+from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS, Channel, check_signal
+from scanner.channel_names import suggest_name
+from scanner.device import AXES, VALUES, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
@@ -175,6 +176,13 @@ def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:
         if name not in (*CHANNEL_UNITS, *AMPLITUDE_CHANNELS, "intensity") and name not in references:
             yield f"{name}: a channel of this name is not used{suggest_name(name)}"
     yield from describe_inverted_sensors(recording, device)
+    stated = {"": device.shared_tolerance, **{f"{name}.": axis.tolerance for name, axis in device.axes.items()}}
+    for prefix, tolerance in stated.items():
+        for key, relative in tolerance.items():
+            if key not in VALUES:
+                yield f"{prefix}tolerance.{key}: is the tolerance of no value of a device, and not used"
+            elif relative > 1.0:
+                yield f"{prefix}tolerance.{key}: is {relative:g}, that is {relative:.0%}; it is relative: 5 % is 0.05"
     for key in _dotted_keys({**device.extra, **{name: axis.extra for name, axis in device.axes.items()}}):
         yield f"{key}: is no key of a device, and not used"
 

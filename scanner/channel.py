@@ -61,19 +61,6 @@ DBM_LEVEL_V = float(np.sqrt(2.0 * 50.0 * 1e-3))
 """Amplitude of a sine of 1 mW in 50 ohm [V]: 0 dBm as spectrum analysers and lock-in amplifiers state it."""
 
 
-MIN_NAME_SIMILARITY = 0.8
-"""Similarity (``difflib``) from which an unknown channel name counts as misspelt: one or two letters of six."""
-
-
-def suggest_name(name: str) -> str:
-    """The known channel name nearest to an unknown one, as the end of a message; empty if none is near."""
-    from difflib import get_close_matches
-
-    known = (*CHANNEL_UNITS, *AMPLITUDE_CHANNELS, "intensity", "sync_x", "sync_y")
-    near = [] if name in known else get_close_matches(name.lower(), known, 1, MIN_NAME_SIMILARITY)
-    return f"; is it {near[0]}?" if near else ""
-
-
 class SampleSource(Protocol):
     """Storage of samples: a numpy array, an HDF5 dataset, or another object that reads when it is sliced."""
 
@@ -319,6 +306,9 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
     if max(-low, high) > MAX_MAGNITUDE:
         what = f"reaches {max(-low, high):.3g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
+    if 0.0 < high - low < 1.0 / MAX_MAGNITUDE:
+        what = f"changes by {high - low:.3g} {signal.unit} only"
+        raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:
         what = f"is constant, {low:.9g} {signal.unit}"
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check that it was connected")
@@ -358,5 +348,7 @@ def _channel_unit(name: str, unit: object, file: str | None) -> tuple[str, float
     if unit not in CONVERSIONS[channel_unit]:
         what = "unit is missing" if unit is None else f"unit {unit!r} is unknown"
         hint = f"accepted units: {', '.join(CONVERSIONS[channel_unit])}"
+        if channel_unit != "m" and str(unit).startswith(("m/s", "mm/s", "um/s")):
+            hint += "; divide a motion in metres by the distance of the spot from the axis"
         raise UnitUnknown(what, file=file, channel=name, hint=hint)
     return channel_unit, CONVERSIONS[channel_unit][str(unit)]

@@ -7,7 +7,7 @@ keys of the tables. Unknown keys are kept in ``extra`` and written back, so that
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,9 @@ from scanner.stages import READOUTS, Capacitance, Drive, Mechanics, Readout, Sca
 AXES = ("x", "y")
 DEFAULT_TOLERANCE = 0.02
 """Relative standard uncertainty of a nominal value for which the device states none: typical of a data sheet."""
+
+VALUES = frozenset(item.name for stage in (Mechanics, Capacitance, Drive, *READOUTS.values()) for item in fields(stage))
+"""Names of the values that may have a tolerance."""
 
 TERMS_WITH_LISTS = ("measured-law", "driven-modes")
 """Terms whose tables also hold text and lists; all others hold numbers."""
@@ -254,4 +257,4 @@ def _readout(table: device_toml.Table) -> Readout | None:
 
 def _tolerance(table: device_toml.Table) -> dict[str, float]:
     tolerance = table.take_table("tolerance")
-    return {} if tolerance is None else tolerance.take_numbers(NOT_NEGATIVE)
+    return {} if tolerance is None else tolerance.take_numbers(NOT_NEGATIVE, only=True)

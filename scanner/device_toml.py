@@ -137,9 +137,9 @@ class Table:
         except DeviceInvalid as error:
             raise self.wrong(error) from None
 
-    def take_numbers(self, must: Mapping[str, Any] = FINITE) -> dict[str, float]:
-        """Read all numbers of the table, and leave texts, lists and tables."""
-        names = [name for name, value in self.rest.items() if not isinstance(value, (str, list, dict))]
+    def take_numbers(self, must: Mapping[str, Any] = FINITE, only: bool = False) -> dict[str, float]:
+        """Read all numbers of the table, and leave texts, lists and tables; those are wrong with ``only``."""
+        names = [name for name, value in self.rest.items() if only or not isinstance(value, (str, list, dict))]
         try:
             return {name: checked_number(self.rest.pop(name), must["must"], name) for name in names}
         except DeviceInvalid as error:

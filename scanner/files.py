@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -103,7 +104,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         BadInput: the file cannot be read, or is not TOML.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name a TOML file") from None
     except UnicodeDecodeError:
@@ -120,9 +121,18 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"is not TOML: {error}", file=source, hint="correct the line that it names") from None
+        raise BadInput(f"is not TOML: {error}", file=source, hint=_toml_hint(text, str(error))) from None
     except (ValueError, RecursionError) as error:  # thousands of digits, or too deeply nested brackets
         raise BadInput(f"is not TOML that can be read: {error}", file=source, hint="write it simpler") from None
+
+
+def _toml_hint(text: str, message: str) -> str:
+    """What to correct in a text that is not TOML; the line that the message names is quoted."""
+    named = re.search(r"at line (\d+)", message)
+    line = text.splitlines()[int(named[1]) - 1].strip() if named else ""
+    if re.fullmatch(r"\w+ *= *[+-]?\d+,\d+ *(#.*)?", line):
+        return f"write the number of {line!r} with a point"
+    return f"correct the line {line!r}" if line else "correct the line that it names"
 
 
 def lock_file(file: IO[bytes]) -> None:

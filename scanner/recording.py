@@ -18,7 +18,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel, suggest_name
+from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
+from scanner.channel_names import list_names
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput, ChannelMissing
@@ -184,8 +185,7 @@ class Recording:
         """
         if name not in self.channels:
             what = "is not in the recording" + (f" and {why}" if why else "")
-            misspelt = [f"{each}{suggest_name(each)}" for each in sorted(self.channels) if suggest_name(each)]
-            hint = f"it holds {', '.join(sorted(self.channels))}" + "".join(f"; {each}" for each in misspelt)
+            hint = f"it holds {list_names(self.channels)}"
             raise ChannelMissing(what, file=self.path, channel=name, hint=hint)
         return self.channels[name]
 

@@ -20,7 +20,8 @@ from estimation.signals import (
     white_noise_sd,
 )
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal, make_channel, suggest_name
+from scanner.channel import Channel, check_signal, make_channel
+from scanner.channel_names import list_names
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block, unwrap_phase
@@ -101,12 +102,15 @@ def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[C
     if f"sense_{name}" in recording and isinstance(axis.readout, Position):
         readout = axis.readout
         return recording[f"sense_{name}"], readout.gain, readout.offset, readout.noise_sd / abs(readout.gain)
+    sense = f"sense_{name}"
     raise ChannelMissing(
-        f"is not in the recording and sense_{name} is no position readout",
+        f"is not in the recording, and neither is {sense}"
+        if sense not in recording
+        else f"is not in the recording and {sense} is no position readout",
         file=recording.path,
         channel=f"angle_{name}",
         hint=f"choose another estimator, record it, or state frequency in [{name}.drive]; "
-        f"there are {', '.join(each + suggest_name(each) for each in sorted(recording.channels))}",
+        f"it holds {list_names(recording.channels)}",
     )
 
 

@@ -2,18 +2,19 @@
 
 The motion begins in the steady state under the drive. The tolerances of stiffness and damping give the covariance of
 its phase and amplitude. The two are correlated, so that a phase measured in the picture corrects the amplitude too.
+A phase that only another stiffness within the tolerance explains selects that stiffness.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from estimation.signals import SenseChannel, drive_channel, intensity_clock, phase_reference
 from estimation.tracker.amplitude_table import MAX_AMPLITUDE_THETA0
-from estimation.tracker.averaged_dynamics import average_cycle, axis_parameters, unpack_parameters
+from estimation.tracker.averaged_dynamics import axis_parameters
 from estimation.tracker.block_signal import MIN_OFFSET_DENSITY_V2_PER_S, BlockSignal
 from estimation.tracker.block_tracking import track_blocks
 from estimation.tracker.demodulation import NoiseSpectrum
@@ -21,15 +22,16 @@ from estimation.tracker.drive_blocks import BlockDrive, demodulate_drive
 from estimation.tracker.initial_state import RELATIVE_STIFFNESS_SD, STIFFNESS_RATE_SD_PER_S
 from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.observations import MIN_BLOCKS, NO_CLIPPED_BLOCKS, BlockObservations
-from estimation.tracker.phase_measurements import PhaseMeasurement, with_phase_measurements
+from estimation.tracker.phase_measurements import UNKNOWN_PHASE_SD, PhaseMeasurement, with_phase_measurements
 from estimation.tracker.process_noise import MIN_DENSITIES
 from estimation.tracker.state_space import AXIS_STATES, DAMPING, LOG_AMPLITUDE, PHASE, STIFFNESS, STIFFNESS_RATE
+from estimation.tracker.steady_motion import PHASE_STEP_RAD, SteadyBranch, find_steady_branch, steady_motion_at
 from estimation.tracker.to_motion import axis_knots, motion_of_knots
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
 from scanner.errors import BadInput
-from scanner.motion import Motion
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from scanner.stages import Position
 
@@ -39,45 +41,22 @@ BLOCK_CYCLES = 2.0
 NO_READOUT = Position(gain=1.0, noise_sd=0.0)
 """Stands in where a readout is required; no sample is read through it."""
 
-START_AMPLITUDE_THETA0 = 0.75
-"""Amplitude at which the search for the steady motion starts, in units of theta0: near the largest torque of a comb."""
-
-MAX_DECAY_TIMES = 30.0
-"""Decay times over which the search for the steady motion is integrated: transients are then below 1e-13."""
-
-STEP_DECAY_TIMES = 0.1
-"""Step of that integration in decay times. The linearly implicit Euler method follows growth and decay with it, and is
-stable for a drive beside the resonance, under which the phase turns many times in a decay time."""
-
-MAX_STEP_CHANGE = 1.0
-"""Largest change of phase [rad] and ln A in one step. Under a linear drive both rates grow as 1/A while the motion
-passes a small amplitude. The limit changes the way to the steady motion, not the steady motion."""
-
-MAX_STEADY_CHANGE = 1e-5
-"""Change of phase [rad] and ln A over the last step at which the motion counts as steady."""
-
 INITIAL_SD = (0.01, 0.005)
 """Standard deviations of phase [rad] and ln A about the steady motion, in addition to those from stiffness and
 damping."""
+
+FIRST_PHASE_SD_RAD = np.deg2rad(4.0)
+"""Standard deviation with which the first measured phase selects the stiffness at the start: the phase drifts until it
+is measured, and the filter uses the measurement itself with its own standard deviation."""
+
+MAX_UNEXPLAINED_PHASE_RAD = np.deg2rad(15.0)
+"""Difference of a phase from the steady motions up to which a stiffness explains it: the registration corrects it."""
 
 STIFFNESS_RATE_DENSITIES = 10.0 ** np.arange(-1.5, 2.0)
 """Spectral densities of the stiffness rate that are compared [1/s^3]. The least one is 0.05 % in 30 ms.
 
 A few measured phases cannot prove a slower drift.
 """
-
-
-class SteadyMotion(NamedTuple):
-    """Steady motion under a drive.
-
-    Attributes:
-        phase: [rad]. log_amplitude: ln A.
-        by_parameters: derivatives of the two by relative changes of k and b, shape (2, 2).
-    """
-
-    phase: float
-    log_amplitude: float
-    by_parameters: Array
 
 
 def track_drive_only(
@@ -102,7 +81,9 @@ def track_drive_only(
         drive = observations.sense.channel
         sign = "ambiguous" if observations.parameters[0].electrostatic_factor else "known: the drive"
         knots = axis_knots(observations, tracks[best].states, tracks[best].sds, 0)
-        axes[name] = motion_of_knots(observations.references[name], knots, intensity_clock(recording, drive), sign)
+        axis = motion_of_knots(observations.references[name], knots, intensity_clock(recording, drive), sign)
+        is_measured = bool(np.isfinite(observations.signal.external_var).any())
+        axes[name] = axis if is_measured else _state_unmeasured(axis, start)
         best_densities[name] = float(STIFFNESS_RATE_DENSITIES[best])
     return Motion(axes, "picture", {"stiffness_trend_walk": best_densities})
 
@@ -164,62 +145,114 @@ def _signal_without_lines(drive: BlockDrive, step: float, main_order: int, max_a
 def steady_state_estimate(observations: BlockObservations, device: Device) -> StateEstimate:
     """Steady motion under the first block's drive, with the covariance from the device's tolerances.
 
+    Where a phase was measured, the motion is that of a stiffness which explains it, within the tolerance.
+
     Raises:
         BadInput: the drive sustains no motion.
     """
     (name,) = observations.sense.axes
-    motion = find_steady_motion(observations)
-    if motion is None:
-        raise BadInput(
-            f"sustains no motion of axis {name} by the device's values when the recording begins",
-            file=observations.sense.channel.file,
-            channel=observations.sense.channel.name,
-            hint="check voltage and frequency of the drive, and the device",
-        )
+    branch = _steady_branch(observations, device)
+    here, probability = _select_motion(observations, branch)
+    stiffness, phase, log = (float(each[here]) for each in (branch.stiffness, branch.phase, branch.log_amplitude))
+    motion = steady_motion_at(observations, stiffness, phase, log)
     x, P = np.zeros(AXIS_STATES + 1), np.zeros((AXIS_STATES + 1, AXIS_STATES + 1))
-    x[PHASE], x[LOG_AMPLITUDE] = motion.phase, motion.log_amplitude
-    parameters, pair = [STIFFNESS, DAMPING], [PHASE, LOG_AMPLITUDE]
+    x[PHASE], x[LOG_AMPLITUDE], x[STIFFNESS] = motion.phase, motion.log_amplitude, stiffness
+    pair = [PHASE, LOG_AMPLITUDE]
+    is_measured = bool(np.isfinite(observations.signal.external_var).any())
+    stiffness_var = float(probability @ (branch.stiffness - stiffness) ** 2)
+    if is_measured:  # the filter follows the slope, and measurements correct it
+        change = np.array([*motion.by_parameters[:, 0], 1.0])
+        spread = stiffness_var * np.outer(change, change)
+    else:
+        each = (branch.phase, branch.log_amplitude, branch.stiffness)
+        deviations = np.array([values - values[here] for values in each])
+        spread = deviations * probability @ deviations.T
+    P[np.ix_([*pair, STIFFNESS], [*pair, STIFFNESS])] = spread
     # The calibrated damping is used as it is: it determines the amplitude, which the picture does not show.
-    spread = np.square([np.hypot(device.tolerance(name, "k"), RELATIVE_STIFFNESS_SD), device.tolerance(name, "b")])
-    P[parameters, parameters] = spread
-    P[np.ix_(pair, parameters)] = motion.by_parameters * spread
-    P[np.ix_(parameters, pair)] = P[np.ix_(pair, parameters)].T
-    P[np.ix_(pair, pair)] = motion.by_parameters * spread @ motion.by_parameters.T + np.diag(np.square(INITIAL_SD))
+    by_damping, damping_var = motion.by_parameters[:, 1], device.tolerance(name, "b") ** 2
+    P[np.ix_(pair, pair)] += damping_var * np.outer(by_damping, by_damping) + np.diag(np.square(INITIAL_SD))
+    P[pair, DAMPING] = P[DAMPING, pair] = damping_var * by_damping
+    P[DAMPING, DAMPING] = damping_var
     P[STIFFNESS_RATE, STIFFNESS_RATE] = STIFFNESS_RATE_SD_PER_S**2
     P[-1, -1] = P[AXIS_STATES - 1, AXIS_STATES - 1] = 1.0  # offset and gain of the absent readout
     return StateEstimate(x, P, np.array([True]))
 
 
-def find_steady_motion(observations: BlockObservations) -> SteadyMotion | None:
-    """The steady motion of largest amplitude under the first block's drive; None where every motion decays.
+def explain_phase(recording: Recording, device: Device, name: str, phase: float) -> tuple[float, float] | None:
+    """The steady motion that a phase known up to half a turn belongs to.
 
-    The averaged equations are integrated from four initial phases.
+    Args:
+        recording, device: of the scan. name: of the axis.
+        phase: against the reference of the axis, up to half a turn [rad].
+
+    Returns:
+        The phase plus the half-turns of the motion [rad], and the relative deviation of the stiffness that explains it
+        best within the tolerance. None where none explains it.
     """
-    law, signal = unpack_parameters(observations.parameter_rows[0]), observations.signal
-    w, force = float(signal.w[0, 0]), signal.force[0, 0]
-    step = STEP_DECAY_TIMES * 2.0 * law.J / law.b
-    log_limit = np.log(MAX_AMPLITUDE_THETA0 * law.theta0)
-    best = None
-    for phase in np.pi * np.arange(4) / 4:
-        log = float(np.log(START_AMPLITUDE_THETA0 * law.theta0))
-        for _ in range(round(MAX_DECAY_TIMES / STEP_DECAY_TIMES)):
-            cycle = average_cycle(law, np.exp(log), phase, w, law.k, law.b, force)
-            slope = np.eye(2) - step * _phase_and_log_rows(cycle.by_phase, cycle.by_log)
-            change = np.linalg.solve(slope, (step * cycle.rate.imag, step * cycle.rate.real))
-            turn, growth = np.clip(change, -MAX_STEP_CHANGE, MAX_STEP_CHANGE).tolist()
-            phase, log = phase + turn, min(log + growth, log_limit)
-        cycle = average_cycle(law, np.exp(log), phase, w, law.k, law.b, force)
-        if abs(cycle.rate) * step < MAX_STEADY_CHANGE and (best is None or log > best.log_amplitude):
-            by_state = _phase_and_log_rows(cycle.by_phase, cycle.by_log)
-            by_parameters = _phase_and_log_rows(cycle.by_stiffness, cycle.by_damping)
-            best = SteadyMotion(
-                float(np.angle(np.exp(1j * signal.main_order * phase))) / signal.main_order,
-                log,
-                np.asarray(-np.linalg.solve(by_state, by_parameters), np.float64),
-            )
-    return best
+    branch = _steady_branch(drive_only_observations(recording, device, name), device)
+    turns = np.round((branch.phase - phase) / np.pi)
+    error = np.abs(branch.phase - phase - np.pi * turns)
+    if error.min() > MAX_UNEXPLAINED_PHASE_RAD:
+        return None
+    cost = (error / PHASE_STEP_RAD) ** 2 - 2.0 * np.log(branch.probability)
+    best = int(np.argmin(np.where(error < MAX_UNEXPLAINED_PHASE_RAD, cost, np.inf)))
+    return phase + np.pi * float(turns[best]), float(branch.stiffness[best])
 
 
-def _phase_and_log_rows(*rates: complex) -> Array:
-    """Rates of phase in the first row and of ln A in the second, one column for each argument."""
-    return np.array([[rate.imag for rate in rates], [rate.real for rate in rates]])
+def _steady_branch(observations: BlockObservations, device: Device) -> SteadyBranch:
+    """Steady motions within the tolerance of the stiffness.
+
+    Raises:
+        BadInput: there is none.
+    """
+    (name,) = observations.sense.axes
+    branch = find_steady_branch(observations, stiffness_sd(device, name))
+    if branch is None:
+        raise _no_motion(observations)
+    return branch
+
+
+def stiffness_sd(device: Device, name: str) -> float:
+    """Relative standard deviation of the stiffness of an axis when a recording begins."""
+    return float(np.hypot(device.tolerance(name, "k"), RELATIVE_STIFFNESS_SD))
+
+
+def _no_motion(observations: BlockObservations) -> BadInput:
+    """The error for a drive that sustains no motion."""
+    (name,) = observations.sense.axes
+    return BadInput(
+        f"sustains no motion of axis {name} by the device's values when the recording begins",
+        file=observations.sense.channel.file,
+        channel=observations.sense.channel.name,
+        hint="check voltage and frequency of the drive, and the device",
+    )
+
+
+def _select_motion(observations: BlockObservations, branch: SteadyBranch) -> tuple[int, Array]:
+    """Number of the steady motion at the start, and the probabilities of all, shape (n,).
+
+    It is that of the device's stiffness, or of the mean one where the device's sustains no motion. Where a phase was
+    measured that it does not explain, it is the most probable one.
+    """
+    measured = observations.signal.external_phase[np.isfinite(observations.signal.external_var[:, 0]), 0]
+    is_sustained = branch.stiffness[0] <= 0.0 <= branch.stiffness[-1]
+    nominal = branch.nearest(0.0 if is_sustained else float(branch.probability @ branch.stiffness))
+    if measured.size == 0:
+        return nominal, branch.probability
+    period = 2 * np.pi / observations.signal.main_order
+    error = branch.phase - measured[0]
+    error -= period * np.round(error / period)
+    if abs(error[nominal]) < FIRST_PHASE_SD_RAD:  # the drift until then is no error of the stiffness at the start
+        return nominal, branch.probability
+    log = np.log(branch.probability) - 0.5 * (error / FIRST_PHASE_SD_RAD) ** 2
+    probability = np.exp(log - log.max())
+    return int(np.argmax(log)), probability / probability.sum()
+
+
+def _state_unmeasured(axis: AxisMotion, start: StateEstimate) -> AxisMotion:
+    """An axis without a measured phase, with the standard deviation of all motions that the tolerances allow.
+
+    The filter's own is that of the slope at the device's values, which is no measure of a phase that turns by much.
+    """
+    sd = np.clip(axis.phase_sd, np.sqrt(start.covariance[PHASE, PHASE]), None)
+    return replace(axis, phase_sd=np.minimum(sd, UNKNOWN_PHASE_SD))

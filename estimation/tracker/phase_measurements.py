@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from estimation.tracker.observations import BlockObservations
 from scanner.arrays import Array
+
+UNKNOWN_PHASE_SD = pi / sqrt(12)
+"""Standard deviation of a phase of which nothing is known but that it lies within half a turn [rad]."""
 
 
 class PhaseMeasurement(NamedTuple):

@@ -12,6 +12,8 @@ OPTIONS = {
     "rate": ("sample_rate", float),
     "start": ("start", float),
     "time": ("time", str),
+    "event": ("event", str),
+    "angle": ("angle", float),
 }
 
 
@@ -31,6 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--time", action="append", default=[], metavar="[NAME=]COLUMN",
         help="variable that holds the times of all channels, or of one, in place of a rate",
     )  # fmt: skip
+    for option, text in (
+        ("event", "what an edge is: zero-crossing-up, zero-crossing-down, turn or both-edges"),
+        ("angle", "angle of the detector [rad]"),
+    ):
+        parser.add_argument(
+            f"--{option}", action="append", default=[], metavar=f"SYNC={option.upper()}",
+            help=f"of a channel sync_x or sync_y, edge times or a sampled signal: {text}",
+        )  # fmt: skip
     parser.add_argument("--format", help="format, if it follows neither from the file's beginning nor from its name")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the recording to write (.h5)")
 
@@ -60,7 +70,7 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
     hint = "as --channel sense_x=CH2 --unit V --rate 5e6, or write a --mapping"
     channels: dict[str, dict[str, Any]] = {}
     for text in args.channel:
-        name, given, variable = text.partition("=")
+        name, given, variable = (part.strip() for part in text.partition("="))
         if not (name and given and variable) or name in channels:
             raise BadInput(f"{text!r} is not NAME=VARIABLE, or repeats a channel", channel="--channel", hint=hint)
         channels[name] = {"variable": variable.split(",") if "," in variable else variable}
@@ -81,7 +91,7 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def format_summary(summary: dict[str, Any]) -> str:
-    from scanner.channel import suggest_name
+    from scanner.channel_names import suggest_name
 
     lines = [f"{summary['recording']}: {summary['duration']:.6g} s, from {summary['source']} ({summary['format']})"]
     for name, own in summary["channels"].items():

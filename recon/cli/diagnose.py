@@ -77,12 +77,13 @@ def diagnose_files(
     from tqdm import tqdm
 
     from estimation.complete_diagnosis import diagnose_with_optics
-    from recon.io.convert import open_any
+    from recon.io.convert import check_different, open_any
     from recon.io.output import check_folder, replacing_folder
     from recon.reference_phase import measure_reference_phase
     from recon.report.diagnosis import diagnosis_report
     from scanner import devices
 
+    check_different(paths)
     check_folder(output)
     began = time.perf_counter()
     with ExitStack() as stack:

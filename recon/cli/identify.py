@@ -48,12 +48,13 @@ def identify_files(
     from contextlib import ExitStack
 
     from estimation.identification.calibrate import identify
-    from recon.io.convert import open_any
+    from recon.io.convert import check_different, open_any
     from recon.io.output import check_folder, replacing_folder, write_json
     from recon.report.identification import identification_report
     from scanner import devices
     from scanner.errors import BadInput
 
+    check_different(paths)
     check_folder(output)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]

@@ -13,18 +13,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import pi
 from typing import NamedTuple
 
 import numpy as np
 
 from estimation.curve_smoother import smooth_curve
-from estimation.frequency_motion import UNKNOWN_PHASE_SD, SlowCurve, interpolate_curve, sine_motion
+from estimation.frequency_motion import SlowCurve, interpolate_curve, missing_for_motion, sine_motion
 from estimation.reference import PhaseReference
 from estimation.signals import phase_reference
+from estimation.tracker.phase_measurements import UNKNOWN_PHASE_SD
 from recon.imaging.amplitude_change import measure_amplitude_changes
 from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
-from recon.imaging.phase_search import MIN_CORRELATION_SD, PhaseFound, search_phases
+from recon.imaging.phase_search import (
+    MIN_FOUND_FRACTION,
+    PERIODS_PER_SEARCH,
+    PhaseFound,
+    continue_phases,
+    cut_slices,
+    search_phases,
+)
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -45,19 +52,12 @@ MAX_ROUNDS = 6
 CONVERGENCE_SD = 0.5
 """Change of a phase, relative to its standard deviation, below which it has converged."""
 
-PERIODS_PER_SEARCH = 12
-"""Periods of the slower axis in which the phases are searched at once: enough to cross most of the field, and half of a
-slice of the registration, within which the phase drifts less."""
-
 MIN_PERIODS_OF_SEARCH = 0.75 * PERIODS_PER_SEARCH
 """Periods of the slower axis from which a failed search has another cause than its length: a recording is cut into
 slices of 0.75 times ``PERIODS_PER_SEARCH`` at least, unless it is shorter as a whole."""
 
 MAX_CLOSED_PERIODS = PERIODS_PER_SEARCH // 4
 """Periods of the slower axis after which a figure that repeats is named as the cause of a failed search."""
-
-MIN_FOUND_FRACTION = 0.5
-"""Fraction of the slices in which the search has to find the phase of an axis."""
 
 
 def phases_from_picture(
@@ -79,7 +79,7 @@ def phases_from_picture(
         BadInput: the samples of opposite directions agree for no phases.
     """
     references = {name: phase_reference(recording, device, name) for name in AXES}
-    slices = _cut(intensity, slow_period(motion) * PERIODS_PER_SEARCH)
+    slices = cut_slices(intensity, slow_period(motion) * PERIODS_PER_SEARCH)
     for name, reference in references.items():
         periods = reference.frequency * intensity.size / intensity.sample_rate
         if periods < 1.0:
@@ -90,7 +90,7 @@ def phases_from_picture(
     phases, notes = _phases_of_slices(references, intensity, slices, found)
     field = {name: float(np.log(motion.axes[name].amplitude[0])) for name in AXES}
     logs = {name: _constant(field[name], intensity) for name in AXES}
-    windows = _cut(intensity, slow_period(motion) * PERIODS_PER_PICTURE)
+    windows = cut_slices(intensity, slow_period(motion) * PERIODS_PER_PICTURE)
     rounds, converged = 0, False
     while rounds < MAX_ROUNDS and not converged:
         motion = replace(motion, axes=_axes(references, phases, logs, intensity))
@@ -111,7 +111,11 @@ def phases_from_picture(
     if not any(measured.values()):
         raise _search_failure(references, found, slices, intensity)
     info = {"picture": {"rounds": rounds, "slices": len(errors), "told": measured}}
-    return replace(motion, axes=axes, info={**motion.info, **info}), [*_notes(measured, len(errors)), *notes]
+    return replace(motion, axes=axes, info={**motion.info, **info}), [
+        *_notes(measured, len(errors)),
+        *_describe_unused_mechanics(recording, device),
+        *notes,
+    ]
 
 
 def _axes(
@@ -131,13 +135,6 @@ class SliceFound(NamedTuple):
     time: float
     x: PhaseFound
     y: PhaseFound
-
-
-def _cut(intensity: Channel, duration: float) -> list[tuple[int, int]]:
-    """Samples (first, stop) of equal parts of about ``duration`` [s]."""
-    parts = max(1, round(intensity.size / intensity.sample_rate / duration))
-    edges = np.linspace(0, intensity.size, parts + 1).round().astype(int)
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
 def _search_slices(
@@ -172,7 +169,7 @@ def _phases_of_slices(
     for name in AXES:
         clear = [(each.time, getattr(each, name)) for each in found if getattr(each, name).is_clear]
         if clear and len(clear) >= MIN_FOUND_FRACTION * len(slices):
-            value, is_unique = _continue_phases([phase for _, phase in clear])
+            value, is_unique = continue_phases([phase for _, phase in clear])
             phases[name] = _knots(np.array([time for time, _ in clear]), value)
             notes += [] if is_unique else [AMBIGUOUS.format(name=name)]
     if not phases:
@@ -235,20 +232,6 @@ def _describe_closed_figure(references: Mapping[str, PhaseReference], length: fl
     return ""
 
 
-def _continue_phases(found: list[PhaseFound]) -> tuple[Array, bool]:
-    """Phases of slices without jumps [rad], and whether they are the only ones that fit.
-
-    A specimen that nearly equals its mirror image allows two phases, a quarter of a turn apart. The scan as a whole
-    decides between them.
-    """
-    raw = np.array([each.value for each in found])
-    value = np.unwrap(raw, period=pi / 2)
-    sign = np.where(np.abs(np.sin(value - raw)) < np.sin(pi / 4), 1.0, -1.0)
-    margin = float(sign @ np.array([each.correlation - each.quarter_turn for each in found]))
-    noise_sd = float(np.sqrt(2.0 * sum(each.noise_sd**2 for each in found)))
-    return value + (0.0 if margin >= 0.0 else pi / 2), abs(margin) > MIN_CORRELATION_SD * noise_sd
-
-
 def _knots(time: Array, value: Array) -> SlowCurve:
     """Phases of slices, with linear interpolation between them."""
     if time.size == 1:
@@ -306,11 +289,19 @@ def _has_converged(before: SlowCurve, after: SlowCurve) -> bool:
     return bool(np.sqrt(np.mean(change**2)) < CONVERGENCE_SD * np.sqrt(np.mean(after.sd**2)))
 
 
+def _describe_unused_mechanics(recording: Recording, device: Device) -> list[str]:
+    """A line on mechanics that the device states and that determine nothing here."""
+    missing = missing_for_motion(recording, device)
+    if missing is None or not any(axis.mechanics for axis in device.axes.values()):
+        return []
+    return [f"J, b and k of the device are not used, because {missing}: with the drives they determine the amplitude"]
+
+
 def _notes(measured: Mapping[str, int], slices: int) -> list[str]:
     """What the picture showed, and what it cannot show."""
     shown = " and ".join(f"of {name} in {measured[name]} of {slices} slices" for name in AXES)
     notes = [
-        f"the phases were measured in the picture itself, {shown} of the scan; only the frequencies were known",
+        f"the phases were measured in the picture itself, {shown} of the scan; only the frequencies were used",
         "the picture does not determine the scale of the amplitudes: the largest is taken to fill the field; only its "
         "changes during the scan were measured",
     ]

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimation.frequency_motion import is_motion_computable
+from estimation.frequency_motion import frequency_motion, is_motion_computable
 from estimation.optics.correction import beam_motion
 from estimation.signals import drive_phase_change
 from estimation.signs import resolve_signs
@@ -25,6 +25,7 @@ from estimation.tracker.drive_only import track_drive_only
 from recon.imaging.bidirectional_phase import PERIODS_PER_SLICE, PhaseError, measure_motion_phase_errors, slow_period
 from recon.imaging.frequency_phase import phases_from_picture
 from recon.imaging.picture import Grid
+from recon.imaging.response_phase import check_response
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES, Device
@@ -70,11 +71,23 @@ def refine_motion(
     """
     if motion.estimator == "picture" and not is_motion_computable(recording, device):
         return phases_from_picture(recording, device, motion, intensity, grid, flips)
+    response_notes: list[str] = []
+    if motion.estimator == "picture":
+        beam = beam_motion(motion, device, recording.start)
+        response = check_response(recording, device, motion, beam, intensity, flips)
+        response_notes = response.notes
+        if response.contradicted and device.scan is not None:
+            free = frequency_motion(recording, device)
+            free, notes = phases_from_picture(recording, device, free, intensity, grid, flips)
+            return free, [*response_notes, *notes]
+        if response.phases:
+            start = _smooth(recording, device, track_drive_only, response.phases, flips)
+            motion = replace(motion, axes={**motion.axes, **{name: start.axes[name] for name in response.phases}})
     pixels = {"x": grid.width / 2, "y": grid.height / 2}
     refined = [name for name in AXES if _rms(motion.axes[name].phase_sd) * pixels[name] > MAX_PHASE_ERROR_PX]
     smoothers = _available_smoothers(recording, device, motion.estimator) if refined else {}
     if not smoothers:
-        return motion, []
+        return motion, response_notes
     initial_sd = {name: _rms(motion.axes[name].phase_sd) for name in refined}
     rounds, ended = 0, False
     smoothed_with: dict[str, str] = {}
@@ -97,7 +110,7 @@ def refine_motion(
     measured = {name: int(np.isfinite(phases[name].sd).sum()) for name in refined}
     info = {"rounds": rounds, "slices": len(errors), "told": measured, "smoothed_with": smoothed_with}
     notes = [_note(name, measured[name], len(errors), smoothed_with[name] != motion.estimator) for name in refined]
-    return replace(motion, info={**motion.info, "picture": info}), notes
+    return replace(motion, info={**motion.info, "picture": info}), [*response_notes, *notes]
 
 
 def _available_smoothers(recording: Recording, device: Device, estimator: str) -> dict[str, Smoother]:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scanner.arrays import Array, Complex
+from scanner.channel import Channel
 
 PHASE_CELLS = 128
 """Cells of a turn of either phase: 2.8° of phase, 1.4° of the result."""
@@ -32,6 +33,14 @@ BANDS = 8
 
 MIN_VARIANCE_SHARE = 1e-9
 """Variance of the samples of a band over their mean square below which they do not differ but for rounding."""
+
+
+PERIODS_PER_SEARCH = 12
+"""Periods of the slower axis in which the phases are searched at once: enough to cross most of the field, and half of a
+slice of the registration, within which the phase drifts less."""
+
+MIN_FOUND_FRACTION = 0.5
+"""Fraction of the slices in which the search has to find the phase of an axis."""
 
 
 class PhaseFound(NamedTuple):
@@ -169,3 +178,24 @@ def _best_reflection(matches: PhaseMatches) -> PhaseFound:
         significance=float((at - np.median(match)) / matches.noise_sd[best]),
         ratio=float(at / matches.same_cell) if matches.same_cell > 0.0 else 0.0,
     )
+
+
+def continue_phases(found: list[PhaseFound]) -> tuple[Array, bool]:
+    """Phases of slices without jumps [rad], and whether they are the only ones that fit.
+
+    A specimen that nearly equals its mirror image allows two phases, a quarter of a turn apart. The scan as a whole
+    decides between them.
+    """
+    raw = np.array([each.value for each in found])
+    value = np.unwrap(raw, period=pi / 2)
+    sign = np.where(np.abs(np.sin(value - raw)) < np.sin(pi / 4), 1.0, -1.0)
+    margin = float(sign @ np.array([each.correlation - each.quarter_turn for each in found]))
+    noise_sd = float(np.sqrt(2.0 * sum(each.noise_sd**2 for each in found)))
+    return value + (0.0 if margin >= 0.0 else pi / 2), abs(margin) > MIN_CORRELATION_SD * noise_sd
+
+
+def cut_slices(intensity: Channel, duration: float) -> list[tuple[int, int]]:
+    """Samples (first, stop) of equal parts of about ``duration`` [s]."""
+    parts = max(1, round(intensity.size / intensity.sample_rate / duration))
+    edges = np.linspace(0, intensity.size, parts + 1).round().astype(int)
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))

@@ -33,8 +33,9 @@ import numpy as np
 from recon.io.readers import read
 from recon.io.readers.column_names import TIME_UNITS, split_label
 from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock, matrix_row
+from recon.io.sampled_edges import find_edges
 from scanner.arrays import Array
-from scanner.channel import AMPLITUDE_CHANNELS, PHASE_CHANNELS, Channel, LazySamples, make_channel
+from scanner.channel import AMPLITUDE_CHANNELS, CONVERSIONS, PHASE_CHANNELS, Channel, LazySamples, make_channel
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput
@@ -66,6 +67,18 @@ def open_any(path: Path, mapping: Path | Plan | None = None, growing: bool = Fal
     """
     check_ends(path)
     return Recording.open(path, growing) if mapping is None else convert(path, mapping)
+
+
+def check_different(paths: Sequence[Path]) -> None:
+    """Check that no recording is given twice: fitted together, it would count as two measurements.
+
+    Raises:
+        BadInput: one is.
+    """
+    files = [path.resolve() for path in paths]
+    for at, file in enumerate(files):
+        if file in files[:at]:
+            raise BadInput("is given twice", file=paths[at], hint="name each recording once")
 
 
 def convert_file(source: Path, mapping: Path | Plan, output: Path) -> dict[str, Any]:
@@ -274,6 +287,10 @@ def _edges(name: str, spec: Any, contents: Contents, source: Path, plan_source: 
     variable = contents.variables[spec["variable"]]
     times = flatten_row(variable.raw)[0 : variable.raw.shape[-1]]
     stated = {"unit": variable.unit} | {key: value for key, value in spec.items() if key != "variable"}
+    if stated["unit"] in CONVERSIONS["V"] and variable.sample_rate:  # the sync signal itself
+        event = str(stated.get("event", "both-edges"))
+        times = find_edges(np.asarray(times, np.float64), variable.sample_rate, variable.start or 0.0, event)
+        stated["unit"] = "s"
     return make_edges(name, times, stated, f"{source} by {plan_source}")
 
 

@@ -26,6 +26,13 @@ MIN_MIDDLE_FRACTION = 0.1
 """Fraction of samples in the middle half of the range from which a signal passes all values between: a square wave and
 a scene of two levels have fewer there, an oscillation has a third."""
 
+MIDDLE_SHARE = 0.25
+"""Distance from either end of the range, of the whole range, from which a sample is in its middle."""
+
+MIN_MIDDLE_SAMPLES_PER_JUMP = 1.0
+"""Samples in the middle of the range for each jump: a signal reaches the end at which it overflows through the middle,
+and returns through it. One that switches between two levels, as bright beads on a dark ground, is not there."""
+
 
 def describe_overflows(recording: Recording) -> list[str]:
     """A line for each signal of the motion or the light that jumps from one end of its range to the other and back."""
@@ -57,4 +64,5 @@ def count_overflows(values: Array) -> int:
     wraps = jumps[np.abs(jumps) > WRAP_SHARE]
     if min(np.sum(wraps > 0.0), np.sum(wraps < 0.0)) < MIN_OVERFLOWS or wraps.size < MIN_WRAP_FRACTION * jumps.size:
         return 0
-    return int(wraps.size)
+    middle = np.abs(finite - 0.5 * (low + high)) < (0.5 - MIDDLE_SHARE) * (high - low)
+    return int(wraps.size) if middle.sum() >= MIN_MIDDLE_SAMPLES_PER_JUMP * wraps.size else 0

@@ -61,16 +61,25 @@ def describe_stack(stack: Mapping[str, Any]) -> str:
 
 def _describe_readout_phase(summary: Mapping[str, Any]) -> str:
     """A sentence on the phase error of the readout that was removed; empty where none was significant."""
-    late = []
+    late: dict[str, list[str]] = {}
     for axis in summary["axes"]:
         error = summary[axis].get("readout_phase_deg")
         if error is not None and abs(error["value"]) > MIN_READOUT_ERROR_SD * error["sd"]:
             word = "late" if error["value"] > 0.0 else "early"
-            late.append(f"{format_uncertain(abs(error['value']), error['sd'], '°')} {word} in {axis}")
+            said = f"{format_uncertain(abs(error['value']), error['sd'], '°')} {word} in {axis}"
+            late.setdefault(_signal_of_axis(summary, axis), []).append(said)
     if not late:
         return ""
-    signal = SIGNALS_BY_ESTIMATOR.get(summary["estimator"], "sense signal is")
-    return f"The {signal} {' and '.join(late)}; the picture was used instead. "
+    signals = ", the ".join(f"{signal} {' and '.join(said)}" for signal, said in late.items())
+    return f"The {signals}; the picture was used instead. "
+
+
+def _signal_of_axis(summary: Mapping[str, Any], axis: str) -> str:
+    """The signal of an axis's phase, and its verb; ``edges`` treats axes without edges as ``sensor`` does."""
+    from_sensor = summary["estimator"] == "edges" and str(summary[axis].get("sign")).endswith(
+        (f"sense_{axis}", f"angle_{axis}")
+    )
+    return SIGNALS_BY_ESTIMATOR.get("sensor" if from_sensor else summary["estimator"], "sense signal is")
 
 
 def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] | None = None) -> str:

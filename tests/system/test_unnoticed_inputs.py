@@ -64,6 +64,7 @@ def test_only_overflows_jump_from_one_end_to_the_other_and_back() -> None:
         "noise": rng.normal(size=time.size),
         "no samples": np.full(9, np.nan),
         "constant": np.ones(9),
+        "two levels in noise": 5.0 * (np.sin(time / 7.0) > 0.9) + 0.01 * rng.normal(size=time.size),
     }
     for name, values in others.items():
         assert count_overflows(values) == 0, name

@@ -63,6 +63,7 @@ def detect_format(path: Path) -> str:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name the instrument's file") from None
     if not beginning:
         raise BadInput("the file is empty", file=path, hint="copy it again")
+    _check_not_packed(path, beginning)
     users = [reader for group in _REGISTERED.values() for reader in group]
     candidates = [*users, *_package_readers()]
     for reader in candidates:
@@ -73,6 +74,29 @@ def detect_format(path: Path) -> str:
             return reader.name
     hint = f"name it in the mapping or by --format: {', '.join(readers())}"
     raise BadInput("is of no format that is known by its beginning or its name", file=path, hint=hint)
+
+
+PACKED = {
+    b"\x1f\x8b": ("is compressed (gzip)", "unpack it first"),
+    b"BZh": ("is compressed (bzip2)", "unpack it first"),
+    b"\xfd7zXZ": ("is compressed (xz)", "unpack it first"),
+    b"7z\xbc\xaf": ("is an archive (7z)", "unpack it first"),
+    b"\xd0\xcf\x11\xe0": ("is a document of Microsoft Office", "save the table as CSV"),
+    b"%PDF": ("is a PDF document", "export the samples from the instrument"),
+}
+"""What files are that hold no samples themselves, and what to do, by their beginning."""
+
+SPREADSHEETS = (".xlsx", ".xlsm", ".ods")
+"""Endings of spreadsheets, which begin as NumPy archives do."""
+
+
+def _check_not_packed(path: Path, beginning: bytes) -> None:
+    """Raise BadInput for compressed files and documents."""
+    if path.suffix.lower() in SPREADSHEETS:
+        raise BadInput("is a spreadsheet", file=path, hint="save the table as CSV")
+    for start, (what, hint) in PACKED.items():
+        if beginning.startswith(start):
+            raise BadInput(what, file=path, hint=hint)
 
 
 def read(path: Path, name: str | None = None) -> Contents:

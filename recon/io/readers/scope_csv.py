@@ -114,8 +114,11 @@ def _variables(layout: Layout, table: Array) -> dict[str, Variable]:
         rate = None if rate is None else float(f"{rate / layout.clock_scale:.12g}")
         start = None if start is None else start * layout.clock_scale
     signals = [at for at in range(len(layout.names)) if at not in (layout.times, layout.index)]
-    variables = {}
-    for at, name in zip(signals, unique_names(layout.names[at] for at in signals), strict=True):
+    variables, names = {}, unique_names(layout.names[at] for at in signals)
+    times = [name for at, name in zip(signals, names, strict=True) if layout.names[at].lower() in TIME_NAMES]
+    if rate is None and not note and len(times) > 1:
+        note = f"{' and '.join(times)} are times: choose those of the channel by --time"
+    for at, name in zip(signals, names, strict=True):
         unit = normalise_unit(layout.units[at])
         if at == layout.clock:
             variables[name] = Variable(table[:, at], unit, note=note or "the clock of the other columns")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from codecs import getincrementaldecoder
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -21,6 +22,9 @@ UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 LINES_PER_BLOCK = 1 << 14
 """Lines parsed at a time: many enough for numpy's parser to be fast, few enough to bound memory."""
 
+BEGINNING_BYTES = 1 << 16
+"""Bytes of a file by which its encoding is found; the names and units of a table are within them."""
+
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 
 
@@ -32,7 +36,7 @@ def read_lines(path: Path) -> Iterator[str]:
     """
     try:
         with path.open("rb") as beginning:
-            encoding = "utf-16" if beginning.read(2) in UTF_16_MARKS else "utf-8-sig"
+            encoding = _encoding(beginning.read(BEGINNING_BYTES))
         file = path.open(encoding=encoding, errors="replace")
     except OSError as error:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name the instrument's file") from None
@@ -41,6 +45,17 @@ def read_lines(path: Path) -> Iterator[str]:
             if len(line) == MAX_LINE_CHARACTERS or "\0" in line:
                 raise BadInput(f"line {number} is no line of a table", file=path, hint="check the file's format")
             yield line.rstrip("\r\n")
+
+
+def _encoding(beginning: bytes) -> str:
+    """Encoding of a text by its first bytes: that of Windows where they are neither UTF-16 nor UTF-8."""
+    if beginning[:2] in UTF_16_MARKS:
+        return "utf-16"
+    try:
+        getincrementaldecoder("utf-8")().decode(beginning)  # may end within a character
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
 
 
 def split_fields(line: str, separator: str) -> list[str]:

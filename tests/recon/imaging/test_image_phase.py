@@ -11,7 +11,8 @@ import pytest
 from estimation.estimate import default_estimator, estimate
 from estimation.tracker import PhaseMeasurement, track
 from estimation.tracker.averaged_dynamics import axis_parameters
-from estimation.tracker.drive_only import NO_READOUT, drive_only_observations, find_steady_motion, track_drive_only
+from estimation.tracker.drive_only import NO_READOUT, drive_only_observations, track_drive_only
+from estimation.tracker.steady_motion import find_steady_motion
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine

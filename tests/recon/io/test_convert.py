@@ -169,7 +169,7 @@ CONTENTS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
         ),
         (("gain = 2.0", ""), "MAP: x.readout.gain: is missing; [x.readout] needs gain, noise_sd"),
         (("name =", "name"), "MAP: is not TOML: Expected '=' after a key in a key/value pair (at line 3, column 6); "
-         "correct the line that it names"),
+         "correct the line 'name \"bench\"'"),
     ],
 )  # fmt: skip
 def test_an_incomplete_or_invalid_mapping_is_refused(bench: Path, swap: tuple[str, str], line: str) -> None:
