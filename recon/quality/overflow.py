@@ -22,10 +22,6 @@ WRAP_SHARE = 0.75
 MIN_WRAP_FRACTION = 0.8
 """Fraction of the jumps that exceed ``WRAP_SHARE``. Pulses of a detector jump by all sizes, few by the whole range."""
 
-MIN_MIDDLE_FRACTION = 0.1
-"""Fraction of samples in the middle half of the range from which a signal passes all values between: a square wave and
-a scene of two levels have fewer there, an oscillation has a third."""
-
 MIDDLE_SHARE = 0.25
 """Distance from either end of the range, of the whole range, from which a sample is in its middle."""
 
@@ -54,11 +50,9 @@ def describe_overflows(recording: Recording) -> list[str]:
 def count_overflows(values: Array) -> int:
     """Number of jumps of a signal (n,) between the ends of its range; 0 if it does not overflow."""
     finite = values[np.isfinite(values)]
-    if finite.size < 2:
+    if not finite.size or np.ptp(finite) == 0.0:
         return 0
     low, high = finite.min(), finite.max()
-    if np.mean(np.abs(finite - 0.5 * (low + high)) < 0.25 * (high - low)) < MIN_MIDDLE_FRACTION:
-        return 0
     steps = np.diff(finite) / (high - low)
     jumps = steps[np.abs(steps) > JUMP_SHARE]
     wraps = jumps[np.abs(jumps) > WRAP_SHARE]
