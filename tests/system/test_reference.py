@@ -18,7 +18,7 @@ import h5py
 import pytest
 
 import lissajous
-from estimation.diagnosis import diagnose
+from estimation.diagnosis import diagnose, finding
 from estimation.estimators import estimators
 from recon import experiment_planning
 from recon.cli import COMMANDS, main
@@ -144,7 +144,7 @@ def test_every_key_of_a_reconstruction_and_a_prediction_is_in_the_reference(
 
 
 def test_every_key_of_a_diagnosis_is_in_the_reference() -> None:
-    records = (diagnose.Finding, diagnose.ParameterEstimate, diagnose.Rival)
+    records = (finding.Finding, finding.ParameterEstimate, finding.Rival)
     names = {item.name for record in records for item in dataclasses.fields(record)}
     device = Device.from_toml("[x.mechanics]\nJ = 1\nb = 1\nk = 1")
     names |= set(diagnose.Diagnosis("consistent", (), None, device, None).to_json())
