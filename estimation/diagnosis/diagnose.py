@@ -17,7 +17,7 @@ from estimation.diagnosis.structure import describe_modes, with_driven_modes
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
-from scanner.terms import catalogue
+from scanner.terms import Term, catalogue
 
 SCHEMA = "lissajous-diagnosis/1"
 
@@ -105,14 +105,14 @@ def diagnose(
 
 def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress) -> Diagnosis:
     """The diagnosis of prepared recordings. Where every selected law is rejected, the others are selected from."""
-    terms = dict(catalogue())
+    terms: Mapping[str, Term] = catalogue()
     while True:
         result = select_terms(runs, device, terms, progress)
         diagnosis = build_diagnosis(result)
         if not result.steps or (diagnosis.search and diagnosis.search.steps):
             return diagnosis
-        for step in result.steps:
-            terms.pop(step.candidate.term.effect)
+        rejected = {step.candidate.term.effect for step in result.steps}
+        terms = {effect: term for effect, term in terms.items() if effect not in rejected}
 
 
 def nominal_device(recordings: Sequence[Recording], device: Device | None) -> Device:
