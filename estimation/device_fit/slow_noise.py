@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import idct
+from numpy.typing import NDArray
+from scipy.fft import dct
 from scipy.optimize import minimize_scalar
 
 from estimation.device_fit.fit import Fit, Likelihood
@@ -103,17 +104,25 @@ def _slow_parts(whiteners: Sequence[Whitener], columns: Array, rows: Mask) -> li
         half_bins = np.arange(1, 2 * int(np.ceil(whitener.first)) - 1)
         if not half_bins.size:
             continue
-        spectrum = np.zeros((whitener.samples, half_bins.size))
-        spectrum[half_bins, half_bins - 1] = 1.0
-        cosines, used = idct(spectrum, norm="ortho", axis=0), rows[samples]
-        compared = cosines[used]
+        values, used = columns[samples], rows[samples]
         parts.append(
             _SlowPart(
                 np.log(whitener.first / (0.5 * half_bins)),
-                cosines.T @ columns[samples],
-                compared.T @ columns[samples][used],
-                compared.T @ compared,
+                dct(values, norm="ortho", axis=0)[half_bins],
+                dct(values * used[:, None], norm="ortho", axis=0)[half_bins],
+                _overlap(used, half_bins),
                 float(np.mean(used)),
             )
         )
     return parts
+
+
+def _overlap(used: Mask, half_bins: NDArray[np.intp]) -> Array:
+    """Inner products over the ``used`` of n samples of the normalised cosines of some half bins, shape (k, k).
+
+    The product of two cosines is half the sum of those of the difference and of the sum of their half bins.
+    """
+    sums = 0.5 * dct(used.astype(float))  # of the cosine of every half bin over the used samples
+    sums = np.concatenate([sums, [0.0], -sums[:0:-1]])
+    difference, total = np.abs(np.subtract.outer(half_bins, half_bins)), np.add.outer(half_bins, half_bins)
+    return np.asarray((sums[difference] + sums[total]) / used.size)

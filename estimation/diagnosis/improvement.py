@@ -44,14 +44,14 @@ class Improvement:
 
 
 def improve(result: SelectionResult) -> Improvement:
-    """Improve the device by the findings that do not make its open-loop prediction worse.
+    """Improve the device by the findings that its open-loop prediction bears out.
 
-    As long as the device with all findings predicts worse than the nominal one, beyond the uncertainty of the
-    comparison, the weakest finding is removed; a rail at which samples stand is certain and stays. Within that
-    uncertainty findings stay if they leave noise alone, but the nominal device takes the place of one with a larger
-    error; findings that leave more than noise have to improve the prediction. A discrepancy term
-    always remains a finding, but if the device with its measured law predicts any channel of any run worse, the device
-    with the named laws alone is returned, or the nominal one if that is worse too.
+    The weakest finding is removed as long as the prediction rejects it; a rail at which samples stand is certain and
+    stays. If the findings leave noise alone, they are rejected by a prediction that is worse than that of the nominal
+    device, beyond the uncertainty of the comparison; within it they stay, but the nominal device takes the place of one
+    with a larger error. If they leave more than noise, the weakest has to lower the error. A discrepancy term always
+    remains a finding, but if the device with its measured law predicts any channel of any run worse, the device with
+    the named laws alone is returned, or the nominal one if that is worse too.
     """
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
@@ -64,11 +64,21 @@ def improve(result: SelectionResult) -> Improvement:
             better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
         larger = has_larger_error(nominal, improved)
-        if not larger or (residual_is_noise(result.final) and not is_worse(nominal, improved)):
+        if residual_is_noise(result.final):
+            rejected = is_worse(nominal, improved)
+        else:
+            rejected = larger or not has_larger_error(improved, _open_loop_without_weakest(result, nominal))
+        if not rejected:
             if larger:
                 device, improved = stated, nominal
             return Improvement(result, device, nominal, improved)
         result = without_weakest(result)
+
+
+def _open_loop_without_weakest(result: SelectionResult, nominal: Mapping[str, OpenLoop]) -> Mapping[str, OpenLoop]:
+    """Open-loop error without the weakest finding; that of the ``nominal`` device without the last."""
+    reduced = without_weakest(result)
+    return open_loop(result.likelihood.runs, improved_device(reduced.final)) if reduced.steps else nominal
 
 
 def _without_discrepancy(result: SelectionResult) -> Device:
