@@ -49,9 +49,9 @@ def improve(result: SelectionResult) -> Improvement:
     The weakest finding is removed as long as the prediction rejects it; a rail at which samples stand is certain and
     stays. If the findings leave noise alone, they are rejected by a prediction that is worse than that of the nominal
     device, beyond the uncertainty of the comparison; within it they stay, but the nominal device takes the place of one
-    with a larger error. If they leave more than noise, the weakest has to lower the error. A discrepancy term always
-    remains a finding, but if the device with its measured law predicts any channel of any run worse, the device with
-    the named laws alone is returned, or the nominal one if that is worse too.
+    with a larger error. If they leave more than noise, they have to lower the error, and the weakest of them too. A
+    discrepancy term always remains a finding, but if the device with its measured law predicts any channel of any run
+    worse, the device with the named laws alone is returned, or the nominal one if that is worse too.
     """
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
@@ -63,13 +63,13 @@ def improve(result: SelectionResult) -> Improvement:
             options = [device, *([_without_discrepancy(result)] if unnamed and len(result.steps) > 1 else [])]
             better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
-        larger = has_larger_error(nominal, improved)
         if residual_is_noise(result.final):
             rejected = is_worse(nominal, improved)
         else:
-            rejected = larger or not has_larger_error(improved, _open_loop_without_weakest(result, nominal))
+            others = nominal, _open_loop_without_weakest(result, nominal)
+            rejected = not all(has_larger_error(improved, other) for other in others)
         if not rejected:
-            if larger:
+            if has_larger_error(nominal, improved):
                 device, improved = stated, nominal
             return Improvement(result, device, nominal, improved)
         result = without_weakest(result)
