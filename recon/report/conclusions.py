@@ -107,7 +107,7 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     elif not findings:
         text = "The recordings contradict the nominal device, but no single effect explains the difference."
     else:
-        text = "The nominal device lacks " + "; and ".join(_describe_finding(finding) for finding in findings) + "."
+        text = _describe_findings(findings)
     if blur_px is not None and findings:
         text += (
             f" Predicted from the drive alone, the nominal motion is wrong by {blur_px[0]:.2g} px rms in a picture of "
@@ -123,6 +123,18 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}."
     return text + untested
+
+
+def _describe_findings(findings: Sequence[Mapping[str, Any]]) -> str:
+    """What the device lacks, then what it may lack: effects that are less probable than another explanation."""
+    probable = [finding for finding in findings if finding["probability"] >= 0.5]
+    parts = ["The nominal device lacks " + "; and ".join(map(_describe_finding, probable)) + "."] if probable else []
+    for finding in findings:
+        if finding not in probable:
+            others = "".join(f" ({rival['effect']}: {rival['probability']:.0%})" for rival in finding["rivals"][:1])
+            what = f"may lack {_describe_finding(finding)}, with a probability of {finding['probability']:.0%}{others}."
+            parts.append(f"{'It' if parts else 'The nominal device'} {what}")
+    return " ".join(parts)
 
 
 def _describe_finding(finding: Mapping[str, Any]) -> str:

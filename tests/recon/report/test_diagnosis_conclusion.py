@@ -1,5 +1,7 @@
 """What a diagnosis says about the device that it writes."""
 
+from typing import Any
+
 import pytest
 
 from recon.report.conclusions import conclude_diagnosis
@@ -7,11 +9,19 @@ from recon.report.conclusions import conclude_diagnosis
 CORRECTED, NOMINAL = "Use the corrected device.toml", "device.toml is the nominal device"
 
 
+def found(effect: str, probability: float, *rivals: tuple[str, float]) -> dict[str, Any]:
+    """A finding in the mechanics of x, as in diagnosis.json."""
+    return {
+        "axis": "x", "stage": "mechanics", "effect": effect, "parameters": [], "channel": "sense",
+        "probability": probability, "rivals": [{"effect": name, "probability": p} for name, p in rivals],
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("improved", "channel", "text"), [(0.2, "sense", CORRECTED), (0.9, "sense", NOMINAL), (0.9, "intensity", CORRECTED)]
 )
 def test_a_device_that_is_not_corrected_is_not_recommended(improved: float, channel: str, text: str) -> None:
-    finding = {"axis": "x", "stage": "mechanics", "effect": "unknown", "parameters": [], "channel": channel}
+    finding = found("unknown", 1.0) | {"channel": channel}
     loops = {"sense_x": {"nominal": {"rmse": 0.9}, "improved": {"rmse": improved}}}
     assert text in conclude_diagnosis({"verdict": "mismatch", "findings": [finding], "open_loop": loops})
 
@@ -21,3 +31,12 @@ def test_what_was_not_tested_is_said_and_nothing_else_of_it() -> None:
     text = conclude_diagnosis(content)
     assert text.endswith("Not tested: the picture, because it cannot be made.")
     assert "pictures agree" not in text
+
+
+def test_an_effect_that_is_less_probable_than_another_explanation_is_not_asserted() -> None:
+    doubtful = found("second-mode", 0.22, ("unknown", 0.78))
+    text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("cubic-stiffness", 0.98), doubtful]})
+    assert "The nominal device lacks cubic-stiffness in the mechanics of axis x. " in text
+    assert "It may lack second-mode in the mechanics of axis x, with a probability of 22% (unknown: 78%)." in text
+    alone = conclude_diagnosis({"verdict": "mismatch", "findings": [doubtful]})
+    assert alone.startswith("The nominal device may lack second-mode")
