@@ -87,7 +87,8 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
 
     Args:
         content: of diagnosis.json.
-        blur_px: rms blur by the phase error of an open-loop prediction in a picture of 400 pixels, before and after.
+        blur_px: rms blur in a picture of 400 pixels by the phase error of an open-loop prediction, and the limit of its
+            uncertainty; an error within it is not stated.
     """
     findings = content["findings"]
     untested = f" Not tested: {content['untested']}." if content.get("untested") else ""
@@ -108,7 +109,7 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         text = "The recordings contradict the nominal device, but no single effect explains the difference."
     else:
         text = _describe_findings(findings)
-    if blur_px is not None and findings:
+    if blur_px is not None and findings and blur_px[0] > blur_px[1]:
         text += (
             f" Predicted from the drive alone, the nominal motion is wrong by {blur_px[0]:.2g} px rms in a picture of "
             f"400 pixels, the corrected one by {blur_px[1]:.1g} px."

@@ -40,3 +40,9 @@ def test_an_effect_that_is_less_probable_than_another_explanation_is_not_asserte
     assert "It may lack second-mode in the mechanics of axis x, with a probability of 22% (unknown: 78%)." in text
     alone = conclude_diagnosis({"verdict": "mismatch", "findings": [doubtful]})
     assert alone.startswith("The nominal device may lack second-mode")
+
+
+@pytest.mark.parametrize(("blur_px", "stated"), [((3.0, 0.1), True), ((0.05, 2.0), False)])
+def test_a_blur_within_its_uncertainty_is_not_stated(blur_px: tuple[float, float], stated: bool) -> None:
+    content = {"verdict": "mismatch", "findings": [found("second-mode", 0.98)]}
+    assert ("Predicted from the drive alone" in conclude_diagnosis(content, blur_px)) is stated
