@@ -22,17 +22,21 @@ class StopRequest:
     """Signal handler that records whether the process was asked to stop.
 
     Attributes:
-        came: whether SIGINT or SIGTERM arrived.
+        came: whether SIGINT or SIGTERM arrived before the work ended.
+        ended: whether the work has ended, so that nothing is left to stop.
     """
 
     came = False
+    ended = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, and again every ``REPEAT_INTERVAL_S`` until it is acknowledged.
 
         Nothing is raised while another exception is handled, above all the first KeyboardInterrupt: its clean-up runs
-        to the end.
+        to the end. Nothing is raised either when the work has ended: its output is in place.
         """
+        if self.ended and not self.came:
+            return
         self.came = True
         if hasattr(signal, "setitimer"):
             signal.signal(signal.SIGALRM, self)

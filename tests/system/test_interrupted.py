@@ -172,6 +172,21 @@ def test_a_full_disk_leaves_nothing(cases: Mapping[str, Case], tmp_path: Path, n
     assert not partial_files(tmp_path)
 
 
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_after_the_work_is_no_interruption(
+    by: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop_then_print(summary: object) -> str:
+        signal.raise_signal(by)
+        return "done"
+
+    monkeypatch.setattr("recon.cli.new_device.format_summary", stop_then_print)
+    output = tmp_path / "device.toml"
+    assert main(["new-device", "-o", str(output)]) == 0
+    assert output.exists()
+    assert capsys.readouterr() == ("done\n", "")
+
+
 # --- an interrupt that compiled code suppresses ---------------------------------------------------------------------
 
 
