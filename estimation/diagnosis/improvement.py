@@ -64,21 +64,17 @@ def improve(result: SelectionResult) -> Improvement:
             better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
         if residual_is_noise(result.final):
-            rejected = is_worse(nominal, improved)
+            if not is_worse(nominal, improved):
+                if has_larger_error(nominal, improved):
+                    device, improved = stated, nominal
+                return Improvement(result, device, nominal, improved)
+            result = without_weakest(result)
         else:
-            others = nominal, _open_loop_without_weakest(result, nominal)
-            rejected = not all(has_larger_error(improved, other) for other in others)
-        if not rejected:
-            if has_larger_error(nominal, improved):
-                device, improved = stated, nominal
-            return Improvement(result, device, nominal, improved)
-        result = without_weakest(result)
-
-
-def _open_loop_without_weakest(result: SelectionResult, nominal: Mapping[str, OpenLoop]) -> Mapping[str, OpenLoop]:
-    """Open-loop error without the weakest finding; that of the ``nominal`` device without the last."""
-    reduced = without_weakest(result)
-    return open_loop(result.likelihood.runs, improved_device(reduced.final)) if reduced.steps else nominal
+            reduced = without_weakest(result)
+            others = [nominal, open_loop(runs, improved_device(reduced.final))] if reduced.steps else [nominal]
+            if all(has_larger_error(improved, other) for other in others):
+                return Improvement(result, device, nominal, improved)
+            result = reduced
 
 
 def _without_discrepancy(result: SelectionResult) -> Device:

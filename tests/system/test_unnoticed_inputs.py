@@ -207,7 +207,6 @@ def test_combs_driven_at_the_resonance_are_refused(tmp_path: Path, capsys: pytes
 
 
 def test_a_scheduler_that_does_not_answer_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    pytest.importorskip("distributed")
     for name in ("first", "second"):
         Recording.from_arrays(channels(), Device.from_toml(READOUTS + FIELD)).write(tmp_path / f"{name}.h5")
     for made in (False, True):
