@@ -254,8 +254,7 @@ def _check_steps(device: Device, plan: Plan) -> None:
         BadInput: they do not.
     """
     for name, axis in device.axes.items():
-        mechanics = axis.require_mechanics()
-        frequency = float(np.sqrt(mechanics.k / mechanics.J)) / (2 * np.pi)
+        frequency = axis.require_mechanics().resonance
         if plan.sample_rate * plan.substeps < MIN_STEPS_PER_PERIOD * frequency:
             least = MIN_STEPS_PER_PERIOD * frequency / plan.substeps
             what = f"{plan.sample_rate:g} samples a second are too few for {name}, of a resonance of {frequency:.6g} Hz"

@@ -231,19 +231,17 @@ def _no_motion(observations: BlockObservations) -> BadInput:
 def _select_motion(observations: BlockObservations, branch: SteadyBranch) -> tuple[int, Array]:
     """Number of the steady motion at the start, and the probabilities of all, shape (n,).
 
-    It is that of the device's stiffness, or of the mean one where the device's sustains no motion. Where a phase was
-    measured that it does not explain, it is the most probable one.
+    It is the most probable one where a phase was measured, else that of the device's stiffness, or of the mean one
+    where the device's sustains no motion.
     """
     measured = observations.signal.external_phase[np.isfinite(observations.signal.external_var[:, 0]), 0]
-    is_sustained = branch.stiffness[0] <= 0.0 <= branch.stiffness[-1]
-    nominal = branch.nearest(0.0 if is_sustained else float(branch.probability @ branch.stiffness))
     if measured.size == 0:
-        return nominal, branch.probability
+        is_sustained = branch.stiffness[0] <= 0.0 <= branch.stiffness[-1]
+        stiffness = 0.0 if is_sustained else float(branch.probability @ branch.stiffness)
+        return branch.nearest(stiffness), branch.probability
     period = 2 * np.pi / observations.signal.main_order
     error = branch.phase - measured[0]
     error -= period * np.round(error / period)
-    if abs(error[nominal]) < FIRST_PHASE_SD_RAD:  # the drift until then is no error of the stiffness at the start
-        return nominal, branch.probability
     log = np.log(branch.probability) - 0.5 * (error / FIRST_PHASE_SD_RAD) ** 2
     probability = np.exp(log - log.max())
     return int(np.argmax(log)), probability / probability.sum()

@@ -14,6 +14,7 @@ from estimation.tracker.amplitude_table import MAX_AMPLITUDE_THETA0
 from estimation.tracker.averaged_dynamics import AxisParameters, CycleAverage, average_cycle, unpack_parameters
 from estimation.tracker.observations import BlockObservations
 from scanner.arrays import Array
+from scanner.stages import Mechanics
 
 START_AMPLITUDE_THETA0 = 0.75
 """Amplitude at which the search for the steady motion starts, in units of theta0: near the largest torque of a comb."""
@@ -129,7 +130,7 @@ def find_steady_branch(observations: BlockObservations, stiffness_sd: float) -> 
         stiffness_sd: relative standard deviation of the stiffness.
     """
     law = unpack_parameters(observations.parameter_rows[0])
-    quality = float(np.sqrt(law.J * law.k) / law.b)
+    quality = Mechanics(law.J, law.b, law.k).quality
     points = int(2 * TOLERANCE_REACH * stiffness_sd * quality / PHASE_STEP_RAD)
     half = min(max(points, MIN_BRANCH_POINTS), MAX_BRANCH_POINTS) // 2
     grid = TOLERANCE_REACH * stiffness_sd * np.arange(-half, half + 1) / half

@@ -66,7 +66,7 @@ def check_response(
     """
     check = ResponseCheck({}, [], [])
     slices = cut_slices(intensity, slow_period(motion) * PERIODS_PER_SEARCH)
-    found = [(middle, each) for middle, each in _search_slices(beam, intensity, slices)]
+    found = _search_slices(beam, intensity, slices)
     for column, name in enumerate(AXES):
         clear = [(middle, axes[column]) for middle, axes in found if axes[column].is_clear]
         if not clear or len(clear) < MIN_FOUND_FRACTION * len(slices):
