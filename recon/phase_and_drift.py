@@ -77,7 +77,8 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     errors = register(motion)
     if not wants_readout_phase(motion, options) or first_late_slice(errors, motion) is not None:
         return replace(estimated, phase_errors=errors)
-    motion, errors, readout_phase = remove_readout_phase(motion, errors, register)
+    one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
+    motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
     notes = [*describe_readout_phase(motion, readout_phase), *estimated.motion_notes]
     return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
 

@@ -29,7 +29,8 @@ def measure_reference_phase(recording: Recording, device: Device) -> ReferencePh
     prepared = prepare(recording, device)
     sensed = estimate_motion(prepared, Options())
     corrected = correct_readout_phase(sensed, Options())
-    found, errors = corrected.readout_phase, corrected.phase_errors
+    found = {axis: error for axis, error in corrected.readout_phase.items() if error.measured}
+    errors = corrected.phase_errors
     if not found or not errors:
         return None
     value = np.array([found[axis].value if axis in found else np.nan for axis in AXES])

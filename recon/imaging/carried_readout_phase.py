@@ -13,7 +13,14 @@ import numpy as np
 
 from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.readout_phase import measured_phase_error, posterior_times
-from recon.imaging.readout_phase_model import OFFSET_SDS_RAD, ReadoutPhase, weigh_hypotheses
+from recon.imaging.readout_phase_model import (
+    OFFSET_SDS_RAD,
+    ConstantPrior,
+    ReadoutPhase,
+    average_separately,
+    constant_prior,
+    weigh_hypotheses,
+)
 from scanner.device import AXES
 from scanner.motion import Motion
 
@@ -52,12 +59,11 @@ def update_readout_phase(
     for column, name in enumerate(AXES):
         axis = motion.axes[name]
         measured = measured_phase_error(errors, column, axis, corrected.axes[name])
-        earlier = None
+        prior = constant_prior(OFFSET_SDS_RAD)
         if name in known:
             updated[name] = replace(known[name], variance=known[name].variance + CHANGE_SD_RAD**2)
-            earlier = float(updated[name].mean[-1]), float(updated[name].variance[-1])
-        times = posterior_times(axis, measured[0])
-        hypotheses = weigh_hypotheses(*measured, times, may_drift=False, earlier=earlier)
-        if hypotheses is not None:
-            updated[name] = hypotheses.average()
+            prior = ConstantPrior(float(updated[name].mean[-1]), updated[name].variance[-1:], np.zeros(1))
+        hypotheses = weigh_hypotheses(*measured, posterior_times(axis, measured[0]), may_drift=False)
+        if hypotheses.determines_constant:
+            updated[name] = average_separately(hypotheses, prior)
     return updated

@@ -16,7 +16,6 @@ import numpy as np
 from recon.imaging.bidirectional_phase import PhaseError, PhaseEstimate
 from recon.imaging.readout_phase_model import (
     DRIFT_SDS_RAD,
-    Hypotheses,
     ReadoutPhase,
     average_jointly,
     weigh_hypotheses,
@@ -46,7 +45,10 @@ ms."""
 
 
 def remove_readout_phase(
-    motion: Motion, errors: Sequence[PhaseError], register: Callable[[Motion], list[PhaseError]]
+    motion: Motion,
+    errors: Sequence[PhaseError],
+    register: Callable[[Motion], list[PhaseError]],
+    one_readout: bool = False,
 ) -> tuple[Motion, list[PhaseError], Mapping[str, ReadoutPhase]]:
     """Correct a motion by the phase error of its readout that the picture shows.
 
@@ -57,58 +59,77 @@ def remove_readout_phase(
         motion: of both axes.
         errors: its phase errors.
         register: measures the phase errors of a corrected motion.
+        one_readout: whether both axes have a readout in common. Its delay shifts both in proportion to their
+            frequencies, so that it is known in an axis of which the picture determines no phase.
 
     Returns:
         The corrected motion, whose ``phase_sd`` is that of sense signal and picture together; its phase errors; and the
-        error that was removed by axis, without the axes of which the picture determines none. Their ``phase_sd`` allows
-        for electronics that nobody described.
+        error that was removed by axis, without the axes of which nothing determines it. Their ``phase_sd`` allows for
+        electronics that nobody described.
     """
-    corrected, found = motion, dict[str, ReadoutPhase]()
-    changes: dict[str, list[float]] = {name: [] for name in AXES}
+    corrected, found, earlier = motion, dict[str, ReadoutPhase](), dict[str, float]()
     refuted: set[str] = set()
     for last in (False,) * (MAX_ROUNDS - 1) + (True,):
-        axes = dict(motion.axes)
-        estimates = average_jointly(_weigh_axes(motion, corrected, errors, set(AXES) - refuted))
-        for name in AXES:
-            axis, estimate = motion.axes[name], estimates.get(name)
-            if estimate is not None:
-                axes[name] = advance_axis(axis, estimate)
-                moved = axes[name].phase - corrected.axes[name].phase
-                changes[name].append(float(np.max(np.abs(moved) / axes[name].phase_sd)))
-            if name in found and (estimate is None or changes[name][-1] > max(changes[name][-2], REPORTED_SDS)):
-                refuted.add(name)  # rounds that converge change less and less, down to their noise
-            if estimate is None or name in refuted:
-                found.pop(name, None)
-                axes[name] = widen_undetermined(axis)
-            else:
-                found[name] = estimate
+        estimates = _estimate_axes(motion, corrected, errors, refuted, one_readout)
+        changes = _changes_sd(motion, corrected, estimates)
+        contradicted = {
+            name
+            for name, error in found.items()
+            if error.measured
+            and (
+                name not in estimates
+                or not estimates[name].measured
+                or changes[name] > max(earlier[name], REPORTED_SDS)  # rounds that converge change less and less
+            )
+        }
+        if contradicted:
+            refuted |= contradicted
+            estimates = _estimate_axes(motion, corrected, errors, refuted, one_readout)
+            changes = _changes_sd(motion, corrected, estimates)
+        found, earlier = estimates, changes
+        axes = {
+            name: advance_axis(axis, found[name]) if name in found else widen_undetermined(axis)
+            for name, axis in motion.axes.items()
+        }
         before, corrected = corrected, replace(motion, axes=axes)
-        if last or all(changes[name][-1] < CONVERGENCE_SD for name in found):
+        if last or all(change < CONVERGENCE_SD for change in changes.values()):
             break
         errors = register(corrected)
     return corrected, _errors_after(errors, before, corrected), found
 
 
-def _weigh_axes(
-    motion: Motion, corrected: Motion, errors: Sequence[PhaseError], names: Set[str]
-) -> dict[str, Hypotheses]:
-    """Hypotheses on the phase errors of axes of ``motion``, without the axes of which the picture determines none.
+def _estimate_axes(
+    motion: Motion, corrected: Motion, errors: Sequence[PhaseError], refuted: Set[str], one_readout: bool
+) -> dict[str, ReadoutPhase]:
+    """Phase errors of ``motion``, without the axes of which the picture determines none.
 
     Args:
         motion, corrected: before and after a correction.
         errors: of the corrected motion.
-        names: of the axes.
+        refuted: axes whose measurements are not used.
+        one_readout: as in ``remove_readout_phase``.
     """
-    found = {}
-    for name in names:
+    axes = {}
+    for column, name in enumerate(AXES):
         axis = motion.axes[name]
-        measured = measured_phase_error(errors, AXES.index(name), axis, corrected.axes[name])
-        times = posterior_times(axis, measured[0])
+        time, value, sd = measured_phase_error(errors, column, axis, corrected.axes[name])
+        times = posterior_times(axis, time)
         sense_sd = np.interp(times, axis.time, axis.phase_sd)
-        hypotheses = weigh_hypotheses(*measured, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
-        if hypotheses is not None:
-            found[name] = hypotheses
-    return found
+        used_sd = np.full_like(sd, np.inf) if name in refuted else sd
+        axes[name] = weigh_hypotheses(time, value, used_sd, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
+    measured = {name: axis for name, axis in axes.items() if axis.determines_constant}
+    if not (one_readout and measured):
+        return average_jointly(measured)
+    return average_jointly(axes, {name: 2.0 * np.pi * float(np.median(motion.axes[name].frequency)) for name in axes})
+
+
+def _changes_sd(motion: Motion, corrected: Motion, estimates: Mapping[str, ReadoutPhase]) -> dict[str, float]:
+    """Largest change of each estimated phase from ``corrected``, in standard deviations."""
+    changes = {}
+    for name, estimate in estimates.items():
+        axis = advance_axis(motion.axes[name], estimate)
+        changes[name] = float(np.max(np.abs(axis.phase - corrected.axes[name].phase) / axis.phase_sd))
+    return changes
 
 
 def measured_phase_error(
@@ -169,6 +190,13 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
         for name in AXES
         if name not in found
     ]
+    notes += [
+        f"the picture determines no phase of {name}; the delay that it shows in the other axis, whose signal passes "
+        f"the same readout, was removed: {np.degrees(error.value):.3g}° ± {np.degrees(error.sd):.1g}°"
+        for name, error in found.items()
+        if not error.measured
+    ]
+    found = {name: error for name, error in found.items() if error.measured}
     late = {name: error for name, error in found.items() if abs(error.value) > REPORTED_SDS * error.sd}
     for name, error in late.items():
         notes.append(

@@ -14,7 +14,15 @@ from phantoms.targets import make_target
 from recon.evaluation import truth_from_simulation
 from recon.imaging.bidirectional_phase import PhaseError, PhaseErrorParts, PhaseEstimate
 from recon.imaging.readout_phase import remove_readout_phase
-from recon.imaging.readout_phase_model import ReadoutPhase, average_jointly, correlate_matern32, weigh_hypotheses
+from recon.imaging.readout_phase_model import (
+    OFFSET_SDS_RAD,
+    ReadoutPhase,
+    average_jointly,
+    average_separately,
+    constant_prior,
+    correlate_matern32,
+    weigh_hypotheses,
+)
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
 from recon.report.summary import summarise
@@ -32,9 +40,7 @@ def measured(truth: np.ndarray, sd: float, rng: np.random.Generator) -> tuple[np
 
 def estimated(value: np.ndarray, sd: np.ndarray, at: np.ndarray, sense_sd: float = 0.0) -> ReadoutPhase:
     """Posterior of one axis by its measurements at ``TIME_S``."""
-    hypotheses = weigh_hypotheses(TIME_S, value, sd, at, sense_sd)
-    assert hypotheses is not None
-    return hypotheses.average()
+    return average_separately(weigh_hypotheses(TIME_S, value, sd, at, sense_sd), constant_prior(OFFSET_SDS_RAD))
 
 
 @pytest.mark.parametrize("kind", ["as stated", "constant", "drifting"])
@@ -89,7 +95,7 @@ def test_a_large_constant_is_found_to_the_precision_of_the_mean() -> None:
 
 def test_without_measurements_there_is_no_estimate() -> None:
     nothing = np.full(TIME_S.size, np.nan), np.full(TIME_S.size, np.inf)
-    assert weigh_hypotheses(TIME_S, *nothing, POSTERIOR_TIME_S) is None
+    assert not weigh_hypotheses(TIME_S, *nothing, POSTERIOR_TIME_S).determines_constant
 
 
 def test_the_estimate_returns_to_the_constant_away_from_the_measurements() -> None:
@@ -111,10 +117,50 @@ def test_an_axis_measured_well_narrows_the_intervals_of_the_other_one_if_its_rea
         y = weigh_hypotheses(TIME_S, *measured(still, np.radians(0.1), rng), POSTERIOR_TIME_S, np.radians(0.01))
         for kind, truth in (("still", still), ("drifting", drift)):
             x = weigh_hypotheses(TIME_S, *measured(truth, np.radians(0.01), rng), POSTERIOR_TIME_S, np.radians(0.01))
-            assert x is not None
-            assert y is not None
-            stated[kind].append(np.mean(average_jointly({"x": x, "y": y})["y"].variance / y.average().variance))
+            alone = average_separately(y, constant_prior(OFFSET_SDS_RAD))
+            stated[kind].append(np.mean(average_jointly({"x": x, "y": y})["y"].variance / alone.variance))
     assert max(stated["still"]) < 1.0 < min(stated["drifting"])
+
+
+RATES = {"x": 2.0 * np.pi * 13.8e3, "y": 2.0 * np.pi * 3.3e3}
+
+
+def test_a_delay_of_the_common_readout_that_one_axis_shows_is_known_in_the_other() -> None:
+    rng = np.random.default_rng(6)
+    ones = np.ones(POSTERIOR_TIME_S.size)
+    nothing = np.full(TIME_S.size, np.nan), np.full(TIME_S.size, np.inf)
+    for delay in (0.0, 0.5e-6, 1.0e-6):
+        late = {axis: rate * delay for axis, rate in RATES.items()}
+        x = weigh_hypotheses(TIME_S, *measured(late["x"] * ones, np.radians(0.03), rng), POSTERIOR_TIME_S)
+        found = average_jointly({"x": x, "y": weigh_hypotheses(TIME_S, *nothing, POSTERIOR_TIME_S)}, RATES)
+        assert found["x"].measured
+        assert not found["y"].measured
+        assert abs(found["y"].value - late["y"]) < np.radians(0.05)
+        assert np.radians(0.05) < found["y"].sd < np.radians(0.3)  # feedthrough into one axis alone is not excluded
+
+
+def test_intervals_of_both_axes_have_their_nominal_coverage_whatever_the_readout_does() -> None:
+    rng = np.random.default_rng(7)
+    sds = {"x": np.radians(0.03), "y": np.radians(0.1)}
+    for delayed_too, own in ((True, False), (False, True), (True, True)):
+        covered, ratio = [], []
+        for _ in range(100):
+            delay = 10.0 ** rng.uniform(-7.5, -6.0) if delayed_too else 0.0
+            truth = {axis: rate * delay for axis, rate in RATES.items()}
+            if own:
+                truth["x"] += rng.choice([-1.0, 1.0]) * np.radians(10.0 ** rng.uniform(-1.5, 0.0))
+            ones = np.ones(POSTERIOR_TIME_S.size)
+            axes = {
+                axis: weigh_hypotheses(TIME_S, *measured(truth[axis] * ones, sds[axis], rng), POSTERIOR_TIME_S)
+                for axis in RATES
+            }
+            found = average_jointly(axes, RATES)
+            error = [(found[axis].value - truth[axis]) / found[axis].sd for axis in RATES]
+            covered.append(np.abs(error) < 1.96)
+            ratio.append(found["y"].sd / average_separately(axes["y"], constant_prior(OFFSET_SDS_RAD)).sd)
+        assert np.all(np.mean(covered, axis=0) > 0.9), (delayed_too, own, np.mean(covered, axis=0))
+        if delayed_too and not own:
+            assert np.mean(ratio) < 0.8  # x determines the delay better than y does
 
 
 def delayed(sense: np.ndarray) -> np.ndarray:
