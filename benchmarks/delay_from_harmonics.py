@@ -21,7 +21,7 @@ from benchmarks.tracker_bound import DRIVES
 from estimation.signals import phase_reference, sense_channels
 from estimation.tracker.block_tracking import average_over_noise
 from estimation.tracker.initial_state import RELATIVE_DAMPING_SD
-from estimation.tracker.observations import demodulate_blocks, lay_out_blocks
+from estimation.tracker.observations import lay_out_blocks
 from estimation.tracker.process_noise import INITIAL_DENSITIES, noise_posterior, tuning_parts, with_offset_density
 from estimation.tracker.track import tune_section
 from phantoms.forward import InitialState, Plan, simulate
@@ -66,8 +66,9 @@ def log_likelihood(recording: Recording, device: Device, delay: float, min_dampi
     recording = recording.with_channel(replace(channel, start=channel.start - delay))
     (sense,) = sense_channels(recording, device)
     references = {name: phase_reference(recording, device, name, sense.channel, True) for name in sense.axes}
-    observations = demodulate_blocks(lay_out_blocks(recording, device, sense, references))
-    section = tune_section(observations, device, None, np.tile(INITIAL_DENSITIES, (len(AXES), 1)), False)
+    layout = lay_out_blocks(recording, device, sense, references)
+    densities = np.tile(INITIAL_DENSITIES, (len(AXES), 1))
+    section = tune_section(layout, (0, layout.starts.size), device, None, densities, False)
     densities = section.tuning.densities.copy()
     densities[:, DAMPING] = np.maximum(densities[:, DAMPING], min_damping_density)
     parts = with_offset_density(tuning_parts(section.observations.signal), section.tuning.offset_density)

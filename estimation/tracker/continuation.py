@@ -11,6 +11,7 @@ from estimation.tracker.demodulation import NoiseSpectrum
 from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.observations import BlockLayout
 from estimation.tracker.process_noise import NoisePosterior
+from estimation.tracker.readout_curve import ReadoutCurve
 from estimation.tracker.state_space import AXIS_STATES, PHASE
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -37,6 +38,7 @@ class Tuning(NamedTuple):
         noise_scale: factor on the noise variance of the blocks.
         offset_density: of the random walk of the readout's offset [V^2/s].
         spectrum: of the noise of the blocks' projections.
+        curves: of the readout, in the order in which the channel was straightened.
     """
 
     densities: Array
@@ -44,6 +46,7 @@ class Tuning(NamedTuple):
     noise_scale: float
     offset_density: float
     spectrum: NoiseSpectrum
+    curves: tuple[ReadoutCurve, ...] = ()
 
 
 class TrackEnd(NamedTuple):

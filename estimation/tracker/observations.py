@@ -34,6 +34,7 @@ from estimation.tracker.line_noise import (
     sample_noise_variance,
 )
 from scanner.arrays import Array, Complex, Index
+from scanner.channel import Channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.harmonics import readout_response
@@ -154,6 +155,10 @@ class BlockLayout:
     w: Array
     force: Complex
     drive_share: Array
+
+    def with_channel(self, channel: Channel) -> BlockLayout:
+        """The layout with other samples of its channel."""
+        return replace(self, sense=replace(self.sense, channel=channel))
 
 
 def lay_out_blocks(

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from estimation.reference import PhaseReference
 from estimation.signals import SenseChannel, intensity_clock, is_capacitive, phase_reference, sense_channels
-from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noise, expand_clipped_blocks
+from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noise, expand_clipped_blocks, track_blocks
 from estimation.tracker.continuation import TrackEnd, Tuning, continued_prior, end_of_track, find_end
 from estimation.tracker.initial_state import initial_estimate, resolve_signs
 from estimation.tracker.kalman_filter import StateEstimate
@@ -24,6 +25,7 @@ from estimation.tracker.process_noise import (
     tuning_parts,
     with_offset_density,
 )
+from estimation.tracker.readout_curve import ReadoutCurve, describe_curves, fit_readout_curve, straightened_channel
 from estimation.tracker.to_motion import AxisKnots, axis_knots, join_knots, motion_of_knots
 from scanner.arrays import Array
 from scanner.device import Device
@@ -37,6 +39,10 @@ the inertia, on whose exchange of energy with the spring the averaged dynamics r
 
 SECTION_BLOCKS = 16384
 """Blocks whose samples are projected at a time, some 10 s: bounds the memory of a long recording."""
+
+MAX_CURVE_ROUNDS = 4
+"""Largest number of times that a curve of the readout is estimated and removed; where there is none, the first one ends
+it, and after a smooth curve the second or third."""
 
 MAX_NOISE_ROUNDS = 5
 """Largest number of rounds in which process noise and noise level are estimated alternately."""
@@ -71,6 +77,7 @@ def track(
     axes: dict[str, AxisMotion] = {}
     info: dict[str, object] = {}
     ends: dict[str, object] = {}
+    notes: list[str] = []
     for sense in sense_channels(recording, device, gaps_ok=True):
         even = is_capacitive(sense.readout)
         end = find_end(previous, sense.channel)
@@ -80,6 +87,9 @@ def track(
             for name, frequency in zip(sense.axes, frequencies, strict=True)
         }
         _check_resonant(sense, device, references)
+        curves = list(end.tuning.curves) if end else []
+        for curve in curves:
+            sense = replace(sense, channel=straightened_channel(sense.channel, curve))
         layout = lay_out_blocks(recording, device, sense, references, end and (end.start, end.length))
         signs, prior = (list(end.signs), continued_prior(end, layout)) if end else ([], None)
         densities = _previous_densities(previous, sense)
@@ -89,14 +99,19 @@ def track(
         results: list[SectionResult] = []
         inherited = end and end.inherited_tuning(layout)
         for first, stop in section_ranges(layout.drive_share):
-            spectrum = inherited.spectrum if inherited else None
-            observations = demodulate_blocks(layout, first, stop + LOOKAHEAD_BLOCKS, spectrum)
+            part = first, stop + LOOKAHEAD_BLOCKS
             if inherited and prior:
+                observations = demodulate_blocks(layout, *part, inherited.spectrum)
                 section = inherit_tuning(observations, prior, signs, inherited, causal)
             else:
-                if offset_density is not None:
-                    observations = observations.with_offset_density(offset_density)
-                section = tune_section(observations, device, prior, densities, causal)
+                tune = partial(
+                    tune_section, part=part, device=device, prior=prior, densities=densities, causal=causal,
+                    known_offset_density=offset_density,
+                )  # fmt: skip
+                section = tune(layout)
+                if first == 0:
+                    section, layout, found = straighten_section(section, layout, tune, causal)
+                    curves += found
             observations, densities = section.observations, section.tuning.densities
             offset_density = section.tuning.offset_density
             signs = signs or section.signs
@@ -121,8 +136,10 @@ def track(
             axes[name] = motion_of_knots(layout.references[name], join_knots(knots[a]), clock, signs[a])
         info[sense.channel.name] = _summarise(layout, results, densities, offset_density)
         tuned_blocks = end.tuned_blocks if end and inherited else layout.starts.size
-        ends[sense.channel.name] = end_of_track(layout, states.next_prior, signs, section.tuning, tuned_blocks)
-    return Motion(axes, "tracker-causal" if causal else "tracker", info, ends=ends)
+        notes += describe_curves(curves, sense.channel)
+        tuning = section.tuning._replace(curves=tuple(curves))
+        ends[sense.channel.name] = end_of_track(layout, states.next_prior, signs, tuning, tuned_blocks)
+    return Motion(axes, "tracker-causal" if causal else "tracker", info, tuple(notes), ends)
 
 
 def track_end(motion: Motion) -> float | None:
@@ -185,7 +202,13 @@ class TunedSection(NamedTuple):
 
 
 def tune_section(
-    observations: BlockObservations, device: Device, prior: StateEstimate | None, densities: Array, causal: bool
+    layout: BlockLayout,
+    part: tuple[int, int],
+    device: Device,
+    prior: StateEstimate | None,
+    densities: Array,
+    causal: bool,
+    known_offset_density: float | None = None,
 ) -> TunedSection:
     """Process noise and noise level of a section from its own blocks.
 
@@ -196,9 +219,13 @@ def tune_section(
     External phases are not used: a few of them would be fitted by an increased process noise.
 
     Args:
+        part: first and stop block of the section.
         prior: estimate at the end of the previous section, None for the first section.
-        densities: at which the tuning starts, shape (axes, 4).
+        densities: at which the tuning starts, shape (axes, 4). known_offset_density: the same of the offset.
     """
+    observations = demodulate_blocks(layout, *part)
+    if known_offset_density is not None:
+        observations = observations.with_offset_density(known_offset_density)
     start, signs = resolve_signs(observations, initial_estimate(observations, device))
     residual_var, scale = observations.signal.noise_var, 1.0
     for _ in range(MAX_NOISE_ROUNDS):
@@ -218,6 +245,30 @@ def tune_section(
     posterior = noise_posterior(observations, start, parts, densities)
     tuning = Tuning(densities, posterior, scale, offset_density, observations.signal.spectrum)
     return TunedSection(observations, prior or start, signs, tuning)
+
+
+def straighten_section(
+    section: TunedSection, layout: BlockLayout, tune: Callable[[BlockLayout], TunedSection], causal: bool
+) -> tuple[TunedSection, BlockLayout, list[ReadoutCurve]]:
+    """Remove a curve of the readout that the device file does not state.
+
+    Args:
+        section: the first one of the channel. layout: of the channel.
+        tune: tunes the section of a layout with other samples.
+
+    Returns:
+        The section and the layout of the straightened channel, and the curves that were removed one after the other.
+    """
+    curves: list[ReadoutCurve] = []
+    for _ in range(MAX_CURVE_ROUNDS):
+        track = track_blocks(section.observations, section.prior, section.tuning.densities[None], causal)[0]
+        curve = fit_readout_curve(layout, section.observations, track.states)
+        if curve is None:
+            break
+        layout = layout.with_channel(straightened_channel(layout.sense.channel, curve))
+        section = tune(layout)
+        curves.append(curve)
+    return section, layout, curves
 
 
 def inherit_tuning(
