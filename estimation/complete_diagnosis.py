@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from estimation.device_fit.data import output_channels
 from estimation.device_fit.fit import fit_model
 from estimation.device_fit.model import Model
 from estimation.diagnosis.diagnose import Diagnosis, diagnose, nominal_device
@@ -25,7 +26,12 @@ if TYPE_CHECKING:
 SENSED_STAGES = ("capacitance", "readout", "timing")
 """Stages whose terms change the phase of the motion that is estimated from the sense signal."""
 
+DETECTORS = {"sensor": "angle", "edges": "sync"}
+"""Channels by which an estimator measures the motion of an axis directly."""
+
 UNTESTED_MOTION = "drive and mechanics, because the device states no mechanics"
+
+UNTESTED_EDGES = "drive and mechanics, because only sync edges show the motion"
 
 MeasureReference = Callable[[Recording, Device], "ReferencePhase | None"]
 """Measures the phase errors of the motion independently of the readout; None if the recording does not allow it."""
@@ -44,7 +50,7 @@ def diagnose_with_optics(
     without it have adapted to it. What the picture shows then belongs to the optics.
 
     A device that states no mechanics predicts no motion. If its recordings have an intensity, only readout and optics
-    are diagnosed.
+    are diagnosed; so they are if sync edges alone show the motion.
 
     Args:
         recordings: of one device.
@@ -90,13 +96,19 @@ def _diagnose_pictures(
 
 
 def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress: Progress) -> Diagnosis:
-    """The diagnosis without pictures; of a device without mechanics whose recordings have some, an empty one."""
+    """The diagnosis without pictures.
+
+    It is empty if the recordings have pictures, and the device states no mechanics or sync edges alone show the motion.
+    """
     pictures = any("intensity" in recording for recording in recordings)
     if pictures and not any(axis.mechanics for axis in nominal.axes.values()):
         if set(nominal.axes) != set(AXES):
             what = f"tests nothing: the device states no mechanics, and only the axis {', '.join(nominal.axes)}"
             raise BadInput(what, file=recordings[0].path, hint="state mechanics, or both axes for the picture")
         return Diagnosis("consistent", (), None, nominal, None, untested=UNTESTED_MOTION)
+    edges = all(f"sync_{axis}" in recording.edges for recording in recordings for axis in nominal.axes)
+    if pictures and edges and not any(output_channels(recording, nominal) for recording in recordings):
+        return Diagnosis("consistent", (), None, nominal, None, untested=UNTESTED_EDGES)
     responses = [frequency_responses(recording, nominal) for recording in recordings]
     if any(responses):
         if len(recordings) > 1:
@@ -177,7 +189,12 @@ def add_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:
     device = diagnosis.device
     corrected = correct_intensity(recording, device)
     motion = beam_motion(estimate(corrected, device), device, corrected.start)
-    optics = diagnose_optics(motion, corrected["intensity"], device)
+    detectors = {
+        axis: f"{DETECTORS[motion.estimator]}_{axis}"
+        for axis in AXES
+        if f"{DETECTORS.get(motion.estimator)}_{axis}" in {*recording.channels, *recording.edges}
+    }
+    optics = diagnose_optics(motion, corrected["intensity"], device, detectors)
     return replace(
         diagnosis,
         verdict="mismatch" if optics.findings else diagnosis.verdict,

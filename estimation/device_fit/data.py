@@ -119,7 +119,7 @@ def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Ru
     Raises:
         BadInput: no channel can be simulated by the device, or a channel is missing or invalid.
     """
-    channels = _output_channels(recording, device)
+    channels = output_channels(recording, device)
     if not channels:
         holds = ", ".join(recording.channels)
         kinds = ", ".join(("sense", *REFERENCE_ORDERS))
@@ -173,7 +173,8 @@ def readout_of(device: Device, axis: str) -> Readout | None:
     return device.readout if device.readout is not None else device.axis(axis).readout
 
 
-def _output_channels(recording: Recording, device: Device) -> dict[str, tuple[str, tuple[str, ...]]]:
+def output_channels(recording: Recording, device: Device) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Kind of each channel that the device can simulate, and the axes that it shows, by name."""
     channels: dict[str, tuple[str, tuple[str, ...]]] = {}
     for name in device.axes:
         channel = sense_channel(device, name)

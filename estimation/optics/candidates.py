@@ -7,7 +7,7 @@ applied to a sinusoidal motion.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,8 @@ class OpticsEffect:
     """A hypothesis about the optics: a direction in the space of the measured parameters.
 
     Attributes:
-        name: of the effect in the catalogue, or ``"phase"`` for a phase error of one axis.
+        name: of the effect in the catalogue, ``"detector-delay"`` for a late detector of one axis's motion, or
+            ``"phase"`` for a phase error of one axis whose motion follows from another signal.
         axis: that it is reported for.
         direction: change of each measured parameter with a unit of the effect's amplitude. Empty for an effect that
             changes none of them and cannot be detected.
@@ -54,19 +55,23 @@ class OpticsEffect:
     size: float
 
 
-def candidate_effects(scan: ScanSamples, rates: Mapping[str, float]) -> list[OpticsEffect]:
+def candidate_effects(
+    scan: ScanSamples, rates: Mapping[str, float], detectors: Container[str] = ()
+) -> list[OpticsEffect]:
     """All optics effects of the catalogue, and a phase error of each axis.
 
     Effects on the intensity are reported for axis x, effects on the position for each axis.
 
     Args:
         rates: angular frequency of each axis [rad/s].
+        detectors: axes whose motion is measured by a detector of their own.
     """
     terms = [term for term in catalogue().values() if term.stage == "optics" and term.effect not in SAME_DIRECTION]
     effects = [_linearise(term, "x", scan, rates) for term in terms if "intensity" in term.channels]
     for axis in AXES:
         effects += [_linearise(term, axis, scan, rates) for term in terms if "place" in term.channels]
-        effects.append(OpticsEffect("phase", axis, {f"delay_{axis}": 1.0}, MAX_PHASE_ERROR_RAD / rates[axis]))
+        name = "detector-delay" if axis in detectors else "phase"
+        effects.append(OpticsEffect(name, axis, {f"delay_{axis}": 1.0}, MAX_PHASE_ERROR_RAD / rates[axis]))
     return [effect for effect in effects if effect is not None]
 
 

@@ -39,6 +39,10 @@ MIN_REPORTED_PROBABILITY = 1e-4
 """Rivals below this probability are not listed."""
 
 
+PHASE_EFFECTS = ("phase", "detector-delay")
+"""Hypotheses about the phase of one axis, see ``OpticsEffect``."""
+
+
 @dataclass(frozen=True)
 class EffectDescription:
     """An effect of known amplitude in the terms of the catalogue; the fields are those of ``Finding``."""
@@ -54,17 +58,18 @@ class EffectDescription:
 
 def has_permitted_sign(effect: OpticsEffect, amplitude: float) -> bool:
     """Whether the term of an effect permits the sign of its amplitude; a phase error may have either sign."""
-    return effect.name == "phase" or catalogue()[effect.name].parameters[0].sign * amplitude >= 0.0
+    return effect.name in PHASE_EFFECTS or catalogue()[effect.name].parameters[0].sign * amplitude >= 0.0
 
 
 def catalogue_name(effect: OpticsEffect, amplitude: float) -> str:
     """Name of the effect in the catalogue at the sign of its amplitude.
 
-    A phase error of one axis is ``"unknown"``, because the intensity does not show its cause. So is an effect whose
-    sign its term excludes. A negative delay of the intensity is a delay of the other channels.
+    A phase error of one axis is ``"unknown"``, because the intensity does not show its cause, unless its motion is
+    measured by a detector of its own, which may be late. So is an effect whose sign its term excludes. A negative delay
+    of the intensity is a delay of the other channels.
     """
-    if effect.name == "phase":
-        return "unknown"
+    if effect.name in PHASE_EFFECTS:
+        return "channel-delay" if effect.name == "detector-delay" and amplitude < 0.0 else "unknown"
     if has_permitted_sign(effect, amplitude):
         return effect.name
     return "channel-delay" if effect.name == "intensity-delay" else "unknown"
@@ -80,14 +85,16 @@ def describe_effect(
         rates: angular frequency of each axis [rad/s].
     """
     name, axis, low, high = catalogue_name(effect, value), effect.axis, value - Z_95 * sd, value + Z_95 * sd
-    if effect.name == "phase":
-        degrees = np.degrees(rates[axis]) * value
+    if effect.name in PHASE_EFFECTS:
+        moved = "lags behind" if value > 0.0 else "is ahead of"
+        size = f"{1e6 * abs(value):.3g} +- {1e6 * Z_95 * sd:.2g} us ({abs(np.degrees(rates[axis]) * value):.3g} deg)"
         where = (
             f"forward and backward half-periods of {axis} are displaced against each other, those of the other axis "
-            f"are not: the motion lags {1e6 * value:.3g} +- {1e6 * Z_95 * sd:.2g} us ({degrees:.3g} deg) behind its "
-            "estimate"
+            f"are not: the motion {moved} its estimate by {size}"
         )
-        equation = f"θ_{axis}(t - {value:.3g} s)"
+        if name == "channel-delay":
+            return _describe_term(axis, name, -value, (-high, -low), where)
+        equation = f"θ_{axis}(t {'-' if value > 0.0 else '+'} {abs(value):.3g} s)"
         return EffectDescription(axis, "timing", name, equation, "forward against backward half-periods", (), where)
     if effect.name == "bleaching":
         if name == "unknown":

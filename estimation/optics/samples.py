@@ -112,6 +112,9 @@ class ScanSamples:
 def _position(scan: ScanSamples, axis: str, delay: float) -> Array:
     """``ScanSamples.position``, cached because most parameters do not change the delay."""
     angle = np.concatenate([read_delayed(scan.tracks[axis], *run, delay) for run in scan.runs])
+    unknown = ~np.isfinite(angle)
+    if unknown.any():  # of samples that the masks leave out, and of a few beside them
+        angle[unknown] = np.interp(np.flatnonzero(unknown), np.flatnonzero(~unknown), angle[~unknown])
     return np.asarray((angle - scan.centre[axis]) / scan.half_swing[axis])
 
 

@@ -8,7 +8,7 @@ effects are compared by their evidence:
 * no effect: the parameters lie within the estimator's phase error, the tolerance of the readout's corner frequencies
   and the errors that detail below a cell causes;
 * delayed intensity: both axes lag by one time;
-* phase error of one axis: that axis alone lags;
+* phase error of one axis: that axis alone lags, or the detector that measures its motion does;
 * bleaching: the light decays;
 * sample motion: half-periods of both directions are displaced equally along one axis.
 
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -126,12 +127,15 @@ Rivals = dict[tuple[str, str], list[tuple[float, OpticsEffect]]]
 """(effect, axis) -> (difference in -2 log evidence, rival) of each effect that acts on the same parameters."""
 
 
-def diagnose_optics(motion: Motion, intensity: Channel, device: Device) -> OpticsDiagnosis:
+def diagnose_optics(
+    motion: Motion, intensity: Channel, device: Device, detectors: Mapping[str, str] = MappingProxyType({})
+) -> OpticsDiagnosis:
     """Find the optics effects that the samples of a scan demand.
 
     Args:
         motion: of both axes, at the intensity's samples.
         device: nominal, for its tolerances.
+        detectors: channel that measures the motion of an axis directly, by axis.
     """
     scan = read_scan({axis: motion.axes[axis].angle for axis in AXES}, intensity)
     rates = {axis: 2 * np.pi * float(np.median(motion.axes[axis].frequency)) for axis in AXES}
@@ -139,7 +143,7 @@ def diagnose_optics(motion: Motion, intensity: Channel, device: Device) -> Optic
     parameters = np.array([fit.parameters[name] for name in MEASURED_PARAMETERS])
     score = fit.information @ parameters + parameters / fit.prior_sd**2
     likelihood = GaussianLikelihood(fit.information, score, nominal_covariance(motion, device, rates, scan, variances))
-    candidates = candidate_effects(scan, rates)
+    candidates = candidate_effects(scan, rates, detectors)
     selected, rivals = select_effects(likelihood, [effect for effect in candidates if effect.direction])
     selected = _validated(scan, variances, likelihood, selected)
     detectability = tuple(
@@ -147,7 +151,7 @@ def diagnose_optics(motion: Motion, intensity: Channel, device: Device) -> Optic
     )
     if not selected:
         return OpticsDiagnosis((), detectability, {})
-    findings, terms = _report(scan, variances, likelihood, selected, rivals, rates)
+    findings, terms = _report(scan, variances, likelihood, selected, rivals, rates, detectors)
     return OpticsDiagnosis(findings, detectability, terms)
 
 
@@ -158,6 +162,7 @@ def _report(
     selected: list[OpticsEffect],
     rivals: Rivals,
     rates: Mapping[str, float],
+    detectors: Mapping[str, str],
 ) -> tuple[tuple[Finding, ...], dict[str, dict[str, dict[str, float]]]]:
     """Findings in order of evidence, and the terms that they add to the device."""
     mean, covariance, evidence = likelihood.posterior(selected)
@@ -180,9 +185,14 @@ def _report(
             description, distance, other_name = discriminate_delay_from_lag(scan, description, amplitude, improved)
             distances.append((distance, other_name))
         findings.append((gain, build_finding(description, gain, distances, heldout)))
-        if description.parameters and description.effect in catalogue() and description.stage == "optics":
-            values = {parameter.name: parameter.value for parameter in description.parameters}
+        values = {parameter.name: parameter.value for parameter in description.parameters}
+        if values and description.effect in catalogue() and description.stage == "optics":
             terms.setdefault(description.axis, {})[description.effect] = values
+        elif description.effect == "channel-delay":
+            late = [effect.axis] if effect.name == "detector-delay" else AXES
+            for axis in (axis for axis in late if detectors.get(axis) == f"angle_{axis}"):
+                variant = catalogue()["channel-delay"].channels.index("angle")
+                terms.setdefault(axis, {})["channel-delay"] = {**values, "variant": variant}
     findings.sort(key=lambda pair: -pair[0])
     return tuple(finding for _, finding in findings), terms
 

@@ -107,9 +107,13 @@ def test_an_effect_is_found_and_its_interval_contains_the_true_value(
     assert finding.heldout["after"] < 0.8 * finding.heldout["before"]
 
 
-def test_a_phase_error_of_one_axis_is_not_reported_as_an_intensity_delay() -> None:
-    (finding,) = diagnose_with_optics([scan(phase_x=0.05)]).findings
-    assert (finding.effect, finding.axis, finding.stage) == ("unknown", "x", "timing")
+@pytest.mark.parametrize(("phase_x", "effect"), [(0.05, "channel-delay"), (-0.05, "unknown")])
+def test_a_phase_error_of_one_axis_is_a_late_detector_or_unknown_not_an_intensity_delay(
+    phase_x: float, effect: str
+) -> None:
+    """No detector is early."""
+    (finding,) = diagnose_with_optics([scan(phase_x=phase_x)]).findings
+    assert (finding.effect, finding.axis, finding.stage) == (effect, "x", "timing")
     assert "deg" in finding.where
 
 

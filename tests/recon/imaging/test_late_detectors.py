@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimation.complete_diagnosis import UNTESTED_EDGES, add_optics, diagnose_with_optics
+from estimation.diagnosis.diagnose import Diagnosis
 from phantoms.sync import SyncDetector, sync_edges
 from recon.evaluation import Truth, truth_from_simulation
 from recon.pipeline import reconstruct
@@ -87,3 +89,25 @@ def test_a_late_intensity_is_not_called_a_delay_of_the_readout() -> None:
     expect_found(result, {axis: -degrees for axis, degrees in EXPECTED_DEG.items()})
     assert any("an intensity that is 1 µs late" in note for note in result.notes)
     assert not any("in the readout would explain" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("late", [("y",), ("x", "y")])
+def test_the_diagnosis_names_a_late_position_detector_and_states_it_in_the_device(late: tuple[str, ...]) -> None:
+    """The angle begins with the delay, so that the first samples of the intensity have none."""
+    recording = recorded("angle", {axis: DELAY_S * (axis in late) for axis in "xy"})
+    assert recording.device is not None
+    found = add_optics(Diagnosis("consistent", (), None, recording.device, None), recording)
+    assert [(finding.effect, finding.axis) for finding in found.findings] == [("channel-delay", late[0])]
+    (delay,) = found.findings[0].parameters
+    assert delay.ci95[0] < DELAY_S < delay.ci95[1]
+    assert [axis for axis in "xy" if "channel-delay" in found.device.axes[axis].terms] == list(late)
+    result = reconstruct(recording, Options(device=found.device, sense_only=True), known(), quiet=True)
+    for axis in late:
+        assert np.degrees(result.evaluation[axis].phase_rmse) < 0.2 * EXPECTED_DEG[axis]
+
+
+@pytest.mark.parametrize("delay", [DELAY_S, 0.0])
+def test_late_sync_edges_are_diagnosed_by_the_picture(delay: float) -> None:
+    found = diagnose_with_optics([recorded("sync", {"x": 0.0, "y": delay})])
+    assert found.untested == UNTESTED_EDGES
+    assert [(finding.effect, finding.axis) for finding in found.findings] == [("channel-delay", "y")] * (delay > 0.0)
