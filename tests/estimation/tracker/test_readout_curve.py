@@ -39,7 +39,9 @@ def clipped_then_coupled(sense: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(sense, low, high) + 0.005 * sense.std() * tone)
 
 
-@pytest.mark.parametrize("change", [curved(3), curved(5), clipped_then_coupled], ids=["third", "fifth", "clipped"])
+@pytest.mark.parametrize(
+    "change", [curved(3), curved(5), curved(7), clipped_then_coupled], ids=["third", "fifth", "seventh", "clipped"]
+)
 def test_the_amplitude_is_that_of_a_straight_readout(
     change: Callable[[np.ndarray], np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
