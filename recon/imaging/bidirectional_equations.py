@@ -16,8 +16,8 @@ SMOOTHING_SD_CELLS = 1.5
 """Standard deviation of the Gaussian that smooths the picture, in cells."""
 
 BLOCKS_PER_SLICE = 64
-"""Blocks of time in a slice. Their scores are treated as independent for the standard error; blocks in space would
-share the pattern of the scan."""
+"""Blocks of time in a slice. For the standard error of an axis, the scores of blocks of about one of its periods are
+treated as independent; blocks in space would share the pattern of the scan."""
 
 
 class NormalEquations(NamedTuple):

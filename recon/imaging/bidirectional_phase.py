@@ -253,10 +253,11 @@ def _estimate_phase_errors(
     )
     clear = np.isfinite(start)
     start = np.where(clear, start, 0.0)
+    groups = _blocks_of_a_period(samples.dx, slices), _blocks_of_a_period(samples.dy, slices)
     best, limit = start, np.full_like(start, SEARCH_RESOLUTION_RAD)
     best_parts = _undetermined_parts(slices)
     for cell in (4 * finest, 2 * finest, finest):  # noisy pictures need large cells, fine detail small ones
-        fit = _fit_cells(samples, best, grid, cell)
+        fit = _fit_cells(samples, best, grid, cell, groups)
         clear &= fit.clear  # noise that hides coarse detail also hides fine detail
         fine_enough = fit.unbiased | (cell == 4 * finest)
         better = (
@@ -288,8 +289,22 @@ def _undetermined_parts(slices: int) -> Array:
     return np.tile([np.nan, np.inf], (slices, PARTS_PER_SLICE, 2, 1))
 
 
-def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: float) -> _Fit:
-    """Gauss-Newton from ``error`` on, over cells of one size [px]."""
+def _blocks_of_a_period(change: Array, slices: int) -> int:
+    """Blocks of about one period of an axis: the power of two nearest to it, at least 1.
+
+    Detail that the cells do not resolve acts on both directions of an axis with opposite signs. In blocks of half a
+    period it would count as noise, although it cancels.
+
+    Args:
+        change: of the position with the phase, whose sign is the direction, shape (n,).
+    """
+    periods = np.count_nonzero(np.diff(np.sign(change[change != 0.0]))) / 2.0 / slices
+    nearest = 2 ** round(math.log2(BLOCKS_PER_SLICE / max(periods, 1.0)))
+    return min(max(nearest, 1), BLOCKS_PER_SLICE // 4)
+
+
+def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: float, groups: tuple[int, int]) -> _Fit:
+    """Gauss-Newton from ``error`` on, over cells of one size [px]; the scores of groups of blocks are independent."""
     to_cells = 0.5 * np.array([grid.width, grid.height]) / cell
     for _ in range(10):
         here = normal_equations(samples, error, grid, cell)
@@ -314,7 +329,10 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     for s, axes in enumerate(determined):
         if axes.any():
             shares = here.score[s][:, axes] @ np.linalg.pinv(slope[s][np.ix_(axes, axes)]).T
-            sd[s, axes] = np.linalg.norm(shares, axis=0)
+            sd[s, axes] = [
+                np.linalg.norm(share.reshape(-1, group).sum(axis=1))
+                for share, group in zip(shares.T, np.array(groups)[axes], strict=True)
+            ]
             weight = here.block_information[s][:, axes].reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
             weight = np.maximum(weight / weight.sum(0), np.finfo(float).tiny)
             by_part = shares.reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
