@@ -12,6 +12,7 @@ from estimation.device_fit.model import Model
 from estimation.diagnosis.diagnose import Diagnosis, diagnose, nominal_device
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.selection import Progress
+from estimation.diagnosis.undriven import steady_without_drive
 from estimation.slow.diagnose import diagnose_decays, slow_decays
 from estimation.slow.diagnose_response import diagnose_responses
 from estimation.slow.response import frequency_responses
@@ -98,7 +99,8 @@ def _diagnose_pictures(
 def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress: Progress) -> Diagnosis:
     """The diagnosis without pictures.
 
-    It is empty if the recordings have pictures, and the device states no mechanics or sync edges alone show the motion.
+    It is empty if the recordings have pictures, and the device states no mechanics, sync edges alone show the motion,
+    or the drive that keeps it up is missing.
     """
     pictures = any("intensity" in recording for recording in recordings)
     if pictures and not any(axis.mechanics for axis in nominal.axes.values()):
@@ -109,6 +111,11 @@ def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress:
     edges = all(f"sync_{axis}" in recording.edges for recording in recordings for axis in nominal.axes)
     if pictures and edges and not any(output_channels(recording, nominal) for recording in recordings):
         return Diagnosis("consistent", (), None, nominal, None, untested=UNTESTED_EDGES)
+    steady = next(filter(None, (steady_without_drive(recording, nominal) for recording in recordings)), None)
+    if steady is not None:
+        if not pictures:
+            raise BadInput(steady, file=recordings[0].path, hint="record the drive, or correct J and b of the device")
+        return Diagnosis("consistent", (), None, nominal, None, untested=f"drive and mechanics, because {steady}")
     responses = [frequency_responses(recording, nominal) for recording in recordings]
     if any(responses):
         if len(recordings) > 1:

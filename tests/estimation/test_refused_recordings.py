@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.diagnosis.undriven import steady_without_drive
 from estimation.identification.calibrate import identify
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
@@ -52,3 +53,20 @@ def test_too_few_turns_are_refused(driven: bool, message: str) -> None:
 def test_a_device_without_a_spring_is_refused_with_what_to_do() -> None:
     with pytest.raises(BadInput, match=r"must be a number greater than 0; a device without a spring"):
         Mechanics(1.0, 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        (np.ones(TIME.size), "sense_x moves steadily, but drive_x was not recorded"),
+        (np.exp(-0.5 * TIME), None),  # decays, though six times more slowly than the device file says
+        (np.zeros(TIME.size), None),
+    ],
+)
+def test_a_motion_that_persists_without_a_recorded_drive_is_refused(shape: np.ndarray, message: str | None) -> None:
+    sense = shape * np.cos(2 * np.pi * 100.0 * TIME) + 0.01 * np.random.default_rng(2).normal(size=TIME.size)
+    without_drive = Recording.from_arrays({"sense_x": (sense, "V", 1e4)}, device(100.0))
+    assert steady_without_drive(without_drive, device(100.0)) == message
+    if message is not None:
+        with pytest.raises(BadInput, match="record the drive"):
+            diagnose_with_optics([without_drive])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimation.complete_diagnosis import UNTESTED_EDGES, add_optics, diagnose_with_optics
-from estimation.diagnosis.diagnose import Diagnosis
+from estimation.complete_diagnosis import UNTESTED_EDGES, diagnose_with_optics
 from phantoms.sync import SyncDetector, sync_edges
 from recon.evaluation import Truth, truth_from_simulation
 from recon.pipeline import reconstruct
@@ -95,8 +94,8 @@ def test_a_late_intensity_is_not_called_a_delay_of_the_readout() -> None:
 def test_the_diagnosis_names_a_late_position_detector_and_states_it_in_the_device(late: tuple[str, ...]) -> None:
     """The angle begins with the delay, so that the first samples of the intensity have none."""
     recording = recorded("angle", {axis: DELAY_S * (axis in late) for axis in "xy"})
-    assert recording.device is not None
-    found = add_optics(Diagnosis("consistent", (), None, recording.device, None), recording)
+    found = diagnose_with_optics([recording])
+    assert found.untested == "drive and mechanics, because angle_x moves steadily, but drive_x was not recorded"
     assert [(finding.effect, finding.axis) for finding in found.findings] == [("channel-delay", late[0])]
     (delay,) = found.findings[0].parameters
     assert delay.ci95[0] < DELAY_S < delay.ci95[1]
