@@ -11,10 +11,10 @@ with Matérn-3/2 covariances (σ1², τ) and (σs(t)², τ). T, c and g are the 
 the estimator, σs the standard deviation that it states. The picture measures s too, so the variance of the corrected
 phase is the posterior variance of β. The hyperparameters σT, σ0, σ1, τ and a factor on the standard errors are averaged
 over by their marginal likelihood (Rasmussen and Williams 2006, eq. 2.30).
-σT = 0, σ0 = 0 and σ1 = 0, a readout as stated, have half of the prior probability each, so that a correct readout keeps
-the precision that the sense signal gives. Whether the readout varies (σ1 > 0) is common to both axes, because the same
-electronics read them: the axis that the picture determines better decides it for both. Axes with readouts of their own
-have no T, and c is as large as it may be.
+σT = 0, σ0 = 0 of both axes and σ1 = 0, a readout as stated, have half of the prior probability each, so that a correct
+readout keeps the precision that the sense signal gives. Whether the readout varies (σ1 > 0) is common to both axes,
+because the same electronics read them: the axis that the picture determines better decides it for both. Axes with
+readouts of their own have no T, and c is as large as it may be.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ NOISE_FACTORS = np.array([1.0, 2.0, 4.0])
 """Factors on the standard errors of the measurements, equally probable. Detail that the registration does not resolve
 acts on short parts as additional noise."""
 PRIOR_PROBABILITY_AS_STATED = 0.5
-"""Prior probability that a constant, and independently that the varying part, is zero: no preference either way."""
+"""Prior probability that the delay is zero, and independently that all constants of single axes are, and that the
+varying part is: no preference either way."""
 DELAY_STEPS = 61
 """Delays about each centre in the integral over T: less than half a standard deviation apart at the centre, further
 apart in proportion to the distance from it."""
@@ -123,10 +124,9 @@ class ConstantPrior(NamedTuple):
     log_probability: Array
 
 
-def constant_prior(sds: Array) -> ConstantPrior:
-    """Zero with ``PRIOR_PROBABILITY_AS_STATED``, else with one of the standard deviations, shape (k,) [rad]."""
-    share = (1.0 - PRIOR_PROBABILITY_AS_STATED) / sds.size
-    probability = np.concatenate([[PRIOR_PROBABILITY_AS_STATED], np.full(sds.size, share)])
+def constant_prior(sds: Array, as_stated: float = PRIOR_PROBABILITY_AS_STATED) -> ConstantPrior:
+    """Zero with the probability ``as_stated``, else with one of the standard deviations, shape (k,) [rad]."""
+    probability = np.concatenate([[as_stated], np.full(sds.size, (1.0 - as_stated) / sds.size)])
     return ConstantPrior(0.0, np.concatenate([[0.0], sds**2]), np.log(probability))
 
 
@@ -200,13 +200,12 @@ def average_jointly(
         rates: angular frequencies [rad/s] where the axes have a readout in common, whose delay is then a part of the
             model.
     """
-    delays, log_prior, sds = np.zeros(1), np.zeros(1), OFFSET_SDS_RAD
+    delays, log_prior, prior = np.zeros(1), np.zeros(1), constant_prior(OFFSET_SDS_RAD)
     if rates is not None:
         delays, log_prior = _delay_nodes(axes, rates)
-        sds = OWN_OFFSET_SDS_RAD
+        prior = constant_prior(OWN_OFFSET_SDS_RAD, PRIOR_PROBABILITY_AS_STATED ** (1.0 / len(axes)))
     constants = {
-        name: _weigh_constants(axis, delays * (rates[name] if rates else 0.0), constant_prior(sds))
-        for name, axis in axes.items()
+        name: _weigh_constants(axis, delays * (rates[name] if rates else 0.0), prior) for name, axis in axes.items()
     }
     evidence = {name: _evidence_of_drift(axis, constants[name]) for name, axis in axes.items()}
     found = {}
