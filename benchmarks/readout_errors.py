@@ -50,7 +50,7 @@ def low_passed(sense: Array, drive: Array, rate: float, rng: np.random.Generator
 
 
 def with_feedthrough(sense: Array, drive: Array, rate: float, rng: np.random.Generator) -> Array:
-    """Drive voltage of x on the electrode, 0.2 to 1 % of the signal, of either sign."""
+    """Drive voltage of one axis on the electrode, 0.2 to 1 % of the signal, of either sign."""
     share = rng.uniform(0.002, 0.01) * rng.choice([-1.0, 1.0])
     return sense + share * sense.std() * (drive - drive.mean()) / drive.std()
 
@@ -121,7 +121,7 @@ def scan(seed: int) -> dict[str, Any]:
         target=scene, duration=DURATION_S, drift=drift, detector=Detector(photons_per_sample=photons, bits=12)
     )
     recording, truth = simulate_experiment(experiment, seed)
-    sense, drive = recording["sense"].read(), recording["drive_x"].read()
+    sense, drive = recording["sense"].read(), recording[f"drive_{rng.choice(['x', 'y'])}"].read()
     for kind in kinds:
         sense = IMPERFECTIONS[kind](sense, drive, recording["sense"].sample_rate, rng)
     known = truth_from_simulation(truth)

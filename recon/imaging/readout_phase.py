@@ -92,10 +92,12 @@ def remove_readout_phase(
             for name, axis in motion.axes.items()
         }
         before, corrected = corrected, replace(motion, axes=axes)
-        if last or all(change < CONVERGENCE_SD for change in changes.values()):
+        if last or not (contradicted or any(change > CONVERGENCE_SD for change in changes.values())):
             break
         errors = register(corrected)
-    return corrected, _errors_after(errors, before, corrected), found
+    # What was measured about a motion that is refuted, the gain of the detector too, is wrong.
+    errors = register(corrected) if contradicted else _errors_after(errors, before, corrected)
+    return corrected, errors, found
 
 
 def _estimate_axes(
