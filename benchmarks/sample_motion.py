@@ -198,8 +198,8 @@ def measure_scan(kind: str, photons: float, seed: int, duration: float) -> dict[
     return row
 
 
-def measure_rest(seed: int) -> tuple[bool, float]:
-    """Whether a sample at rest is reported as moving, and the gain of the log likelihood."""
+def measure_rest(seed: int) -> tuple[bool, float, float]:
+    """Whether a sample at rest is reported as moving, gain of the log likelihood, and motion stated as left [px]."""
     photons = REST_PHOTONS[seed // len(SCENES) % len(REST_PHOTONS)]
     scan = simulate_scan("rest", photons, seed, REST_DURATION_S)
     options = Options(pixels=(PIXELS, PIXELS), sample_motion=True)
@@ -208,7 +208,7 @@ def measure_rest(seed: int) -> tuple[bool, float]:
         prepared, replace(options, estimator=default_estimator(prepared.recording, prepared.device))
     )
     motion = correct_sample_motion(estimated, options).sample_motion
-    return (motion.moving, motion.gain) if motion is not None else (False, 0.0)
+    return (motion.moving, motion.gain, float(np.hypot(*motion.left))) if motion is not None else (False, 0.0, 0.0)
 
 
 def main() -> None:
@@ -228,8 +228,9 @@ def main() -> None:
             found.append(measure_rest(seed))
             if arguments.verbose:
                 print(seed, found[-1], flush=True)
-        gains = np.sort([gain for _, gain in found])
-        print(f"at rest: {sum(moving for moving, _ in found)} of {len(found)} reported as moving")
+        gains = np.sort([gain for _, gain, _ in found])
+        print(f"at rest: {sum(moving for moving, _, _ in found)} of {len(found)} reported as moving")
+        print(f"motion that is left is stated in {sum(left > 0.0 for _, _, left in found)}")
         print(f"gains of the log likelihood: median {np.median(gains):.2g}, largest {gains[-3:].round(2)}")
         return
     for kind in arguments.motions.split(";"):
