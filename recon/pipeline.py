@@ -150,7 +150,7 @@ def correct_sample_motion(estimated: EstimatedMotion, options: Options) -> Estim
         return estimated
     intensity = estimated.prepared.intensity
     found = measure_sample_motion(estimated.beam, intensity, estimated.grid, _unlocated(estimated))
-    notes = [*estimated.motion_notes, describe_sample_motion(found)]
+    notes = [*estimated.motion_notes, describe_sample_motion(found, intensity.sample_rate)]
     return replace(estimated, sample_motion=found, motion_notes=notes)
 
 

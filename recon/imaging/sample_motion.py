@@ -1,10 +1,12 @@
 """Rigid motion of the sample during a scan, estimated at the crossings of the scan path.
 
 1. At rest: the equations of each block around no motion (``sample_motion_equations``), and the likelihood of a walk
-   over rest (``motion_smoother``). Without a gain of ``MIN_LOG_LIKELIHOOD_GAIN`` nothing is reported.
+   and of vibrations over rest (``motion_smoother``). Without a gain of ``MIN_LOG_LIKELIHOOD_GAIN``, here or at the end,
+   nothing is reported.
 2. Coarse: parts of ``SEARCH_PERIODS`` by exhaustive comparison (``sample_motion_search``).
 3. Fine: Gauss-Newton over blocks of one period of the slower axis. Every round maps the samples with the present
    motion, and smooths the equations of all blocks. Kernels become narrower from round to round.
+4. Left: the variance of a motion that both halves of the scene show after that (``sample_motion_residual``).
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.imaging.motion_smoother import SmoothedMotion, smooth_motion
-from recon.imaging.sample_motion_equations import ScanSamples, block_equations
-from recon.imaging.sample_motion_jumps import place_jumps
+from recon.imaging.motion_smoother import SmoothedMotion, part_shift, smooth_motion
+from recon.imaging.sample_motion_equations import PARTS, ScanSamples, block_equations
+from recon.imaging.sample_motion_jumps import MotionKnots, place_jumps
+from recon.imaging.sample_motion_residual import residual_variance
 from recon.imaging.sample_motion_search import search_motion
+from recon.imaging.sample_vibrations import Vibration
 from scanner.arrays import Array
 from scanner.channel import Channel
 
@@ -55,12 +59,15 @@ class SampleMotion:
 
     Attributes:
         length: samples in a block, a period of the slower axis.
-        sample: sample numbers of the knots between which the displacement is linear: the middles of blocks, and two
-            knots at each jump, shape (knots,).
+        sample: sample numbers of the knots between which the displacement is linear: the middles of blocks, of their
+            parts where the sample vibrates, and two knots at each jump, shape (knots,).
         shift: x and y at the knots, shape (knots, 2) [px]; 0 for a sample at rest.
         sd: of ``shift``, shape (knots, 2) [px]; for a sample at rest that of the position of a single block.
         moving: whether a motion was found.
         gain: of the log likelihood by the motion over rest.
+        left: standard deviation of a motion in x and y that was not followed, shape (2,) [px]; 0 where none is
+            significant. ``sd`` contains it.
+        vibrations: that were found; frequencies in cycles per sample, amplitudes in pixels.
     """
 
     length: int
@@ -69,6 +76,8 @@ class SampleMotion:
     sd: Array
     moving: bool
     gain: float
+    left: Array
+    vibrations: tuple[Vibration, ...]
 
     def times(self, intensity: Channel) -> Array:
         """Times of the knots on the clock of the intensity that the motion was estimated from, shape (knots,) [s]."""
@@ -87,53 +96,67 @@ def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int
         period: of the slower axis [samples].
         shape: height and width of the picture [px].
     """
-    length = max(round(period), 4)
-    blocks = samples.x.size // length
+    part = max(round(period / PARTS), 1)
+    length = part * PARTS
+    blocks = -(-samples.x.size // length)
     if blocks < MIN_BLOCKS:
         return None
-    shift = np.zeros((blocks, 2))
-    width, compared = choose_width(samples, shift, length, shape)
+    position = np.zeros((blocks, 2))
+    at_rest = part_shift(position, [])
+    width, compared = choose_width(samples, at_rest, part, shape)
     if compared < MIN_COMPARED:
         return None
-    found = block_equations(samples, shift, length, shape, width)
-    smoothed = smooth_motion(found.score, found.information, shift, jumps=False)
-    gain = smoothed.gain
-    if gain < MIN_LOG_LIKELIHOOD_GAIN:
-        of_a_block = smoothed.scale * np.linalg.inv(found.information.mean(axis=0) + MIN_INFORMATION * np.eye(2))
-        sd = np.tile(np.sqrt(np.diag(of_a_block)), (blocks, 1))
+    equations = block_equations(samples, at_rest, part, shape, width)
+    first = final = smooth_motion(equations, position, jumps=False)
+    if first.gain >= MIN_LOG_LIKELIHOOD_GAIN:
+        start = first._replace(position=_coarse_motion(samples, length, blocks, shape), vibrations=[])
+        final, width = _follow(samples, start, part, shape)
+    gain = min(first.gain, final.gain)
+    moving = gain >= MIN_LOG_LIKELIHOOD_GAIN
+    if moving:
+        knots, shift, vibrations = place_jumps(samples, final, part, shape, width), final.shift, final.vibrations
+    else:
         middle: Array = np.asarray((np.arange(blocks) + 0.5) * length - 0.5, np.float64)
-        return SampleMotion(length, middle, shift, sd, False, gain)
-    shift = _coarse_motion(samples, length, blocks, shape)
-    for coarse in COARSE_WIDTHS_PX:
-        smoothed = _round(samples, shift, length, shape, coarse, smoothed.walk)
-        shift = smoothed.position
-    width, _ = choose_width(samples, shift, length, shape)
-    for _ in range(MAX_ROUNDS):
-        smoothed = _round(samples, shift, length, shape, width, smoothed.walk)
-        sd = np.sqrt(np.einsum("bii->bi", smoothed.covariance))
-        change = np.sqrt(np.mean((smoothed.position - shift) ** 2)) / np.sqrt(np.mean(sd**2))
-        shift = smoothed.position
-        if change < CONVERGED_SD:
-            break
-    knots = place_jumps(samples, shift, sd, smoothed.jumps, length, shape, width)
-    return SampleMotion(length, *knots, True, gain)
+        information = equations.information[:, :2, :2].mean(axis=0) + MIN_INFORMATION * np.eye(2)
+        sd_of_a_block = np.sqrt(first.motion.scale * np.diag(np.linalg.inv(information)))
+        knots, shift, vibrations = MotionKnots(middle, position, np.tile(sd_of_a_block, (blocks, 1))), at_rest, []
+    left = residual_variance(samples, shift, part, shape, width)
+    sample, displacement, sd = (each[knots.sample < samples.x.size] for each in knots)  # the last block may be cut off
+    per_sample = tuple(each._replace(frequency=each.frequency / length) for each in vibrations)
+    return SampleMotion(length, sample, displacement, np.sqrt(sd**2 + left), moving, gain, np.sqrt(left), per_sample)
 
 
-def choose_width(samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int]) -> tuple[float, float]:
+def choose_width(samples: ScanSamples, shift: Array, part: int, shape: tuple[int, int]) -> tuple[float, float]:
     """Return the kernel [px] whose picture of the other blocks predicts the samples best.
 
     The fraction of the samples that the narrowest kernel compares with others is returned too.
     """
-    found = [block_equations(samples, shift, length, shape, width) for width in WIDTHS_PX]
+    found = [block_equations(samples, shift, part, shape, width) for width in WIDTHS_PX]
     return WIDTHS_PX[int(np.argmin([each.misfit for each in found]))], found[0].compared
 
 
+def _follow(
+    samples: ScanSamples, smoothed: SmoothedMotion, part: int, shape: tuple[int, int]
+) -> tuple[SmoothedMotion, float]:
+    """The motion after rounds of Gauss-Newton from a coarse one, and the kernel [px] of the last ones."""
+    for coarse in COARSE_WIDTHS_PX:
+        smoothed = _round(samples, smoothed, part, shape, coarse)
+    width, _ = choose_width(samples, smoothed.shift, part, shape)
+    for _ in range(MAX_ROUNDS):
+        before = smoothed
+        smoothed = _round(samples, before, part, shape, width)
+        variance = np.einsum("bpii->bpi", smoothed.covariance()).mean()
+        if np.mean((smoothed.shift - before.shift) ** 2) < CONVERGED_SD**2 * variance:
+            break
+    return smoothed, width
+
+
 def _round(
-    samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int], width: float, walk: tuple[int, int]
+    samples: ScanSamples, around: SmoothedMotion, part: int, shape: tuple[int, int], width: float
 ) -> SmoothedMotion:
     """A step of Gauss-Newton, without the mean, which no sample determines."""
-    found = block_equations(samples, shift, length, shape, width)
-    smoothed = smooth_motion(found.score, found.information, shift, walk)
+    found = block_equations(samples, around.shift, part, shape, width)
+    smoothed = smooth_motion(found, around.position, around.vibrations, around)
     return smoothed._replace(position=smoothed.position - smoothed.position.mean(axis=0))
 
 

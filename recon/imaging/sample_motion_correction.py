@@ -96,7 +96,11 @@ def measure_sample_motion(beam: Motion, intensity: Channel, grid: Grid, unlocate
     period = slow_period(beam) * intensity.sample_rate
     shape = math.ceil(grid.height / cell), math.ceil(grid.width / cell)
     found = estimate_sample_motion(samples, period, shape)
-    return None if found is None else replace(found, shift=cell * found.shift, sd=cell * found.sd)
+    if found is None:
+        return None
+    vibrations = tuple(each._replace(cosine=cell * each.cosine, sine=cell * each.sine) for each in found.vibrations)
+    lengths = {name: cell * getattr(found, name) for name in ("shift", "sd", "left")}
+    return replace(found, vibrations=vibrations, **lengths)
 
 
 def relative_to_sample(beam: Motion, motion: SampleMotion | None, grid: Grid) -> Motion:
@@ -110,22 +114,28 @@ def relative_to_sample(beam: Motion, motion: SampleMotion | None, grid: Grid) ->
     return replace(beam, axes=axes)
 
 
-def describe_sample_motion(motion: SampleMotion | None) -> str:
-    """What a reader has to know of the motion that was removed, in a line."""
+def describe_sample_motion(motion: SampleMotion | None, sample_rate: float) -> str:
+    """What a reader has to know of the motion that was removed, in a line; sample rate of the intensity [Hz]."""
     if motion is None:
         return "sample motion: the scan crosses itself too rarely to determine one; nothing was removed"
+    left = ""
+    if motion.left.any():
+        left = "; a motion of {:.2g} x {:.2g} pixels rms (x, y) beside it could not be followed".format(*motion.left)
+    sd = float(np.sqrt(np.mean(motion.sd**2)))
     if not motion.moving:
         text = "sample motion: none was found"
-        sd = float(np.sqrt(np.mean(motion.sd**2)))
         if sd > MAX_USEFUL_SD_PX:
             return (
                 f"{text}, but a period of the slower axis determines the position to {sd:.2g} pixels only: the picture "
-                "has too little structure or too few photons"
+                f"has too little structure or too few photons{left}"
             )
-        return f"{text}; each period of the slower axis determines the position to {sd:.2g} pixels (1 sd)"
+        return f"{text}; each period of the slower axis determines the position to {sd:.2g} pixels (1 sd){left}"
     range_x, range_y = np.ptp(motion.shift, axis=0)
-    sd = float(np.sqrt(np.mean(motion.sd**2)))
-    return (
+    text = (
         f"sample motion: {range_x:.2g} x {range_y:.2g} pixels peak to peak (x, y), known to {sd:.1g} pixels at each "
-        "moment, was removed; a vibration of hundreds of hertz may be left, which that standard deviation leaves out"
+        "moment, was removed"
     )
+    for each in motion.vibrations:
+        across, down = 2.0 * each.peak
+        text += f"; vibration at {each.frequency * sample_rate:.4g} Hz, {across:.2g} x {down:.2g} pixels peak to peak"
+    return text + left

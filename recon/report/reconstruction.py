@@ -190,7 +190,7 @@ def sample_motion_sections(result: Reconstruction) -> list[Section]:
         return []
     uri = sample_motion_figure(motion.times(result.intensity), motion.shift, motion.sd)
     figure = Figure(uri, "displacement of the sample with ±2 standard deviations; its mean is not determined")
-    text = describe_sample_motion(motion)
+    text = describe_sample_motion(motion, result.intensity.sample_rate)
     return [Section("Motion of the sample", f"{text[0].upper()}{text[1:]}.", figures=[figure], least="26rem")]
 
 

@@ -144,6 +144,14 @@ def sample_motion_summary(result: Reconstruction) -> dict[str, Any] | None:
         "sd_px": dict(zip(AXES, np.sqrt(np.mean(motion.sd**2, axis=0)).tolist(), strict=True)),
         "log_likelihood_gain": motion.gain,
         "bandwidth_hz": 0.5 * result.intensity.sample_rate / motion.length,
+        "vibrations": [
+            {
+                "frequency_hz": each.frequency * result.intensity.sample_rate,
+                "peak_to_peak_px": dict(zip(AXES, (2.0 * each.peak).tolist(), strict=True)),
+            }
+            for each in motion.vibrations
+        ],
+        "left_px": dict(zip(AXES, motion.left.tolist(), strict=True)),
     }
 
 

@@ -14,7 +14,8 @@ from recon.cli import main
 from recon.imaging.motion_smoother import smooth_motion
 from recon.imaging.sample_motion import MIN_LOG_LIKELIHOOD_GAIN, SampleMotion, estimate_sample_motion
 from recon.imaging.sample_motion_correction import describe_sample_motion
-from recon.imaging.sample_motion_equations import ScanSamples, block_equations
+from recon.imaging.sample_motion_equations import PARTS, SHAPES, BlockEquations, ScanSamples, block_equations
+from recon.imaging.sample_vibrations import Vibration
 from tests.support.simulated import imaging
 
 RATE, PIXELS = 1.5e6, 96
@@ -57,7 +58,8 @@ def test_a_sample_at_rest_is_reported_at_rest() -> None:
     assert not found.moving
     assert found.gain < 0.5 * MIN_LOG_LIKELIHOOD_GAIN
     assert not found.shift.any()
-    assert "none was found" in describe_sample_motion(found)
+    assert "none was found" in describe_sample_motion(found, RATE)
+    assert not found.left.any()
 
 
 def test_a_breathing_sample_is_followed_within_its_standard_deviation() -> None:
@@ -94,23 +96,31 @@ def test_a_phase_error_is_no_motion() -> None:
 
 def test_the_equations_show_a_known_translation() -> None:
     samples = scan(np.zeros((2, 2)))
-    shift = np.zeros((BLOCKS, 2))
-    shift[50] = 0.5, -0.3
-    equations = block_equations(samples, shift, round(PERIOD), (PIXELS, PIXELS), 1.0)
-    found = np.linalg.solve(equations.information[50], equations.score[50])
-    sd = np.sqrt(np.diag(np.linalg.inv(equations.information[50])))
+    shift = np.zeros((BLOCKS * PARTS, 2))
+    shift[50 * PARTS : 51 * PARTS] = 0.5, -0.3
+    equations = block_equations(samples, shift, round(PERIOD / PARTS), (PIXELS, PIXELS), 1.0)
+    information = equations.information[50, :2, :2]
+    found = np.linalg.solve(information, equations.score[50, :2])
+    sd = np.sqrt(np.diag(np.linalg.inv(information)))
     assert np.abs(found - (-0.5, 0.3)) == pytest.approx(0.0, abs=4.0 * sd.max())
     assert sd.max() < 0.15
 
 
 def test_white_noise_of_the_position_is_smoothed_to_rest() -> None:
     rng = np.random.default_rng(2)
-    information = np.tile(np.diag([50.0, 20.0]), (400, 1, 1))
-    score = rng.standard_normal((400, 2)) * np.sqrt([50.0, 20.0])
-    smoothed = smooth_motion(score, information, np.zeros((400, 2)))
+    strength = np.tile([50.0, 20.0], len(SHAPES))
+    score = rng.standard_normal((400, strength.size)) * np.sqrt(strength)
+    equations = BlockEquations(score, np.tile(np.diag(strength), (400, 1, 1)), 1.0, 1.0, independent)
+    smoothed = smooth_motion(equations, np.zeros((400, 2)))
     assert smoothed.gain < 4.0
     assert np.abs(smoothed.position).max() < 0.1
     assert not smoothed.jumps
+    assert not smoothed.vibrations
+
+
+def independent(columns: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Products of the scores for independent noise: not asked for where no vibration is found."""
+    raise AssertionError
 
 
 def test_a_scene_without_structure_and_a_scan_without_crossings_are_stated() -> None:
@@ -119,11 +129,11 @@ def test_a_scene_without_structure_and_a_scan_without_crossings_are_stated() -> 
     found = estimate_sample_motion(flat, PERIOD, (PIXELS, PIXELS))
     assert found is not None
     assert not found.moving
-    assert "too little structure" in describe_sample_motion(found)
+    assert "too little structure" in describe_sample_motion(found, RATE)
     line = (0.5 + 4.0 * (np.arange(samples.x.size) // 1800)).astype(np.float32)
     raster = ScanSamples.from_arrays(samples.places(slice(None))[0], line, samples.value)
     assert estimate_sample_motion(raster, 1800.0, (PIXELS, PIXELS)) is None
-    assert "too rarely" in describe_sample_motion(None)
+    assert "too rarely" in describe_sample_motion(None, RATE)
 
 
 @pytest.mark.slow
@@ -149,8 +159,41 @@ def test_the_command_removes_a_motion_and_states_it(tmp_path: Path) -> None:
     assert "Motion of the sample" in (out / "report.html").read_text()
 
 
-def test_the_note_of_a_removed_motion_says_what_may_be_left() -> None:
+def test_the_note_names_vibrations_and_what_is_left() -> None:
     shift = np.array([[0.0, 0.0], [3.0, 1.0]])
-    note = describe_sample_motion(SampleMotion(1000, np.array([0.0, 1e5]), shift, np.full((2, 2), 0.05), True, 99.0))
+    vibration = Vibration(500.0 / RATE, np.array([1.5, 0.0]), np.array([0.0, 0.5]))
+    found = SampleMotion(
+        1000, np.array([0.0, 1e5]), shift, np.full((2, 2), 0.05), True, 99.0, np.array([0.4, 0.0]), (vibration,)
+    )
+    note = describe_sample_motion(found, RATE)
     assert "3 x 1 pixels peak to peak" in note
-    assert "a vibration of hundreds of hertz may be left" in note
+    assert "vibration at 500 Hz, 3 x 1 pixels peak to peak" in note
+    assert "0.4 x 0 pixels rms (x, y) beside it could not be followed" in note
+
+
+def vibration(hertz: float, size: float) -> np.ndarray:
+    """A displacement [px] peak to peak along (0.8, 0.6), for :func:`scan`."""
+    time = np.linspace(0.0, BLOCKS * PERIOD / RATE, 20 * BLOCKS)
+    return 0.5 * size * np.outer(np.sin(2.0 * np.pi * hertz * time + 1.0), [0.8, 0.6])
+
+
+@pytest.mark.parametrize(("hertz", "size"), [(400.0, 4.0), (1000.0, 1.0), (3500.0, 1.0)])
+def test_a_vibration_on_top_of_a_drift_is_followed(hertz: float, size: float) -> None:
+    drift = np.linspace(0.0, 4.0, 20 * BLOCKS)[:, None] * [0.5, -0.5]
+    displacement = vibration(hertz, size) + drift
+    found = estimate_sample_motion(scan(displacement), PERIOD, (PIXELS, PIXELS))
+    assert found is not None
+    assert [each.frequency * RATE for each in found.vibrations] == pytest.approx([hertz], abs=2.0)
+    assert 2.0 * found.vibrations[0].peak == pytest.approx([0.8 * size, 0.6 * size], abs=0.1)
+    error = error_of(found, displacement)
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert np.mean(np.abs(error) < 1.96 * found.sd) > 0.8
+    assert not found.left.any()
+
+
+def test_a_vibration_above_the_band_is_stated() -> None:
+    found = estimate_sample_motion(scan(vibration(4700.0, 4.0)), PERIOD, (PIXELS, PIXELS))
+    assert found is not None
+    assert found.left.max() > 0.5
+    assert np.all(found.sd[:, np.argmax(found.left)] > 0.5)
+    assert "could not be followed" in describe_sample_motion(found, RATE)
