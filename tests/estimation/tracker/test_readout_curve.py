@@ -8,11 +8,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from estimation.tracker import track
+from estimation.tracker import track, track_end
 from estimation.tracker.readout_curve import ReadoutCurve, straightened_channel
 from scanner import devices
 from scanner.channel import make_channel
 from scanner.motion import Motion
+from scanner.recording import Recording
 from tests.support.simulated import noisy, with_sense
 
 
@@ -39,6 +40,22 @@ def clipped_then_coupled(sense: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(sense, low, high) + 0.005 * sense.std() * tone)
 
 
+def between(recording: Recording, start: float | None, stop: float) -> Recording:
+    """The samples of a recording between two times [s]."""
+    assert start is not None
+    channels = {}
+    for name, channel in recording.channels.items():
+        first, last = (round((time - channel.start) * channel.sample_rate) for time in (start, stop))
+        values = channel.read(max(first, 0), last)
+        channels[name] = (
+            values,
+            channel.unit,
+            channel.sample_rate,
+            channel.start + max(first, 0) / channel.sample_rate,
+        )
+    return Recording.from_arrays(channels, recording.device)
+
+
 @pytest.mark.parametrize(
     "change", [curved(3), curved(5), curved(7), clipped_then_coupled], ids=["third", "fifth", "seventh", "clipped"]
 )
@@ -63,3 +80,13 @@ def test_a_straightened_channel_undoes_its_curve_and_keeps_missing_samples() -> 
     channel = straightened_channel(make_channel("sense", measured, unit="V", sample_rate=1.0), curve)
     np.testing.assert_allclose(channel.read(), [-1.0, -0.5, 0.0, 0.5, 0.8, np.nan], atol=1e-5)
     np.testing.assert_allclose(channel.read(1, 3), [-0.5, 0.0], atol=1e-5)
+
+
+def test_the_next_segment_of_a_scan_is_straightened_by_the_same_curve() -> None:
+    device, recording = devices.load("imaging"), with_sense(noisy(3), curved(5))
+    whole, first = track(recording, device), track(between(recording, 0.0, 0.022), device)
+    second = track(between(recording, track_end(first), 0.03), device, previous=first)
+    assert second.notes == first.notes
+    for axis in "xy":
+        amplitude, known = second.axes[axis].amplitude, whole.axes[axis]
+        np.testing.assert_allclose(amplitude, np.interp(second.axes[axis].time, known.time, known.amplitude), rtol=2e-3)
