@@ -13,7 +13,6 @@ from estimation.tracker.readout_curve import ReadoutCurve, straightened_channel
 from scanner import devices
 from scanner.channel import make_channel
 from scanner.motion import Motion
-from scanner.recording import Recording
 from tests.support.simulated import noisy, with_sense
 
 
@@ -38,22 +37,6 @@ def clipped_then_coupled(sense: np.ndarray) -> np.ndarray:
     low, high = np.quantile(sense, [0.03, 0.97])
     tone = np.sin(2.0 * np.pi * 27680.0 / 5e6 * np.arange(sense.size))
     return np.asarray(np.clip(sense, low, high) + 0.005 * sense.std() * tone)
-
-
-def between(recording: Recording, start: float | None, stop: float) -> Recording:
-    """The samples of a recording between two times [s]."""
-    assert start is not None
-    channels = {}
-    for name, channel in recording.channels.items():
-        first, last = (round((time - channel.start) * channel.sample_rate) for time in (start, stop))
-        values = channel.read(max(first, 0), last)
-        channels[name] = (
-            values,
-            channel.unit,
-            channel.sample_rate,
-            channel.start + max(first, 0) / channel.sample_rate,
-        )
-    return Recording.from_arrays(channels, recording.device)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +67,10 @@ def test_a_straightened_channel_undoes_its_curve_and_keeps_missing_samples() -> 
 
 def test_the_next_segment_of_a_scan_is_straightened_by_the_same_curve() -> None:
     device, recording = devices.load("imaging"), with_sense(noisy(3), curved(5))
-    whole, first = track(recording, device), track(between(recording, 0.0, 0.022), device)
-    second = track(between(recording, track_end(first), 0.03), device, previous=first)
+    whole, first = track(recording, device), track(recording.slice(0.0, 0.022), device)
+    start = track_end(first)
+    assert start is not None
+    second = track(recording.slice(start, 0.03), device, previous=first)
     assert second.notes == first.notes
     for axis in "xy":
         amplitude, known = second.axes[axis].amplitude, whole.axes[axis]
