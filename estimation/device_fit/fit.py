@@ -95,6 +95,12 @@ class Fit:
         return np.asarray(np.linalg.inv(fitted.T @ fitted + np.diag(self.model.precision)))
 
     @property
+    def promised_fall(self) -> float:
+        """Fall of the misfit that the linear model still promises: about 0 where the fit has converged."""
+        gradient = self.jacobian[self.rows].T @ self.residual[self.rows] + self.model.precision * self.x
+        return float(gradient @ self.covariance @ gradient)
+
+    @property
     def validation_chi2(self) -> float:
         """Reduced chi-square of the held-out samples."""
         return float(np.mean(self.residual[self.validation_rows] ** 2))
@@ -218,7 +224,7 @@ def fit_model(
     steps: Array | None = None,
     tolerance: float = 0.05,
     abort_above: float = np.inf,
-    fixed: int | None = None,
+    fixed: Sequence[int] = (),
 ) -> Fit:
     """Fit a model to the samples of a window; see ``estimation.least_squares.fit_levenberg_marquardt``.
 
@@ -229,7 +235,7 @@ def fit_model(
         steps: difference steps, shape (p,), adapted in place.
         tolerance: stop when a step lowers the misfit by less.
         abort_above: misfit of a competing fit. A fit above it that no longer approaches it is aborted.
-        fixed: index of a parameter that keeps its value.
+        fixed: indices of parameters that keep their value.
     """
     steps = np.full(x.size, INITIAL_STEP) if steps is None else steps
     rows = likelihood.fitted(stop)
@@ -239,7 +245,7 @@ def fit_model(
         x,
         model.precision,
         rows=rows,
-        fixed=() if fixed is None else (fixed,),
+        fixed=fixed,
         max_iterations=max_iterations,
         tolerance=tolerance,
         abort_above=abort_above,

@@ -61,7 +61,7 @@ def _profile_endpoint(likelihood: Likelihood, fit: Fit, i: int, side: float) -> 
             break
         distance *= np.clip(1.0 / rise, 0.5, 2.0)
         trial = fit_model(
-            likelihood, fit.model, fit.x + ridge * distance, max_iterations=4, tolerance=PROFILE_TOLERANCE, fixed=i
+            likelihood, fit.model, fit.x + ridge * distance, max_iterations=4, tolerance=PROFILE_TOLERANCE, fixed=(i,)
         )
         ridge, rise = (trial.x - fit.x) / distance, relative_rise(trial.chi2 + trial.penalty)
     return float(distance / np.clip(rise, 0.5, 2.0))

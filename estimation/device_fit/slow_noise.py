@@ -28,6 +28,11 @@ MAX_SLOPE = 2.0
 of electronics exceeds for long."""
 
 
+MAX_PROMISED_FALL = 10.0
+"""Fall of the misfit that the linear model may still promise at a fit: iterations end where a step lowers the misfit by
+less than 0.05, so that a fit with more is not at a minimum of the linear model."""
+
+
 class _SlowPart(NamedTuple):
     """The slowest cosines of one whitened channel, in which the noise is extrapolated.
 
@@ -59,9 +64,13 @@ class _SlowPart(NamedTuple):
 def steeper_noise_gain(likelihood: Likelihood, fit: Fit) -> float:
     """Fall of a fit's -2 log evidence if the slow noise of every channel rises more steeply than extrapolated.
 
-    All parameters of the fit are estimated again under that noise, around the fit.
+    All parameters of the fit are estimated again under that noise, around the fit. They keep their values where the
+    linear model does not hold: what it promises there may exceed the whole misfit.
     """
-    columns = np.column_stack([fit.jacobian, fit.residual - fit.jacobian @ fit.x])
+    if fit.promised_fall < MAX_PROMISED_FALL:
+        columns = np.column_stack([fit.jacobian, fit.residual - fit.jacobian @ fit.x])
+    else:
+        columns = np.column_stack([np.zeros_like(fit.jacobian), fit.residual])
     whiteners = [whitener for row in likelihood.whiteners for whitener in row]
     return gain_of_steeper_noise(whiteners, columns, fit.rows, fit.model.precision)
 

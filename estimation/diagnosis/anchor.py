@@ -99,7 +99,12 @@ def fit_anchor(
 
 
 def fit_growing(
-    likelihood: Likelihood, model: Model, x: Array, reached: float, limit: float = MAX_RESIDUAL_RATIO
+    likelihood: Likelihood,
+    model: Model,
+    x: Array,
+    reached: float,
+    limit: float = MAX_RESIDUAL_RATIO,
+    fixed: Sequence[int] = (),
 ) -> Fit:
     """Fit over windows that grow as fast as the motion is followed, from one of the length ``reached`` on.
 
@@ -108,17 +113,20 @@ def fit_growing(
     Args:
         x: start, shape (p,).
         limit: largest residual ratio with which the motion is followed.
+        fixed: indices of parameters that keep their value.
     """
     growth, stop = MAX_WINDOW_GROWTH, reached
     while True:
-        fit = fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=1.0)
+        fit = fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=1.0, fixed=fixed)
         if stop == reached or residual_ratio(likelihood, fit, stop) < limit:
             if stop >= 1.0:
                 return fit
             reached, x = stop, fit.x
             growth = min(growth * growth, MAX_WINDOW_GROWTH)
         elif growth < MIN_WINDOW_GROWTH:
-            return fit if stop >= 1.0 else fit_model(likelihood, model, fit.x, 1.0, WINDOW_ITERATIONS, tolerance=1.0)
+            if stop >= 1.0:
+                return fit
+            return fit_model(likelihood, model, fit.x, 1.0, WINDOW_ITERATIONS, tolerance=1.0, fixed=fixed)
         else:
             growth = np.sqrt(growth)
         stop = min(1.0, reached * growth)

@@ -184,9 +184,14 @@ def _choose_around_drift(
         return None
     progress("stated values, with drifting resonances")
     model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, *drifts], nominal.model.mains)
-    drifting = fit_growing(
-        likelihood, model, stated_values(model, model.map_parameters_from(nominal.model, nominal.x)), first
-    )
+    start = stated_values(model, model.map_parameters_from(nominal.model, nominal.x))
+    drifting = fit_growing(likelihood, model, start, first)
+    if nominal_values_are_improbable(drifting):
+        # Short windows of a precise signal hardly limit some combinations of the nominal values, and the way back leads
+        # through a long curved valley. So these values are kept until the whole recording is followed.
+        stated = [i for i, parameter in enumerate(model.parameters) if parameter.kind == "nominal"]
+        kept = fit_growing(likelihood, model, start, first, fixed=stated)
+        drifting = fit_model(likelihood, model, kept.x)
     if nominal_values_are_improbable(drifting):
         return None
     selected = _choose_laws(drifting, nominal, pool, progress)

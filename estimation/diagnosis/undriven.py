@@ -31,7 +31,7 @@ def steady_without_drive(recording: Recording, device: Device) -> str | None:
             continue
         first, last = (_tone_amplitude(part) for part in (channel.read(0, tenth), channel.read(-tenth)))
         if last > MAX_STEADY_CHANGE * first > 0.0:
-            return f"{name} moves steadily, but {' and '.join(f'drive_{axis}' for axis in axes)} was not recorded"
+            return f"{name} moves steadily without {' and '.join(f'drive_{axis}' for axis in axes)}"
     return None
 
 

@@ -95,7 +95,7 @@ def test_the_diagnosis_names_a_late_position_detector_and_states_it_in_the_devic
     """The angle begins with the delay, so that the first samples of the intensity have none."""
     recording = recorded("angle", {axis: DELAY_S * (axis in late) for axis in "xy"})
     found = diagnose_with_optics([recording])
-    assert found.untested == "drive and mechanics, because angle_x moves steadily, but drive_x was not recorded"
+    assert found.untested == "drive and mechanics, because angle_x moves steadily without drive_x"
     assert [(finding.effect, finding.axis) for finding in found.findings] == [("channel-delay", late[0])]
     (delay,) = found.findings[0].parameters
     assert delay.ci95[0] < DELAY_S < delay.ci95[1]
