@@ -221,7 +221,9 @@ def _describe_delay(delay: float, estimator: str) -> str:
             f"an intensity that is {-1e6 * delay:.2g} µs late (detector, amplifier, start of the channel) would "
             "explain the error of both axes: positions in the picture are right, and the motion is late by this time"
         )
-    pole = f"a delay of {1e6 * delay:.2g} µs or a pole near {1e-3 / (2.0 * np.pi * delay):.2g} kHz in the "
+    corner = 1.0 / (2.0 * np.pi * delay)
+    near = f"{1e-3 * corner:.2g} kHz" if corner < 1e5 else f"{1e-6 * corner:.2g} MHz"
+    pole = f"a delay of {1e6 * delay:.2g} µs or a pole near {near} in the "
     if estimator == "tracker":
         return pole + "readout would explain the error of both axes; run `lissajous diagnose`"
     return pole + "position detectors would explain the error of both axes; state their channels' start earlier by it"
