@@ -1,6 +1,6 @@
 """Phase error and its stated uncertainty when the readout is not what the device file states.
 
-    python -m benchmarks.readout_errors SCANS [--first SEED] [--json FILE]
+    python -m benchmarks.readout_errors SCANS [--first SEED] [--photons LEAST MOST] [--json FILE]
 
 Every scan has two axes on one electrode whose resonances drift, and none, one or two imperfections of the readout that
 the device file does not state. Kind, size, scene and photon level are drawn from the seed. Prints a table by kind.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -110,11 +110,11 @@ def with_sense(recording: Recording, values: Array) -> Recording:
     return recording.with_channel(channel)
 
 
-def scan(seed: int) -> dict[str, Any]:
+def scan(seed: int, range_of_photons: Sequence[float]) -> dict[str, Any]:
     """Imperfections of one scan, its phase errors [deg], coverage of the 95 % intervals and picture error ratio."""
     rng = np.random.default_rng([22, seed])
     kinds = list(rng.permutation(list(IMPERFECTIONS))[: rng.choice([0, 1, 2], p=[0.1, 0.65, 0.25])])
-    photons = float(np.exp(rng.uniform(np.log(100.0), np.log(1000.0))))
+    photons = float(np.exp(rng.uniform(*np.log(range_of_photons))))
     scene = str(rng.choice(SCENES))
     drift = {axis: float(rng.uniform(-0.002, 0.002)) for axis in "xy"}
     experiment = Experiment(
@@ -168,11 +168,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scans", type=int, help="number of scans")
     parser.add_argument("--first", type=int, default=0, help="seed of the first scan")
+    parser.add_argument(
+        "--photons", type=float, nargs=2, default=(100.0, 1000.0), metavar=("LEAST", "MOST"), help="a sample"
+    )
     parser.add_argument("--json", type=Path, help="write one record a scan")
     args = parser.parse_args()
     rows = []
     for seed in range(args.first, args.first + args.scans):
-        rows.append(scan(seed))
+        rows.append(scan(seed, args.photons))
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     print(table(rows))
     if args.json:

@@ -196,11 +196,8 @@ def add_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:
     device = diagnosis.device
     corrected = correct_intensity(recording, device)
     motion = beam_motion(estimate(corrected, device), device, corrected.start)
-    detectors = {
-        axis: f"{DETECTORS[motion.estimator]}_{axis}"
-        for axis in AXES
-        if f"{DETECTORS.get(motion.estimator)}_{axis}" in {*recording.channels, *recording.edges}
-    }
+    kind, recorded = DETECTORS.get(motion.estimator), {*recording.channels, *recording.edges}
+    detectors = {axis: f"{kind}_{axis}" for axis in AXES if f"{kind}_{axis}" in recorded} if kind else {}
     optics = diagnose_optics(motion, corrected["intensity"], device, detectors)
     return replace(
         diagnosis,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.tracker.demodulation import harmonic_basis, sample_offsets, whiten_projections
+from estimation.tracker.demodulation import harmonic_basis, sample_offsets, sum_lines, whiten_projections
 from estimation.tracker.kalman_filter import JUMP_NIS
 from estimation.tracker.line_noise import DISTURBED_VARIANCE_RATIO
 from estimation.tracker.linearisation import expected_projections
@@ -88,8 +88,7 @@ def project_expansion(
         offset: times from the block's middle, shape (n,) [s].
         expected: lines and their derivatives, see ``expected_projections``, shape (3, m). sd: of the noise [V].
     """
-    lines = expected @ table
-    h = lines[0] + offset * (lines[1] + offset * lines[2])
+    h = sum_lines(expected, table, offset)
     gradient, weight = expand_samples(values, rails, h, sd)
     used = weight > MIN_WEIGHT
     table, offset, h, gradient, weight = table[:, used], offset[used], h[used], gradient[used], weight[used]

@@ -89,6 +89,17 @@ def harmonic_basis(length: int, rate: float, lines: Index, table_w: Array) -> Ar
     return out
 
 
+def sum_lines(lines: Array, table: Array, offset: Array) -> Array:
+    """Signal of lines that change within a block, shape (n,).
+
+    Args:
+        lines: coefficients, and their first and half their second derivatives by time, shape (3, m).
+        table: B' at the samples, shape (m, n). offset: times from the block's middle, shape (n,) [s].
+    """
+    constant, linear, quadratic = lines @ table
+    return np.asarray(constant + offset * (linear + offset * quadratic))
+
+
 def project_blocks(
     channel: Channel,
     starts: Index,

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.tracker.demodulation import harmonic_basis, sample_offsets
+from estimation.tracker.demodulation import harmonic_basis, sample_offsets, sum_lines
 from estimation.tracker.linearisation import expected_projections
 from estimation.tracker.observations import BlockLayout, BlockObservations
 from estimation.tracker.state_space import RATE_TERMS
@@ -28,6 +28,8 @@ from scanner.channel import Channel, LazySamples
 CURVE_BLOCKS = 16
 """Blocks that the curve is estimated from, evenly spaced over a section. They determine it to a fiftieth of the noise
 of a sample; the curve does not change with time."""
+MIN_CURVE_BLOCKS = 4
+"""Fewest blocks: two in each half, whose scatter shows whether an improvement is significant."""
 TAIL_FRACTIONS = 0.4 * 0.5 ** np.arange(7)
 """Fractions of the samples beyond the knots of the spline, on each side: from the middle to rails that cut 1 %."""
 MIN_GAIN_SDS = 3.0
@@ -75,7 +77,7 @@ def fit_readout_curve(layout: BlockLayout, observations: BlockObservations, stat
         states: of the track, shape (blocks, states).
     """
     blocks = _chosen_blocks(observations)
-    if len(observations.parameters) < 2 or blocks.size < 4:
+    if len(observations.parameters) < 2 or blocks.size < MIN_CURVE_BLOCKS:
         return None
     samples = [_block_samples(layout, observations, states, k) for k in blocks]
     signal = np.concatenate([h for _, h, _ in samples])
@@ -134,8 +136,7 @@ def _block_samples(
     table = harmonic_basis(length, channel.sample_rate, signal.lines, signal.table_w[k])
     rates = np.empty((len(observations.parameters), RATE_TERMS), np.complex128)
     expected, _ = expected_projections(observations.parameter_rows, signal, k, states[k], rates)
-    lines = expected @ table
-    h = lines[0] + offset * (lines[1] + offset * lines[2])
+    h = sum_lines(expected, table, offset)
     clipped = np.flatnonzero(observations.clipped.block == k)
     low, high = observations.clipped.rails[clipped[0]] if clipped.size else (-np.inf, np.inf)
     used = np.isfinite(values) & (h > low) & (h < high)  # by the expected signal: a choice by their noise is biased
