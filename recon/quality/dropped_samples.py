@@ -131,11 +131,20 @@ def register_slices_separately(motion: Motion, intensity: Channel, grid: Grid, s
 def first_late_slice(phase_errors: Sequence[PhaseError], motion: Motion) -> int | None:
     """Return the first slice from which on none is aligned while all before it are; None where there is no such slice.
 
-    The last slice alone is not accepted, because the location needs a whole slice after it.
+    The delay has to change there by as much as a slice may be late: a constant delay near that limit is within it in
+    one slice and beyond it in another. The last slice alone is not accepted, because the location needs a whole slice
+    after it.
     """
     late = ~slices_aligned(phase_errors, motion)
     first = int(np.argmax(late))
-    return first if 0 < first < len(phase_errors) - 1 and late[first:].all() else None
+    if not (0 < first < len(phase_errors) - 1 and late[first:].all()):
+        return None
+    delays = slice_delays(phase_errors, motion)
+    known = np.isfinite(delays[first:])
+    if not known.any():  # later than the registration reaches
+        return first
+    change = delays[first:][known].mean() - delays[:first].mean()
+    return first if abs(change) > MAX_DELAY_SAMPLES else None
 
 
 def locate_dropped_samples(

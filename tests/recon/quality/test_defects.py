@@ -242,6 +242,7 @@ def test_only_a_lasting_sudden_delay_counts_as_dropped_samples(whole: Reconstruc
     )  # no estimate after the first slice
     assert first_late_slice(slices_of([0.0, 0.0, 0.0, 0.0]), whole.motion) is None
     assert first_late_slice(slices_of([0.0, 3.0, 0.0, 0.0]), whole.motion) is None
+    assert first_late_slice(slices_of([0.4, 0.6, 0.6, 0.6]), whole.motion) is None  # a constant delay near the limit
     assert first_late_slice(slices_of([2.0, 2.0, 2.0]), whole.motion) is None  # a constant delay
     assert first_late_slice(slices_of([0.0, 0.0, 3.0]), whole.motion) is None  # followed by no complete slice
 
