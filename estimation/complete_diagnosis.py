@@ -30,10 +30,6 @@ SENSED_STAGES = ("capacitance", "readout", "timing")
 DETECTORS = {"sensor": "angle", "edges": "sync"}
 """Channels by which an estimator measures the motion of an axis directly."""
 
-UNTESTED_MOTION = "drive and mechanics, because the device states no mechanics"
-
-UNTESTED_EDGES = "drive and mechanics, because only sync edges show the motion"
-
 MeasureReference = Callable[[Recording, Device], "ReferencePhase | None"]
 """Measures the phase errors of the motion independently of the readout; None if the recording does not allow it."""
 
@@ -107,15 +103,15 @@ def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress:
         if set(nominal.axes) != set(AXES):
             what = f"tests nothing: the device states no mechanics, and only the axis {', '.join(nominal.axes)}"
             raise BadInput(what, file=recordings[0].path, hint="state mechanics, or both axes for the picture")
-        return Diagnosis("consistent", (), None, nominal, None, untested=UNTESTED_MOTION)
+        return _without_motion(nominal, "the device states no mechanics")
     edges = all(f"sync_{axis}" in recording.edges for recording in recordings for axis in nominal.axes)
     if pictures and edges and not any(output_channels(recording, nominal) for recording in recordings):
-        return Diagnosis("consistent", (), None, nominal, None, untested=UNTESTED_EDGES)
+        return _without_motion(nominal, "only sync edges show the motion")
     steady = next(filter(None, (steady_without_drive(recording, nominal) for recording in recordings)), None)
     if steady is not None:
         if not pictures:
             raise BadInput(steady, file=recordings[0].path, hint="record the drive, or correct J and b of the device")
-        return Diagnosis("consistent", (), None, nominal, None, untested=f"drive and mechanics, because {steady}")
+        return _without_motion(nominal, steady)
     responses = [frequency_responses(recording, nominal) for recording in recordings]
     if any(responses):
         if len(recordings) > 1:
@@ -131,6 +127,11 @@ def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress:
         progress("amplitude of a free decay")
         return diagnose_decays([decay for of_one in decays for decay in of_one], nominal)
     return diagnose(recordings, nominal, progress)
+
+
+def _without_motion(nominal: Device, reason: str) -> Diagnosis:
+    """The diagnosis of recordings of which only the pictures are diagnosed."""
+    return Diagnosis("consistent", (), None, nominal, None, untested=f"drive and mechanics, because {reason}")
 
 
 def _diagnose_readout(

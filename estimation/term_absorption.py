@@ -81,8 +81,8 @@ def remaining_term(active: ActiveTerm, axis: Axis) -> ActiveTerm:
 
 
 def with_clocks(recording: Recording, terms: Terms) -> Recording:
-    """The recording with the sample times that the terms' clock laws give each sense and angle channel."""
-    channels = dict(recording.channels)
+    """The recording with the times that the terms' clock laws give to sense and angle samples and to sync edges."""
+    channels, edges = dict(recording.channels), dict(recording.edges)
     for name, active in terms.items():
         for term in active:
             if term.term.clock is None:
@@ -93,7 +93,10 @@ def with_clocks(recording: Recording, terms: Terms) -> Recording:
                 start, end = (float(t) for t in term.term.clock(ends, term.values))
                 moved = replace(channel, start=recording.start + start, sample_rate=channel.size / (end - start))
                 channels[channel.name] = _cut(moved, recording.start, recording.end)
-    return replace(recording, channels=MappingProxyType(channels))
+            for late in (edges[key] for key in names if key in edges):
+                times = recording.start + term.term.clock(late.times - recording.start, term.values)
+                edges[late.name] = replace(late, times=times)
+    return replace(recording, channels=MappingProxyType(channels), edges=MappingProxyType(edges))
 
 
 def _cut(channel: Channel, start: float, end: float) -> Channel:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from estimation.complete_diagnosis import UNTESTED_EDGES
 from recon.frame_axis import format_positions
 from recon.report.numbers import format_interval, format_uncertain, format_value
 
@@ -120,8 +119,6 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     in_picture = any(finding["channel"] == "intensity" for finding in findings)
     if loops and not in_picture and all(loop["improved"] == loop["nominal"] for loop in loops):
         text += " device.toml is the nominal device: a corrected one predicts the held-out samples no better."
-    elif content.get("untested") == UNTESTED_EDGES and {each["effect"] for each in findings} == {"channel-delay"}:
-        text += " Subtract the delay from the edge times: device.toml does not state it."
     elif findings or modes:
         text += " Use the corrected device.toml in place of the nominal one."
     if content.get("unexplained"):

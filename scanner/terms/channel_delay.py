@@ -24,5 +24,6 @@ TERM = Term(
         "drive-lag": "a drive lag delays the angle too: record the angle",
     },
     channels=("sense", "angle"),
+    stated_channels=("sync",),  # edge times; edges are no samples that a diagnosis could fit
     clock=clock,
 )
