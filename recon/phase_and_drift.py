@@ -6,6 +6,7 @@ a drift is less accurate or refuted, so it is measured again in the intensity wi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from recon.estimated_motion import EstimatedMotion
@@ -18,7 +19,7 @@ from recon.imaging.intensity_correction import (
 )
 from recon.imaging.readout_phase import describe_readout_phase, remove_readout_phase
 from recon.imaging.slow_gain import describe_slow_gain
-from recon.quality.dropped_samples import first_late_slice
+from recon.quality.dropped_samples import first_late_slice, register_slices_separately
 from recon.reconstruction import Options
 from recon.registration_segments import registration_segments
 from scanner.motion import Motion
@@ -67,7 +68,8 @@ def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
 def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
     """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
 
-    A picture that changes its timing at some moment is left as it is, because dropped samples are to be restored first.
+    Where the picture changes its timing at some moment, the motion is left as it is, because dropped samples are to be
+    restored first.
     """
     motion = estimated.motion
 
@@ -75,12 +77,26 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         return measure_phase_errors(replace(estimated, motion=corrected))
 
     errors = register(motion)
-    if not wants_readout_phase(motion, options) or first_late_slice(errors, motion) is not None:
+    if not wants_readout_phase(motion, options) or _loses_timing(estimated, errors):
         return replace(estimated, phase_errors=errors)
     one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
     motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
     notes = [*describe_readout_phase(motion, readout_phase), *estimated.motion_notes]
     return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
+
+
+def _loses_timing(estimated: EstimatedMotion, errors: Sequence[PhaseError]) -> bool:
+    """Whether the slices of the scan are late from some time on, in a picture of all and in one picture of each.
+
+    A slice that determines nothing counts as late. A picture of few photons determines some slices by chance.
+    """
+    intensity, position_z = estimated.prepared.intensity, estimated.prepared.position_z
+    if first_late_slice(errors, estimated.motion) is None:
+        return False
+    if len(registration_segments(estimated.motion, intensity, position_z)) > 1:  # the slices do not cover the scan
+        return False
+    separate = register_slices_separately(estimated.beam, intensity, estimated.grid, len(errors))
+    return first_late_slice(separate, estimated.motion) is not None
 
 
 def correct_intensity_drift(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
