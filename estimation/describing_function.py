@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scanner.active_terms import ActiveTerm
 from scanner.arrays import Array, Complex
 from scanner.device import Axis, Device
-from scanner.forward_model import ActiveTerm
 from scanner.integrator.abi import nominal_values
 from scanner.motion import Motion
 from scanner.stages import Mechanics

@@ -14,17 +14,11 @@ from types import MappingProxyType
 
 import numpy as np
 
+from scanner.active_terms import ActiveTerm, with_constants
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Axis, Device
-from scanner.forward_model import (
-    ActiveTerm,
-    AxisTrajectory,
-    DriveInput,
-    apply_channel_terms,
-    effective_drive,
-    with_constants,
-)
+from scanner.forward_model import AxisTrajectory, DriveInput, apply_channel_terms, effective_drive
 from scanner.integrator.nodes import nodes_to_samples, to_nodes
 from scanner.recording import Recording
 from scanner.stages import Amdm

@@ -36,10 +36,11 @@ from estimation.term_absorption import (
     with_outputs,
     with_samples,
 )
+from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
-from scanner.forward_model import ActiveTerm, reference_signal, sense_signal, stated_terms
+from scanner.forward_model import reference_signal, sense_signal
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 

@@ -18,20 +18,19 @@ from numpy.typing import NDArray
 
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.waveforms import Waveform
+from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.arrays import Array
 from scanner.channel import CHANNEL_UNITS
 from scanner.device import Axis, Device
 from scanner.drift import Drift
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.forward_model import (
-    ActiveTerm,
     AxisTrajectory,
     DriveInput,
     reference_signal,
     sense_signal,
     simulate_axis,
     simulate_coupled,
-    stated_terms,
 )
 from scanner.integrator.abi import TORQUE_LAW
 from scanner.integrator.nodes import to_nodes

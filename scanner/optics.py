@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from scanner.active_terms import ActiveTerm, in_stage_order, stated_terms
 from scanner.arrays import Array
 from scanner.device import Device
-from scanner.forward_model import ActiveTerm, in_stage_order, stated_terms
 from scanner.terms import SignalContext
 
 _EMPTY = np.empty(0)
@@ -23,7 +23,7 @@ def terms_on_channel(device: Device, channel: str, axis: str | None = None) -> l
 
     Raises:
         DeviceInvalid: the device has no such axis.
-        BadInput: as :func:`scanner.forward_model.stated_terms`.
+        BadInput: as :func:`scanner.active_terms.stated_terms`.
     """
     axes = device.axes.values() if axis is None else (device.axis(axis),)
     return in_stage_order(term for one in axes for term in stated_terms(one) if term.channel == channel)

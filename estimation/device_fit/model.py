@@ -18,10 +18,10 @@ from estimation.device_fit.parameters import (
     ParameterSpec,
     nominal_parameters,
 )
+from scanner.active_terms import ActiveTerm, stated_terms, with_constants
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.forward_model import (
-    ActiveTerm,
     AxisTrajectory,
     DriveInput,
     reference_signal,
@@ -29,8 +29,6 @@ from scanner.forward_model import (
     simulate_axis,
     simulate_batch,
     simulate_coupled,
-    stated_terms,
-    with_constants,
 )
 from scanner.integrator.runge_kutta import LANES
 from scanner.stages import Amdm

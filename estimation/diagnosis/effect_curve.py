@@ -12,15 +12,9 @@ from estimation.device_fit.fit import Fit
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.posterior import axis_trajectories, draw_parameters
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from scanner.active_terms import ActiveTerm, with_constants
 from scanner.arrays import Array
-from scanner.forward_model import (
-    ActiveTerm,
-    AxisTrajectory,
-    apply_channel_terms,
-    effective_drive,
-    sense_signal,
-    with_constants,
-)
+from scanner.forward_model import AxisTrajectory, apply_channel_terms, effective_drive, sense_signal
 from scanner.integrator.abi import nominal_values
 from scanner.integrator.nodes import nodes_to_samples
 from scanner.integrator.trajectories import CapacitanceTerm

@@ -14,9 +14,9 @@ import numpy as np
 
 from estimation.optics.measurement import MAX_PHASE_ERROR_RAD, MEASURED_PARAMETERS
 from estimation.optics.samples import OpticsParameters, ScanSamples
+from scanner.active_terms import ActiveTerm
 from scanner.arrays import Array
 from scanner.device import AXES
-from scanner.forward_model import ActiveTerm
 from scanner.optics import apply_terms
 from scanner.terms import NaturalScales, Term, catalogue
 from scanner.terms.term import AMPLITUDE_KINDS

@@ -12,10 +12,11 @@ from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.identification.calibrate import identify
 from recon.io.convert import convert
+from scanner.active_terms import stated_terms
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
-from scanner.forward_model import DriveInput, sense_signal, simulate_axis, stated_terms
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.integrator.nodes import to_nodes
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position

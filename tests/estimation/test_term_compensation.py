@@ -16,8 +16,8 @@ from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis
 from scanner import devices
+from scanner.active_terms import ActiveTerm
 from scanner.device import Device
-from scanner.forward_model import ActiveTerm
 from scanner.recording import Recording
 from scanner.stages import Drive, Position
 from scanner.terms import catalogue

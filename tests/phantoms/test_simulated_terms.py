@@ -11,8 +11,9 @@ from phantoms.forward import InitialState, Plan, Scene, simulate
 from phantoms.optics import Detector
 from phantoms.waveforms import Sine
 from scanner import devices
+from scanner.active_terms import stated_terms
 from scanner.device import Device
-from scanner.forward_model import DriveInput, sense_signal, simulate_axis, simulate_coupled, stated_terms
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis, simulate_coupled
 from scanner.integrator.nodes import to_nodes
 from scanner.terms import NaturalScales, Term, catalogue
 

@@ -10,9 +10,9 @@ import pytest
 from estimation.estimate import estimate
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
+from scanner.active_terms import stated_terms
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
-from scanner.forward_model import stated_terms
 from scanner.terms import catalogue
 from scanner.terms.driven_modes import mode_response
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from scanner.active_terms import stated_terms
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
-from scanner.forward_model import DriveInput, simulate_axis, stated_terms
+from scanner.forward_model import DriveInput, simulate_axis
 from scanner.terms import catalogue
 from scanner.terms.measured_law import added, beyond, measured_law
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.device import Axis
 from scanner.errors import BadInput
-from scanner.forward_model import ActiveTerm, DriveInput, sense_signal, simulate_axis, stated_terms
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.integrator.abi import Nominal
 from scanner.integrator.runge_kutta import LANES, negative_exponential
 from scanner.integrator.trajectories import CapacitanceTerm, TorqueTerm, TrajectorySpec, integrate, integrate_batch

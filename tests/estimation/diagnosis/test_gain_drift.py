@@ -9,8 +9,9 @@ from estimation.device_fit.data import prepare_run
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import diagnose as diagnosing
 from estimation.diagnosis.gain_drift import may_be_gain_drift
+from scanner.active_terms import stated_terms
 from scanner.device import Axis, Device
-from scanner.forward_model import DriveInput, simulate_axis, stated_terms
+from scanner.forward_model import DriveInput, simulate_axis
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
 from scanner.terms import catalogue

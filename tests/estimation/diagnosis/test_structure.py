@@ -12,9 +12,10 @@ from estimation.device_fit.data import Run, prepare_run
 from estimation.diagnosis import diagnose as diagnosing
 from estimation.diagnosis.structure import find_modes, with_driven_modes
 from recon.report.conclusions import conclude_diagnosis
+from scanner.active_terms import stated_terms
 from scanner.arrays import Array
 from scanner.device import Axis, Device
-from scanner.forward_model import DriveInput, sense_signal, simulate_axis, stated_terms
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.integrator.nodes import to_nodes
 from scanner.recording import Recording
 from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position
