@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from phantoms.forward import Plan, Scene, simulate
 from phantoms.optics import Detector, blur_by_spot
 from phantoms.targets import make_target
@@ -13,6 +15,12 @@ from scanner import devices
 from scanner.device import Device
 from scanner.drift import Drift, exponential
 from scanner.recording import Recording
+
+IMAGING_DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
+"""Drives of the named device ``imaging``, with the frequencies of the papers."""
+
+SETTLING_TIME_CONSTANTS, MIN_SETTLING_S = 4.0, 0.05
+"""Time constants of the slowest decay, and least time [s], after which the amplitude is 98 % of its final value."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +43,7 @@ class Experiment:
 
     device: Device = field(default_factory=lambda: devices.load("imaging"))
     target: str = "immunohistochemistry"
-    drives: Mapping[str, Waveform] = field(
-        default_factory=lambda: {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
-    )
+    drives: Mapping[str, Waveform] = field(default_factory=lambda: IMAGING_DRIVES)
     duration: float = 0.06
     sample_rate: float = 5e6
     drift: Mapping[str, float] = field(default_factory=lambda: {"x": -0.002, "y": -0.002})
@@ -73,8 +79,15 @@ def simulate_experiment(
         drives=experiment.drives,
         duration=experiment.duration,
         sample_rate=experiment.sample_rate,
+        settle=_settling_time(experiment.device),
         drift={axis: Drift(exponential(change, experiment.drift_tau)) for axis, change in experiment.drift.items()},
         references=("angle",) if experiment.angles else (),
     )
     recording, truth = simulate(experiment.device, plan, Scene(light, experiment.detector), seed, nominal=nominal)
     return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}
+
+
+def _settling_time(device: Device) -> float:
+    """Time that the drives have been running before the recording starts [s]."""
+    decays = [axis.quality / (np.pi * axis.resonance) for axis in device.axes.values() if axis.mechanics]
+    return max(MIN_SETTLING_S, SETTLING_TIME_CONSTANTS * max(decays, default=0.0))

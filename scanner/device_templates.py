@@ -9,17 +9,8 @@ from math import hypot, pi, radians, sqrt
 
 from scanner.device import AXES
 from scanner.errors import BadInput
+from scanner.steady_drive import COMB_AMPLITUDE_THETA0, COMB_C0, COMB_STIFFNESS, comb_frequency, comb_voltage
 
-COMB_STIFFNESS = 9.6e-6
-"""Stiffness of a comb-driven mirror whose stiffness is not stated [N m / rad]: that of chen2020."""
-COMB_C0 = 5.71e-12
-"""Amplitude of its capacitance [F], of the same mirror."""
-COMB_AMPLITUDE_THETA0 = 0.9
-"""Typical amplitude of a comb-driven axis in units of theta0: that of the named device ``imaging``."""
-COMB_VOLTS, COMB_THETA0, COMB_QUALITY = 30.0, 0.2, 120.0
-"""Amplitude and offset of the voltage [V] that sustains that amplitude for this theta0 [rad] and Q."""
-COMB_DETUNING = 0.67
-"""Half the drive's frequency over the resonance, less one, times Q: where that voltage sustains the amplitude."""
 MIRROR_INERTIA = 1.0e-10
 """Moment of inertia of a linearly driven axis [kg m2]: an arbitrary value, which only scales b, k and the torque."""
 LINEAR_VOLTS = 10.0
@@ -192,7 +183,7 @@ def _aligned(text: str) -> str:
 def _fill(scanner: ScannerKind, typical: KnownAxis, known: KnownAxis) -> KnownAxis:
     """Known values, and typical ones in place of the others; a known drive frequency determines the resonance."""
     quality = known.quality or typical.quality or 1.0
-    ratio = 2.0 * (1.0 + COMB_DETUNING / quality) if scanner.is_parametric else 1.0
+    ratio = comb_frequency(1.0, quality) if scanner.is_parametric else 1.0
     off_resonance = typical.drive_frequency is not None
     from_drive = None if off_resonance or known.drive_frequency is None else known.drive_frequency / ratio
     resonance = known.resonance or from_drive or typical.resonance or 1.0
@@ -218,7 +209,7 @@ def _volts(scanner: ScannerKind, axis: KnownAxis) -> str:
     """Frequency, amplitude and offset of a drive that reaches the amplitude, as ``simulate`` takes them."""
     if not scanner.is_parametric:
         return f"{axis.drive_frequency:.8g},{LINEAR_VOLTS:g},0"
-    volts = COMB_VOLTS * _theta0(axis) / COMB_THETA0 * sqrt(COMB_QUALITY / (axis.quality or 1.0))
+    volts = comb_voltage(COMB_STIFFNESS, axis.quality or 1.0, COMB_C0, _theta0(axis))
     return f"{axis.drive_frequency:.8g},{volts:.3g},{volts:.3g}"
 
 

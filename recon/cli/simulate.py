@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recon.cli.argument_types import parse_drive, parse_positive
+
+if TYPE_CHECKING:
+    from phantoms.waveforms import Sine
+    from scanner.device import Device
+
+DEFAULT_DEVICE = "imaging"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="REC", help="the recording to write (.h5)")
     parser.add_argument(
-        "--device", default="imaging", metavar="NAME|FILE", help="a named device or a TOML file (imaging)"
+        "--device", default=DEFAULT_DEVICE, metavar="NAME|FILE", help="a named device or a TOML file (imaging)"
     )
     parser.add_argument(
         "--target", default="immunohistochemistry", metavar="NAME|FILE", help="what lies under the beam"
@@ -20,13 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--drive-x",
         type=parse_drive,
-        default=(27680.0, 30.0, 30.0),
         metavar="HZ,V,V",
-        help="frequency, amplitude, offset (27680,30,30)",
+        help="frequency, amplitude, offset; by default those at which x fills the field of the device (imaging: "
+        "27680,30,30)",
     )
-    parser.add_argument(
-        "--drive-y", type=parse_drive, default=(6540.0, 30.0, 30.0), metavar="HZ,V,V", help="likewise (6540,30,30)"
-    )
+    parser.add_argument("--drive-y", type=parse_drive, metavar="HZ,V,V", help="likewise (imaging: 6540,30,30)")
     parser.add_argument("--duration", type=parse_positive, default=0.06, help="s (0.06)")
     parser.add_argument("--rate", type=parse_positive, default=5e6, help="samples a second (5e6)")
     parser.add_argument(
@@ -47,17 +51,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from phantoms.experiment import Experiment, simulate_experiment
     from phantoms.optics import Detector
-    from phantoms.waveforms import Sine
     from scanner import devices
     from scanner.files import check_no_input, check_place
 
     check_place(args.output)
     check_no_input(args.output, Path(args.device), Path(args.target))
 
+    device = devices.find(args.device)
+    drives = _drives(args, device)
     experiment = Experiment(
-        device=devices.find(args.device),
+        device=device,
         target=args.target,
-        drives={"x": Sine(*args.drive_x), "y": Sine(*args.drive_y)},
+        drives=drives,
         duration=args.duration,
         sample_rate=args.rate,
         drift={"x": args.drift, "y": args.drift},
@@ -70,8 +75,38 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     recording, truth = simulate_experiment(experiment, args.seed)
     recording.write(args.output, truth)
     channels = {name: channel.size for name, channel in recording.channels.items()}
-    return {"recording": str(args.output), "duration": recording.duration, "seed": args.seed, "channels": channels}
+    return {
+        "recording": str(args.output),
+        "duration": recording.duration,
+        "seed": args.seed,
+        "channels": channels,
+        "drives": {axis: {"frequency": d.frequency, "amplitude": d.amplitude, "offset": d.offset}
+                   for axis, d in drives.items()},
+    }  # fmt: skip
+
+
+def _drives(args: argparse.Namespace, device: Device) -> dict[str, Sine]:
+    """The drive of each axis: as given, or for the default device that of the papers, or one that fills the field."""
+    from phantoms.experiment import IMAGING_DRIVES
+    from phantoms.waveforms import Sine
+    from scanner.device import AXES
+    from scanner.steady_drive import steady_drive
+
+    if args.device == DEFAULT_DEVICE:
+        drives = dict(IMAGING_DRIVES)
+    else:
+        half_angles = dict(zip(AXES, device.require_scan().mechanical_half_angles, strict=True))
+        drives = {name: Sine(*steady_drive(axis, half_angles[name])) for name, axis in device.axes.items()}
+    given = {"x": args.drive_x, "y": args.drive_y}
+    return drives | {axis: Sine(*drive) for axis, drive in given.items() if drive is not None}
 
 
 def format_summary(summary: dict[str, Any]) -> str:
-    return f"{summary['recording']}: {summary['duration']:.6g} s of {', '.join(summary['channels'])}, with its truth"
+    drives = ", ".join(
+        f"{axis} {drive['frequency']:.6g} Hz, {drive['amplitude']:.3g} V, offset {drive['offset']:.3g} V"
+        for axis, drive in summary["drives"].items()
+    )
+    return (
+        f"{summary['recording']}: {summary['duration']:.6g} s of {', '.join(summary['channels'])}, with its truth\n"
+        f"  driven at {drives}"
+    )
