@@ -95,12 +95,6 @@ class Fit:
         return np.asarray(np.linalg.inv(fitted.T @ fitted + np.diag(self.model.precision)))
 
     @property
-    def promised_fall(self) -> float:
-        """Fall of the misfit that the linear model still promises: about 0 where the fit has converged."""
-        gradient = self.jacobian[self.rows].T @ self.residual[self.rows] + self.model.precision * self.x
-        return float(gradient @ self.covariance @ gradient)
-
-    @property
     def validation_chi2(self) -> float:
         """Reduced chi-square of the held-out samples."""
         return float(np.mean(self.residual[self.validation_rows] ** 2))
@@ -111,10 +105,10 @@ def misfit(fit: Fit) -> float:
     return fit.chi2 + fit.penalty
 
 
-def nominal_values_are_improbable(fit: Fit) -> bool:
+def nominal_values_are_improbable(fit: Fit, probability: float = MIN_PULL_PROBABILITY) -> bool:
     """Whether the nominal values lie so far from the stated ones, in tolerances, that they have absorbed a misfit."""
     pulls = fit.x[[f.kind == "nominal" for f in fit.model.parameters]]
-    return bool(chi2_distribution.sf(pulls @ pulls, pulls.size) < MIN_PULL_PROBABILITY)
+    return bool(chi2_distribution.sf(pulls @ pulls, pulls.size) < probability)
 
 
 def held_out_samples(size: int, guard: tuple[int, int] = (0, 0)) -> Mask:

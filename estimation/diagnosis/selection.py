@@ -51,6 +51,10 @@ ABSORBED_EFFECT = "resonance-drift"
 """The effect that nominal values absorb most easily: amplitude and phase of the motion follow the resonance through
 every value of mechanics and capacitance."""
 
+MAX_ABSORBED_PROBABILITY = 0.05
+"""Probability of the fitted nominal values below which drifting resonances around the stated values are tried. It costs
+one in twenty recordings without any effect an additional fit; what is found is judged by its evidence."""
+
 MAX_NONLINEAR_STARTS = 8
 """Starts of a law that is linear in no amplitude that are fitted, those with the largest predicted gain. In five
 recordings of a mode that grows, of 3 to 82 starts, the best fit came from one of the first six."""
@@ -180,7 +184,7 @@ def _choose_around_drift(
         first: end of the first window, as a fraction of the recordings.
     """
     drifts = [candidate for candidate in pool if candidate.term.effect == ABSORBED_EFFECT]
-    if not drifts or not nominal_values_are_improbable(nominal):
+    if not drifts or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
         return None
     progress("stated values, with drifting resonances")
     model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, *drifts], nominal.model.mains)
@@ -192,7 +196,8 @@ def _choose_around_drift(
         stated = [i for i, parameter in enumerate(model.parameters) if parameter.kind == "nominal"]
         kept = fit_growing(likelihood, model, start, first, fixed=stated)
         drifting = fit_model(likelihood, model, kept.x)
-    if nominal_values_are_improbable(drifting):
+    absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, drifting)
+    if nominal_values_are_improbable(drifting) or not absorbed:
         return None
     selected = _choose_laws(drifting, nominal, pool, progress)
     return None if selected is None or nominal_values_are_improbable(selected.fit) else selected
