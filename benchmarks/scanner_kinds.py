@@ -39,28 +39,38 @@ SHARE_DRIFTING = 0.7
 """Probability that an axis drifts."""
 
 
-def simulate_scan(kind: str, seed: int) -> tuple[Recording, dict[str, float]]:
-    """A scan and the relative change of each axis's stiffness."""
-    rng = np.random.default_rng([41, seed, len(kind)])
+def experiment_of_kind(
+    kind: str, drift: dict[str, float], drift_tau: float, target: str = "immunohistochemistry"
+) -> Experiment:
+    """A scan of a target by a scanner of a kind that fills its field.
+
+    Args:
+        drift: relative change of each axis's stiffness.
+        drift_tau: its time constant, relative to the duration.
+    """
     device = Device.from_toml(new_device(kind, {}))
     half_angles = dict(zip(AXES, device.require_scan().mechanical_half_angles, strict=True))
-    drift = {}
-    for axis in AXES:
-        size = float(rng.choice([-1, 1]) * np.exp(rng.uniform(*np.log(DRIFTS))))
-        drift[axis] = size if rng.random() < SHARE_DRIFTING else 0.0
-    target = str(rng.choice(["immunohistochemistry", "retina", "cell"]))
     duration, rate = DURATION_S_RATE_HZ[kind]
-    experiment = Experiment(
+    return Experiment(
         device=device,
         target=target,
         drives={name: Sine(*steady_drive(axis, half_angles[name])) for name, axis in device.axes.items()},
         duration=duration,
         sample_rate=rate,
         drift=drift,
-        drift_tau=float(rng.uniform(0.3, 1.0) * duration),
+        drift_tau=drift_tau * duration,
         detector=Detector(photons_per_sample=1000.0, bits=12),
     )
-    return simulate_experiment(experiment, seed)[0], drift
+
+
+def simulate_scan(kind: str, seed: int) -> tuple[Recording, dict[str, float]]:
+    """A scan and the relative change of each axis's stiffness."""
+    rng, drift = np.random.default_rng([41, seed, len(kind)]), {}
+    for axis in AXES:
+        size = float(rng.choice([-1, 1]) * np.exp(rng.uniform(*np.log(DRIFTS))))
+        drift[axis] = size if rng.random() < SHARE_DRIFTING else 0.0
+    target = str(rng.choice(["immunohistochemistry", "retina", "cell"]))
+    return simulate_experiment(experiment_of_kind(kind, drift, float(rng.uniform(0.3, 1.0)), target), seed)[0], drift
 
 
 def main() -> None:

@@ -34,6 +34,7 @@ from estimation.diagnosis.screening import (
     score_candidate_starts,
 )
 from estimation.diagnosis.significance import DETECTION_THRESHOLD, evidence_gain, satisfies_sign_constraints
+from scanner.arrays import Array
 from scanner.device import Device
 from scanner.terms import Term
 
@@ -193,14 +194,23 @@ def _choose_around_drift(
     if nominal_values_are_improbable(drifting):
         # Short windows of a precise signal hardly limit some combinations of the nominal values, and the way back leads
         # through a long curved valley. So these values are kept until the whole recording is followed.
-        stated = [i for i, parameter in enumerate(model.parameters) if parameter.kind == "nominal"]
-        kept = fit_growing(likelihood, model, start, first, fixed=stated)
-        drifting = fit_model(likelihood, model, kept.x)
+        drifting = fit_model(likelihood, model, _fit_with_stated_values(likelihood, model, start, first).x)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, drifting)
     if nominal_values_are_improbable(drifting) or not absorbed:
         return None
     selected = _choose_laws(drifting, nominal, pool, progress)
+    if selected is not None and nominal_values_are_improbable(selected.fit):
+        # They have absorbed a further effect, which is visible beside these laws at the stated values only.
+        fit = selected.fit
+        kept = _fit_with_stated_values(likelihood, fit.model, stated_values(fit.model, fit.x), first)
+        selected = _choose_laws(kept, nominal, pool, progress)
     return None if selected is None or nominal_values_are_improbable(selected.fit) else selected
+
+
+def _fit_with_stated_values(likelihood: Likelihood, model: Model, start: Array, first: float) -> Fit:
+    """The fit over growing windows whose nominal values keep those of ``start``."""
+    stated = [i for i, parameter in enumerate(model.parameters) if parameter.kind == "nominal"]
+    return fit_growing(likelihood, model, start, first, fixed=stated)
 
 
 def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected | None:
