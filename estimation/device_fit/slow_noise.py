@@ -56,59 +56,38 @@ class _SlowPart(NamedTuple):
         return float(self.share * slope * self.reach.sum() + (slope / SLOPE_PRIOR_SD) ** 2)
 
 
-class SteeperNoise(NamedTuple):
-    """The slow noise that suits a linear model best.
-
-    Attributes:
-        gain: fall of -2 log evidence.
-        slopes: exponents by which the noise of each extrapolated channel rises more steeply.
-        inner_products: of the columns under that noise, shape (p + 1, p + 1).
-    """
-
-    gain: float
-    slopes: tuple[float, ...]
-    inner_products: Array
-
-
 def steeper_noise_gain(likelihood: Likelihood, fit: Fit) -> float:
     """Fall of a fit's -2 log evidence if the slow noise of every channel rises more steeply than extrapolated.
 
-    All parameters of the fit are estimated again under that noise, in the linear model around the fit. What that model
-    promises is compared with a simulation: far from the fit it may exceed the whole misfit. Where the parameters gain
-    less by it than by keeping their values, they keep them.
+    All parameters of the fit are estimated again under that noise, in the linear model around the fit.
     """
     whiteners = [whitener for row in likelihood.whiteners for whitener in row]
-    precision = fit.model.precision
-    kept = fit_steeper_noise(whiteners, fit.residual[:, None], fit.rows, np.zeros(0))
-    columns = np.column_stack([fit.jacobian, fit.residual - fit.jacobian @ fit.x])
-    moved = fit_steeper_noise(whiteners, columns, fit.rows, precision)
-    if not any(moved.slopes):
-        return kept.gain
-    gram = moved.inner_products
-    x = gaussian_posterior(gram[:-1, :-1], -gram[:-1, -1], precision**-0.5).mean
-    promised = float(np.append(x, 1.0) @ gram @ np.append(x, 1.0))
-    residual = likelihood.residual(fit.model, x)
-    simulated = float(residual[fit.rows] @ residual[fit.rows])
-    for part, slope in zip(_slow_parts(whiteners, residual[:, None], fit.rows), moved.slopes, strict=True):
-        simulated += float(part.weakening(slope)[0, 0])
-    return max(kept.gain, moved.gain - (simulated - promised))
+    columns = np.column_stack([fit.jacobian, fit.residual])
+    return gain_of_steeper_noise(whiteners, columns, fit.rows, fit.model.precision, fit.x)
 
 
-def fit_steeper_noise(whiteners: Sequence[Whitener], columns: Array, rows: Mask, precision: Array) -> SteeperNoise:
-    """The slope of every channel's slow noise that improves the evidence of a linear model most, one after the other.
+def gain_of_steeper_noise(
+    whiteners: Sequence[Whitener], columns: Array, rows: Mask, precision: Array, x: Array
+) -> float:
+    """Fall of -2 log evidence of a linear model by the slope of every channel's slow noise, the best of each in turn.
+
+    The model is linear in the change of the parameters: those of a precise signal are so well determined that the
+    misfit in terms of their values would be lost in rounding.
 
     Args:
         whiteners: of all channels in order, n whitened samples together.
-        columns: whitened sensitivities to p parameters and, last, the residual with all of them at 0, shape (n, p + 1).
+        columns: whitened sensitivities to p parameters and, last, the residual, shape (n, p + 1).
         rows: samples that are fitted, shape (n,).
-        precision: of the parameters' priors, shape (p,).
+        precision: of the parameters' priors, whose means are 0.
+        x: parameters at the residual, shape (p,).
     """
     fitted = columns[rows]
-    gram, gain, slopes = fitted.T @ fitted, 0.0, list[float]()
+    gram, gain = fitted.T @ fitted, 0.0
     root = precision**-0.5
 
     def neg2_log_evidence(inner_products: Array) -> float:
-        posterior = gaussian_posterior(inner_products[:-1, :-1], -inner_products[:-1, -1], root)
+        score = -inner_products[:-1, -1] - precision * x
+        posterior = gaussian_posterior(inner_products[:-1, :-1], score, root)
         return float(inner_products[-1, -1]) + posterior.neg2_log_evidence
 
     for part in _slow_parts(whiteners, columns, rows):
@@ -118,10 +97,9 @@ def fit_steeper_noise(whiteners: Sequence[Whitener], columns: Array, rows: Mask,
             return neg2_log_evidence(gram + part.weakening(slope)) + part.cost(slope) - before
 
         best = minimize_scalar(change, bounds=(0.0, MAX_SLOPE), method="bounded")
-        slopes.append(float(best.x) if best.fun < 0.0 else 0.0)
         if best.fun < 0.0:
-            gain, gram = gain - float(best.fun), gram + part.weakening(slopes[-1])
-    return SteeperNoise(gain, tuple(slopes), gram)
+            gain, gram = gain - float(best.fun), gram + part.weakening(float(best.x))
+    return gain
 
 
 def _slow_parts(whiteners: Sequence[Whitener], columns: Array, rows: Mask) -> list[_SlowPart]:

@@ -25,7 +25,7 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, make_whitener, noise_psd
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.resampling import decimate, resample_drive
-from estimation.device_fit.slow_noise import fit_steeper_noise
+from estimation.device_fit.slow_noise import gain_of_steeper_noise
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.linearisation import linear_model
@@ -182,7 +182,8 @@ def test_low_frequency_misfit_is_attributed_to_noise_as_far_as_a_steeper_spectru
 
     def gain(residual: Array, *sensitivities: Array, whitener: Whitener = whitener) -> float:
         columns = np.column_stack([*sensitivities, residual])
-        return fit_steeper_noise([whitener], columns, np.ones(n, bool), np.full(len(sensitivities), 1e-4)).gain
+        precision, x = np.full(len(sensitivities), 1e-4), np.zeros(len(sensitivities))
+        return gain_of_steeper_noise([whitener], columns, np.ones(n, bool), precision, x)
 
     assert gain(white) < 2.0
     assert gain(white + measured) < 2.0
