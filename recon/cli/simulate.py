@@ -92,13 +92,12 @@ def _drives(args: argparse.Namespace, device: Device) -> dict[str, Sine]:
     from scanner.device import AXES
     from scanner.steady_drive import steady_drive
 
+    given = {axis: Sine(*drive) for axis, drive in (("x", args.drive_x), ("y", args.drive_y)) if drive is not None}
     if args.device == DEFAULT_DEVICE:
-        drives = dict(IMAGING_DRIVES)
-    else:
-        half_angles = dict(zip(AXES, device.require_scan().mechanical_half_angles, strict=True))
-        drives = {name: Sine(*steady_drive(axis, half_angles[name])) for name, axis in device.axes.items()}
-    given = {"x": args.drive_x, "y": args.drive_y}
-    return drives | {axis: Sine(*drive) for axis, drive in given.items() if drive is not None}
+        return IMAGING_DRIVES | given
+    half_angles = dict(zip(AXES, device.require_scan().mechanical_half_angles, strict=True))
+    others = {name: axis for name, axis in device.axes.items() if name not in given}
+    return {name: Sine(*steady_drive(axis, half_angles[name])) for name, axis in others.items()} | given
 
 
 def format_summary(summary: dict[str, Any]) -> str:

@@ -26,3 +26,13 @@ def test_a_device_that_is_neither_is_refused(command: str, tmp_path: Path, capsy
     assert "no device is named 'imagin' and no file is" in line
     assert "imaging" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_simulate_drives_a_device_of_ones_own_so_that_it_fills_the_field(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    device, scan = str(tmp_path / "own.toml"), str(tmp_path / "scan.h5")
+    assert main(["new-device", "--kind", "electromagnetic", "-o", device]) == 0
+    simulate = ["simulate", "--device", device, "-o", scan, "--duration", "0.005", "--rate", "2e5"]
+    assert main([*simulate, "--drive-y", "800,3,0"]) == 0
+    assert "driven at x 2000 Hz, 10 V, offset 0 V, y 800 Hz, 3 V, offset 0 V" in capsys.readouterr().out
