@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import Fit, fit_model
+from estimation.device_fit.fit import Fit, fit_model, misfit
 from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.discrepancy import is_discrepancy
@@ -53,6 +53,7 @@ def improve(result: SelectionResult) -> Improvement:
     discrepancy term always remains a finding, but if the device with its measured law predicts any channel of any run
     worse, the device with the named laws alone is returned, or the nominal one if that is worse too.
     """
+    result = _settled(result)
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
     while True:
@@ -75,6 +76,19 @@ def improve(result: SelectionResult) -> Improvement:
             if all(has_larger_error(improved, other) for other in others):
                 return Improvement(result, device, nominal, improved)
             result = reduced
+
+
+def _settled(result: SelectionResult) -> SelectionResult:
+    """The result with a final fit that is continued with undetermined nominal values as stated, if that is better.
+
+    Along a curved valley a fit ends where a step gains little, many tolerances from the stated values. From there the
+    way back to them, which ``determined_parameters`` takes to first order, would change the motion.
+    """
+    final = result.final
+    fit = fit_model(result.likelihood, final.model, determined_parameters(final))
+    if misfit(fit) >= misfit(final):
+        return result
+    return replace(result, final=fit, steps=tuple(replace(step, after=fit) for step in result.steps))
 
 
 def _without_discrepancy(result: SelectionResult) -> Device:
