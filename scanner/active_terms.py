@@ -65,10 +65,9 @@ def _stated_term(axis: Axis, effect: str, values: dict[str, Any], known: dict[st
         hint = f"{effect} needs {', '.join(p.name for p in term.parameters)}"
         raise BadInput(f"lacks {missing[0]}", file=axis.source, channel=key, hint=hint)
     variant = int(values.get("variant", 0))
-    channels = (*term.channels, *term.stated_channels)
-    if not 0 <= variant < len(channels):
+    if not 0 <= variant < len(term.variants):
         raise BadInput(f"variant {variant} is unknown", file=axis.source, channel=key, hint="count from 0")
-    return [ActiveTerm(term, tuple(values[p.name] for p in term.parameters), channels[variant])]
+    return [ActiveTerm(term, tuple(values[p.name] for p in term.parameters), term.variants[variant])]
 
 
 def in_stage_order(terms: Iterable[ActiveTerm]) -> list[ActiveTerm]:

@@ -76,7 +76,6 @@ def clipped_readouts(runs: Sequence[Run], saturation: Term | None) -> list[Candi
             rail = find_rail(output.full) if saturation is not None and output.kind == "sense" else None
             if rail is not None and saturation is not None:
                 fixed = Parameter("limit", "V", lambda scales, limit=rail.limit: limit, kind="fixed")  # type: ignore[misc]
-                channels = (*saturation.channels, *saturation.stated_channels)
-                term = replace(saturation, parameters=(fixed,), channels=channels)
+                term = replace(saturation, parameters=(fixed,), channels=saturation.variants)
                 by_axis.setdefault(output.axes[0], Candidate(term, output.axes[0], rail.channel))
     return list(by_axis.values())

@@ -190,9 +190,8 @@ def _report(
             terms.setdefault(description.axis, {})[description.effect] = values
         elif description.effect == "channel-delay":
             late = [effect.axis] if effect.name == "detector-delay" else AXES
-            delay = catalogue()["channel-delay"]
             for axis in (axis for axis in late if axis in detectors):
-                variant = (*delay.channels, *delay.stated_channels).index(detectors[axis].partition("_")[0])
+                variant = catalogue()["channel-delay"].variants.index(detectors[axis].partition("_")[0])
                 terms.setdefault(axis, {})["channel-delay"] = {**values, "variant": variant}
     findings.sort(key=lambda pair: -pair[0])
     return tuple(finding for _, finding in findings), terms

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
+from recon.imaging.normal_density import normal_log_density
 from scanner.arrays import Array
 
 HELD_OUT_FRACTION = 0.1
@@ -154,7 +155,8 @@ def excess_variance(residual: Array, noise: Array, predicted: Array, weight: Arr
 
 def positive_mean(found: float, sd: float) -> float:
     """Return the posterior mean of a positive number from an estimate with normal errors, and no other knowledge."""
-    return found + sd * float(np.exp(norm.logpdf(found / sd) - norm.logcdf(found / sd)))
+    ratio = found / sd
+    return found + sd * float(np.exp(normal_log_density(ratio) - log_ndtr(ratio)))
 
 
 def scale_with_prior(found: float, spread: Array | float, expected: float, log_sd: float) -> float:

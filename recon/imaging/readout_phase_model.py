@@ -26,10 +26,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import logsumexp
 
+from recon.imaging.normal_density import normal_log_density
 from scanner.arrays import Array
 
 OFFSET_SDS_RAD = np.radians([0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
@@ -287,7 +287,7 @@ def _delay_nodes(axes: Mapping[str, Hypotheses], rates: Mapping[str, float]) -> 
         [centre + width * np.sinh(np.linspace(-end, end, DELAY_STEPS))
          for (centre, width), end in zip(centres, ends, strict=True)]
     )  # fmt: skip
-    density = stats.norm.logpdf(delays[:, None], 0.0, sds) + constant_prior(sds).log_probability[1:]
+    density = normal_log_density(delays[:, None], sds) + constant_prior(sds).log_probability[1:]
     log_prior = logsumexp(density, axis=1) + np.log(np.gradient(delays))
     return np.concatenate([[0.0], delays]), np.concatenate([[math.log(PRIOR_PROBABILITY_AS_STATED)], log_prior])
 

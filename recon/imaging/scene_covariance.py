@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.optimize import nnls
 
 from recon.imaging.held_out import pixel_means
 from recon.imaging.smoothing import smooth
@@ -76,6 +75,8 @@ class SceneCovariance(NamedTuple):
         Args:
             basis: covariances by lag, shape (lags down, lags across, n).
         """
+        from scipy.optimize import nnls  # here because it takes 0.1 s to import
+
         used = self.used
         if not used.any():
             return np.zeros(basis.shape[-1])

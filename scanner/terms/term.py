@@ -198,6 +198,11 @@ class Term:
     coupled: bool = False
 
     @property
+    def variants(self) -> tuple[str, ...]:
+        """The kinds of channel among which ``variant`` of a device file selects, in its order."""
+        return (*self.channels, *self.stated_channels)
+
+    @property
     def acts_on_channel(self) -> bool:
         """Whether the effect acts on a recorded channel, and not on the mirror."""
         return not (self.output is None and self.clock is None and self.corners is None)
