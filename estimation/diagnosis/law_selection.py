@@ -22,7 +22,7 @@ from estimation.diagnosis.linear_model import (
     RivalFit,
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
-from estimation.diagnosis.necessity import leave_nothing, need_of_laws
+from estimation.diagnosis.necessity import need_of_laws
 from estimation.diagnosis.significance import satisfies_sign_constraints
 
 MAX_LINEARISATIONS = 8
@@ -40,7 +40,7 @@ class Choice(NamedTuple):
         likelihood: under the noise that they leave.
         before, fit: of the nominal device, and of the device with them.
         rivals: other laws in the place of each, by its key.
-        leaves_nothing: whether free corrections of all stages beside them have no evidence.
+        remaining: fall of -2 log evidence by free corrections of all stages beside them.
         certain: whether they are the answer if no law is found beside them; see :class:`necessity.Need`.
     """
 
@@ -48,7 +48,7 @@ class Choice(NamedTuple):
     before: Fit
     fit: Fit
     rivals: dict[str, tuple[RivalFit, ...]]
-    leaves_nothing: bool
+    remaining: float
     certain: bool
 
 
@@ -118,7 +118,7 @@ def choose_laws(
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     linear_rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
     rivals = {key: _with_fitted_rivals(key, of_law, fit, compared) for key, of_law in linear_rivals.items()}
-    return Choice(likelihood, before, fit, rivals, leave_nothing(linear, present), need.certain)
+    return Choice(likelihood, before, fit, rivals, need.remaining, need.certain)
 
 
 def _with_fitted_rivals(

@@ -36,10 +36,12 @@ class Need(NamedTuple):
     Attributes:
         possible: they may be, as a base beside which another law is sought.
         certain: and they are the answer if no other law is found.
+        remaining: fall of -2 log evidence by free corrections of all stages beside them.
     """
 
     possible: bool
     certain: bool
+    remaining: float
 
 
 def need_of_laws(linear: LinearModel, laws: Sequence[int], explained: float, alone: float) -> Need:
@@ -56,17 +58,12 @@ def need_of_laws(linear: LinearModel, laws: Sequence[int], explained: float, alo
     beside = linear.hypothesis(laws)
     without = linear.without_discrepancy(laws)
     remainder = without.misfit - beside.misfit
-    significant = without.neg2_log_evidence - beside.neg2_log_evidence > MIN_SCORE_GAIN
+    remaining = without.neg2_log_evidence - beside.neg2_log_evidence
     advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
     springs = [axis for axis, effect in linear.effects(laws) if effect in POLYNOMIAL_SPRINGS]
     series = len(springs) > len(set(springs))
-    bulk = not significant or (remainder < MAX_REMAINDER_RATIO * explained and not series)
+    bulk = remaining <= MIN_SCORE_GAIN or (remainder < MAX_REMAINDER_RATIO * explained and not series)
     possible = explained >= MIN_EXPLAINED_RATIO * remainder and advantage > (
         -MIN_SCORE_GAIN if bulk else SMALL_LAW_MARGIN
     )
-    return Need(possible, possible and (bulk or advantage > MIN_ADVANTAGE_RATIO * remainder))
-
-
-def leave_nothing(linear: LinearModel, laws: Sequence[int]) -> bool:
-    """Whether the discrepancy terms of all stages beside laws have no evidence at all."""
-    return linear.without_discrepancy(laws).neg2_log_evidence < linear.hypothesis(laws).neg2_log_evidence
+    return Need(possible, possible and (bulk or advantage > MIN_ADVANTAGE_RATIO * remainder), remaining)

@@ -86,12 +86,14 @@ class SelectionResult:
         nominal: fit of the nominal device under that likelihood.
         final: fit of the device with all selected terms.
         steps: one for each selected term.
+        remaining: fall of -2 log evidence by free corrections of all stages beside named laws; 0 without them.
     """
 
     likelihood: Likelihood
     nominal: Fit
     final: Fit
     steps: tuple[SelectionStep, ...] = field(default_factory=tuple)
+    remaining: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class _Selected:
         nominal, fit: without them, and with them.
         without: fits without one of several terms, by its key.
         rivals: of each by its key.
-        leaves_nothing: whether free corrections of all stages beside them have no evidence.
+        remaining: fall of -2 log evidence by free corrections of all stages beside named laws; 0 without them.
         certain: whether they are the answer; otherwise a discrepancy term is.
     """
 
@@ -112,7 +114,7 @@ class _Selected:
     fit: Fit
     without: Mapping[str, Fit] = field(default_factory=dict)
     rivals: Mapping[str, tuple[RivalFit, ...]] = field(default_factory=dict)
-    leaves_nothing: bool = False
+    remaining: float = 0.0
     certain: bool = True
 
 
@@ -143,7 +145,7 @@ def select_terms(
     progress(f"{len(pool)} candidates")
     selected = _choose_terms(likelihood, nominal, early, stops, pool, progress)
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
-    return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps)
+    return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps, selected.remaining)
 
 
 def _choose_terms(
@@ -221,9 +223,7 @@ def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress:
     fit, without = drop_redundant(choice.likelihood, choice.fit)
     if not evidence_gain(choice.likelihood, choice.before, fit):
         return None
-    return _Selected(
-        choice.likelihood, choice.before, fit, without, choice.rivals, choice.leaves_nothing, choice.certain
-    )
+    return _Selected(choice.likelihood, choice.before, fit, without, choice.rivals, choice.remaining, choice.certain)
 
 
 def _choose_discrepancy(
@@ -276,7 +276,7 @@ def _with_nonlinear_term(
         first: end of the first window of a fit over growing windows, as a fraction of the recordings. A mode that grows
             is determined early, while the misfit of the whole recording has several minima.
     """
-    if selected.leaves_nothing:
+    if selected.remaining < 0.0:
         return selected
     bases = [selected.nominal]
     if uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates)):
@@ -305,7 +305,7 @@ def _with_nonlinear_term(
     likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
     before = fit_model(likelihood, nominal.model, nominal.x)
     fit, removed = drop_redundant(likelihood, fit_model(likelihood, best.model, best.x))
-    return _Selected(likelihood, before, fit, removed, certain=need.certain)
+    return _Selected(likelihood, before, fit, removed, remaining=need.remaining, certain=need.certain)
 
 
 def _step(selected: _Selected, candidate: Candidate) -> SelectionStep:

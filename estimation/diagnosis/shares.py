@@ -13,6 +13,7 @@ from estimation.device_fit.fit import Fit, Likelihood, held_out_samples
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.screening import ScoreTest, all_candidates, score_candidates
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
+from estimation.diagnosis.significance import DETECTION_THRESHOLD
 
 MAX_HELD_OUT_CHI2 = 1.3
 """Held-out reduced chi-square above which a part of the misfit is reported as unexplained."""
@@ -73,6 +74,11 @@ def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
     return explained_share(without, complete, nominal, noise[name])
 
 
+def leaves_noise_alone(result: SelectionResult) -> bool:
+    """Whether the residual of the final fit is called noise and no free correction beside named laws is detected."""
+    return residual_is_noise(result.final) and result.remaining <= DETECTION_THRESHOLD
+
+
 def residual_is_noise(fit: Fit) -> bool:
     """Whether the residual of a fit is called noise."""
     return fit.validation_chi2 < MAX_HELD_OUT_CHI2
@@ -89,10 +95,10 @@ def _channel(result: SelectionResult, step: SelectionStep) -> str:
 def find_correction(result: SelectionResult) -> ScoreTest | None:
     """Score test of the discrepancy term that would explain most of what the final fit leaves.
 
-    None if the residual is noise, or if the fit contains all discrepancy terms.
+    None if nothing but noise is left, or if the fit contains all discrepancy terms.
     """
     final = result.final
-    if residual_is_noise(final):
+    if leaves_noise_alone(result):
         return None
     present = {candidate.key for candidate in final.model.candidates}
     discrepancies = all_candidates(final.model.device, final.model, DISCREPANCY_TERMS.values())
@@ -101,16 +107,19 @@ def find_correction(result: SelectionResult) -> ScoreTest | None:
 
 
 def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dict[str, Any] | None:
-    """The largest unexplained share of a channel's misfit, and the stage of the correction that would reduce it most.
+    """The unexplained share of a channel's misfit, and the stage of the correction that would reduce it most.
+
+    The channel is the one whose residual exceeds its noise most: a share of a misfit near the noise means little.
 
     Returns:
-        ``share``, ``stage`` and ``channel``; None if the residual is noise.
+        ``share``, ``stage`` and ``channel``; None if nothing but noise is left.
     """
-    if residual_is_noise(result.final):
+    if leaves_noise_alone(result):
         return None
     noise = noise_by_channel(result.likelihood)
     complete, nominal = misfit_by_channel(result.final), misfit_by_channel(result.nominal)
-    share, name = max((remaining_share(complete[key], nominal[key], noise[key]), key) for key in complete)
+    name = max(complete, key=lambda key: complete[key] / max(noise[key], 1e-300))
+    share = remaining_share(complete[name], nominal[name], noise[name])
     if share < MIN_REMAINDER_SHARE:
         return None
     return {"share": share, "stage": correction.candidate.term.stage if correction else "readout", "channel": name}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,9 +15,11 @@ from estimation.device_fit.fit import Likelihood, fit_model, linearise_at
 from estimation.device_fit.initial import flat_whiteners
 from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
+from estimation.diagnosis import shares
 from estimation.diagnosis.clipping import find_rail
 from estimation.diagnosis.identifiability import determined_parameters
-from estimation.diagnosis.shares import explained_share, remaining_share
+from estimation.diagnosis.selection import SelectionResult
+from estimation.diagnosis.shares import explained_share, find_remainder, remaining_share
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -28,6 +32,21 @@ def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
     assert explained_share(without=5.0, complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.95)
     assert remaining_share(complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.05)
     assert explained_share(without=1.0, complete=1.2, nominal=5.0, noise=1.0) == 0.0
+
+
+@pytest.mark.parametrize(("remaining", "stated"), [(-5.0, False), (9.0, False), (800.0, True)])
+def test_what_a_correction_beside_named_laws_still_takes_is_stated(
+    monkeypatch: pytest.MonkeyPatch, remaining: float, stated: bool
+) -> None:
+    """The residual is near the noise. The angle fits within it, and its share, large by chance, is not stated."""
+    complete, nominal = SimpleNamespace(validation_chi2=1.1), SimpleNamespace(validation_chi2=50.0)
+    misfits = {id(complete): {"sense_x": 1.2, "angle_x": 1.01}, id(nominal): {"sense_x": 41.0, "angle_x": 1.02}}
+    monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: misfits[id(fit)])
+    monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 1.0, "angle_x": 1.0})
+    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, remaining=remaining)
+    remainder = find_remainder(cast(SelectionResult, result), None)
+    expected = {"share": pytest.approx(0.005), "stage": "readout", "channel": "sense_x"}
+    assert remainder == (expected if stated else None)
 
 
 def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> None:
@@ -104,7 +123,7 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     from estimation.device_fit.parameters import Candidate
     from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
     from estimation.diagnosis.improvement import improve
-    from estimation.diagnosis.selection import SelectionResult, SelectionStep
+    from estimation.diagnosis.selection import SelectionStep
 
     (recording,), _, device = ROWS["pendulum-45"](measured_data)
     run = prepare_run(recording, device)
