@@ -102,20 +102,20 @@ def posterior_picture(samples: SplitSums, noise: SampleNoise, initial_strength: 
     gradients = _gradient_covariance(mean, 0.0, WINDOW * width)
     precision = _sample_precision(mean, noise, scene_variance)
     strength = initial_strength or width**2 * float((kept_counts * precision).mean())
-    start: Fields = np.repeat(_bordered(mean)[..., None], LANES, axis=2).astype(np.float32)
+    start: Fields = np.repeat(_bordered(mean)[None], LANES, axis=0).astype(np.float32)
     for _ in range(REFINEMENTS):
         strengths = strength * np.exp(STRENGTH_STEP * (np.arange(LANES) - 0.5 * (LANES - 1)))
         stencil = build_stencil(*_weights(gradients, MEAN_POWER))
         start = _posterior_means(stencil, kept, kept_counts * precision, strengths, start, COARSE_TOLERANCE)
-        errors = held[..., None] - _inner(start)
-        misfits = np.einsum("ij,ijk->k", judged * precision, errors**2)
+        errors = held - _inner(start)
+        misfits = np.einsum("ij,kij->k", judged * precision, errors**2)
         strength, weights = log_average(strengths, misfits)
-        mean = _inner(start) @ weights
+        mean = np.tensordot(weights, _inner(start), 1)
         gradients = _gradient_covariance(mean, GRADIENT_SMOOTHING * width, WINDOW * width)
         precision = _sample_precision(mean, noise, scene_variance)
     stencil = build_stencil(*_weights(gradients, MEAN_POWER))
     solved = _posterior_means(stencil, means, samples.counts * precision, strengths, start, FINE_TOLERANCE)
-    image = _inner(solved) @ weights
+    image = np.tensordot(weights, _inner(solved), 1)
     scene = measure_covariance(samples.kept_sums, kept_counts)
     data, spectrum = samples.counts * precision, fit_spectrum(scene)
     image, mean, weight = _add_stationary(image, mean, samples, judged, precision, spectrum)
@@ -199,8 +199,8 @@ def _posterior_means(
     The prior does not depend on the mean level. It is subtracted, so that the tolerance refers to the contrast.
     """
     level = np.float32(np.vdot(precision, means) / precision.sum())
-    scaled = (_bordered(precision)[..., None] / strengths).astype(np.float32)
-    data = _bordered(means - level).astype(np.float32)[..., None] * scaled
+    scaled = (_bordered(precision) / strengths[:, None, None]).astype(np.float32)
+    data = _bordered(means - level).astype(np.float32) * scaled
     return solve(stencil, scaled, data, start - level, tolerance, MAX_ITERATIONS) + level
 
 
@@ -222,4 +222,4 @@ def _bordered(image: NDArray[Any]) -> NDArray[Any]:
 
 def _inner(fields: NDArray[Any]) -> NDArray[Any]:
     """The fields without their border."""
-    return fields[1:-1, 1:-1]
+    return fields[:, 1:-1, 1:-1]

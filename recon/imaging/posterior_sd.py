@@ -14,10 +14,11 @@ approximations for large sparse precision matrices" (Rao-Blackwellised variances
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from recon.imaging.held_out import CORRELATED_ERRORS, LOG_SCALES, SplitSums, pixel_means, scale_with_prior
-from recon.imaging.posterior_solver import LANES, build_stencil, draw_noise, multiply, solve
+from recon.imaging.posterior_solver import LANES, build_stencil, multiply, solve
 from recon.imaging.smoothing import smooth
 from recon.imaging.stationary_prior import CentreDetail
 from scanner.arrays import Array
@@ -48,14 +49,14 @@ def variance_from_neighbours(weights: tuple[Array, Array, Array], precision: Arr
         strength: of the prior.
     """
     stencil = build_stencil(*weights)
-    scaled = np.repeat(np.pad(precision / strength, 1).astype(np.float32)[..., None], LANES, axis=2)
+    scaled = np.repeat(np.pad(precision / strength, 1).astype(np.float32)[None], LANES, axis=0)
     bits = np.random.default_rng(0).integers(0, 256, (4, *precision.shape), np.uint8)
     noise = draw_noise(*weights, scaled, bits)
     drawn, coupled = solve(stencil, scaled, noise, np.zeros_like(noise), DRAW_TOLERANCE), np.zeros_like(noise)
     multiply(stencil, np.zeros_like(scaled), drawn, coupled)
     own = stencil[0, 1:-1, 1:-1]
-    neighbours = drawn[1:-1, 1:-1] - coupled[1:-1, 1:-1] / own[..., None]
-    spread = smooth(np.mean(neighbours**2, axis=-1), NEIGHBOUR_WIDTH_PX)
+    neighbours = drawn[:, 1:-1, 1:-1] - coupled[:, 1:-1, 1:-1] / own
+    spread = smooth(np.mean(neighbours**2, axis=0), NEIGHBOUR_WIDTH_PX)
     return (1.0 / own + spread).astype(np.float64) / strength
 
 
@@ -121,3 +122,45 @@ def variance_at_centres(variance: Array, data: Array, detail: CentreDetail) -> t
     share = data * variance / (1.0 + data * variance)
     ratio = detail.variance * (1.0 - share) + share * (detail.covariance - 1.0) ** 2
     return variance * ratio, share
+
+
+@numba.njit(cache=True)
+def draw_noise(xx, xy, yy, precision, bits):  # type: ignore[no-untyped-def]
+    """Return right-hand sides whose solutions have the covariance of the posterior.
+
+    Their covariance is the matrix of the system. They are sums of independent random signs: the variance of the
+    solutions needs no normal numbers.
+
+    Args:
+        xx, xy, yy: cell weights, shape (height - 1, width - 1).
+        precision: of the data, shape (LANES, height + 2, width + 2).
+        bits: random bytes, a bit for each lane, shape (4, height, width).
+
+    Returns:
+        Shape (LANES, height + 2, width + 2).
+    """
+    height, width = bits.shape[1], bits.shape[2]
+    noise = np.zeros((LANES, height + 2, width + 2), np.float32)
+    for i in range(height):
+        for j in range(width):
+            for k in range(LANES):
+                sign = np.float32(2 * ((bits[3, i, j] >> k) & 1)) - np.float32(1.0)
+                noise[k, i + 1, j + 1] += sign * np.sqrt(precision[k, i + 1, j + 1])
+    for i in range(height - 1):
+        for j in range(width - 1):
+            # The energy of a cell is (p, q) W (p, q)' / 4 + (xx + yy) r^2 / 4, where p and q are the sums of its two
+            # horizontal and its two vertical differences, and r is the difference of its two diagonal sums.
+            r00 = np.sqrt(xx[i, j])
+            r01 = xy[i, j] / r00
+            r11 = np.sqrt(max(yy[i, j] - r01 * r01, 0.0))
+            r22 = np.sqrt(xx[i, j] + yy[i, j])
+            for k in range(LANES):
+                a = (bits[0, i, j] >> k & 1) - 0.5
+                b = (bits[1, i, j] >> k & 1) - 0.5
+                c = (bits[2, i, j] >> k & 1) - 0.5
+                across, down, twist = r00 * a, r01 * a + r11 * b, r22 * c
+                noise[k, i + 1, j + 1] += twist - across - down
+                noise[k, i + 1, j + 2] += across - down - twist
+                noise[k, i + 2, j + 1] += down - across - twist
+                noise[k, i + 2, j + 2] += across + down + twist
+    return noise

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LANES = 4
-"""Systems solved at once. Four numbers of single precision fill one register, so four cost little more than one."""
+"""Systems solved at once. In a sweep, each pixel waits for the one before; four independent systems fill that time."""
 
 COARSEST_PIXELS = 8
 """Width or height of the coarsest grid: few enough for relaxation to solve it."""
@@ -31,7 +31,7 @@ Stencil = NDArray[np.float32]
 """Five coupling arrays with a border of zeros, shape (5, height + 2, width + 2)."""
 
 Fields = NDArray[np.float32]
-"""``LANES`` pictures with a border of zeros, shape (height + 2, width + 2, LANES)."""
+"""``LANES`` pictures with a border of zeros, shape (LANES, height + 2, width + 2)."""
 
 
 @numba.njit(cache=True)
@@ -56,65 +56,102 @@ def build_stencil(xx, xy, yy):  # type: ignore[no-untyped-def]
     return stencil
 
 
-@numba.njit(cache=True, forceinline=True, fastmath=True)
-def _add_coupled(stencil, x, i, j, total):  # type: ignore[no-untyped-def]
-    """Set ``total`` to the couplings of a pixel to its eight neighbours."""
-    c0, c1, c2, c3 = stencil[1, i, j], stencil[1, i, j - 1], stencil[2, i, j], stencil[2, i - 1, j]
-    c4, c5, c6, c7 = stencil[3, i, j], stencil[3, i - 1, j - 1], stencil[4, i, j], stencil[4, i - 1, j + 1]
-    for k in range(LANES):
-        total[k] = (
-            c0 * x[i, j + 1, k]
-            + c2 * x[i + 1, j, k]
-            + c3 * x[i - 1, j, k]
-            + c4 * x[i + 1, j + 1, k]
-            + c5 * x[i - 1, j - 1, k]
-            + c6 * x[i + 1, j - 1, k]
-            + c7 * x[i - 1, j + 1, k]
-            + c1 * x[i, j - 1, k]
-        )
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _couple_row_above(stencil, x, i, total):  # type: ignore[no-untyped-def]
+    """Set ``total``, shape (width,), to the couplings of the pixels of row i to the row above, of one lane."""
+    n = total.size
+    left, above, right = x[i - 1, :n], x[i - 1, 1 : n + 1], x[i - 1, 2:]
+    to_left, to_above, to_right = stencil[3, i - 1, :n], stencil[2, i - 1, 1:], stencil[4, i - 1, 2:]
+    for j in range(n):
+        total[j] = to_left[j] * left[j] + to_above[j] * above[j] + to_right[j] * right[j]
+
+
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _add_row_below(stencil, x, i, total):  # type: ignore[no-untyped-def]
+    """Add to ``total``, shape (width,), the couplings of the pixels of row i to the row below, of one lane."""
+    n = total.size
+    left, below, right = x[i + 1, :n], x[i + 1, 1 : n + 1], x[i + 1, 2:]
+    to_left, to_below, to_right = stencil[4, i, 1:], stencil[2, i, 1:], stencil[3, i, 1:]
+    for j in range(n):
+        total[j] += to_left[j] * left[j] + to_below[j] * below[j] + to_right[j] * right[j]
 
 
 @numba.njit(cache=True, fastmath=True)
 def multiply(stencil, precision, x, out):  # type: ignore[no-untyped-def]
     """Write (prior + data precision) x into ``out``."""
-    total = np.empty(LANES, np.float32)
-    for i in range(1, x.shape[0] - 1):
-        for j in range(1, x.shape[1] - 1):
-            _add_coupled(stencil, x, i, j, total)
-            own = stencil[0, i, j]
-            for k in range(LANES):
-                out[i, j, k] = total[k] + (own + precision[i, j, k]) * x[i, j, k]
+    n = x.shape[2] - 2
+    total = np.empty(n, np.float32)
+    for i in range(1, x.shape[1] - 1):
+        own, to_left, to_right = stencil[0, i, 1:], stencil[1, i, :n], stencil[1, i, 1:]
+        for k in range(LANES):
+            _couple_row_above(stencil, x[k], i, total)
+            _add_row_below(stencil, x[k], i, total)
+            left, here, right = x[k, i, :n], x[k, i, 1:], x[k, i, 2:]
+            data, product = precision[k, i, 1:], out[k, i, 1:]
+            for j in range(n):
+                neighbours = total[j] + to_left[j] * left[j] + to_right[j] * right[j]
+                product[j] = neighbours + (own[j] + data[j]) * here[j]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _substitute(values, factors, forward):  # type: ignore[no-untyped-def]
+    """Subtract from each value the result beside it times its factor, in place, along rows of shape (LANES, width).
+
+    The lanes are written out, so that their last results stay in registers.
+    """
+    a = b = c = d = np.float32(0.0)
+    n = values.shape[1]
+    for step in range(n):
+        j = step if forward else n - 1 - step
+        a = values[0, j] - factors[0, j] * a
+        b = values[1, j] - factors[1, j] * b
+        c = values[2, j] - factors[2, j] * c
+        d = values[3, j] - factors[3, j] * d
+        values[0, j], values[1, j], values[2, j], values[3, j] = a, b, c, d
 
 
 @numba.njit(cache=True, fastmath=True)
 def _relax(stencil, inverse, b, x, forward):  # type: ignore[no-untyped-def]
     """One Gauss-Seidel sweep; ``inverse``: of the diagonal."""
-    total = np.empty(LANES, np.float32)
-    height, width = x.shape[0], x.shape[1]
-    for row in range(1, height - 1):
-        i = row if forward else height - 1 - row
-        for column in range(1, width - 1):
-            j = column if forward else width - 1 - column
-            _add_coupled(stencil, x, i, j, total)
-            for k in range(LANES):
-                x[i, j, k] = (b[i, j, k] - total[k]) * inverse[i, j, k]
+    height, n = x.shape[1] - 2, x.shape[2] - 2
+    values, factors = np.empty((LANES, n), np.float32), np.empty((LANES, n), np.float32)
+    for row in range(1, height + 1):
+        i = row if forward else height + 1 - row
+        to_next, to_last = stencil[1, i, 1:], stencil[1, i, :n]
+        if not forward:
+            to_next, to_last = to_last, to_next
+        for k in range(LANES):
+            value, factor = values[k], factors[k]
+            _couple_row_above(stencil, x[k], i, value)
+            _add_row_below(stencil, x[k], i, value)
+            target, scale = b[k, i, 1:], inverse[k, i, 1:]
+            not_yet = x[k, i, 2:] if forward else x[k, i, :n]
+            for j in range(n):
+                value[j] = (target[j] - value[j] - to_next[j] * not_yet[j]) * scale[j]
+                factor[j] = to_last[j] * scale[j]
+        _substitute(values, factors, forward)
+        for k in range(LANES):
+            x[k, i, 1 : n + 1] = values[k]
 
 
 @numba.njit(cache=True, fastmath=True)
 def _relax_from_zero(stencil, inverse, b):  # type: ignore[no-untyped-def]
     """Return the result of a forward Gauss-Seidel sweep that begins at zero; ``inverse``: of the diagonal."""
+    n = b.shape[2] - 2
     x = np.zeros_like(b)
-    for i in range(1, x.shape[0] - 1):
-        for j in range(1, x.shape[1] - 1):
-            c1, c3, c5, c7 = (
-                stencil[1, i, j - 1],
-                stencil[2, i - 1, j],
-                stencil[3, i - 1, j - 1],
-                stencil[4, i - 1, j + 1],
-            )
-            for k in range(LANES):
-                coupled = c3 * x[i - 1, j, k] + c5 * x[i - 1, j - 1, k] + c7 * x[i - 1, j + 1, k] + c1 * x[i, j - 1, k]
-                x[i, j, k] = (b[i, j, k] - coupled) * inverse[i, j, k]
+    values, factors = np.empty((LANES, n), np.float32), np.empty((LANES, n), np.float32)
+    for i in range(1, x.shape[1] - 1):
+        to_left = stencil[1, i, :n]
+        for k in range(LANES):
+            value, factor = values[k], factors[k]
+            _couple_row_above(stencil, x[k], i, value)
+            target, scale = b[k, i, 1:], inverse[k, i, 1:]
+            for j in range(n):
+                value[j] = (target[j] - value[j]) * scale[j]
+                factor[j] = to_left[j] * scale[j]
+        _substitute(values, factors, True)
+        for k in range(LANES):
+            x[k, i, 1 : n + 1] = values[k]
     return x
 
 
@@ -148,12 +185,12 @@ def _coarsen_stencil(stencil):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, fastmath=True)
 def _sum_blocks(fine):  # type: ignore[no-untyped-def]
     """Sums over blocks of 2 x 2 pixels."""
-    height, width = fine.shape[0] - 2, fine.shape[1] - 2
-    coarse = np.zeros(((height + 1) // 2 + 2, (width + 1) // 2 + 2, LANES), np.float32)
-    for i in range(height):
-        for j in range(width):
-            for k in range(LANES):
-                coarse[i // 2 + 1, j // 2 + 1, k] += fine[i + 1, j + 1, k]
+    height, width = fine.shape[1] - 2, fine.shape[2] - 2
+    coarse = np.zeros((LANES, (height + 1) // 2 + 2, (width + 1) // 2 + 2), np.float32)
+    for k in range(LANES):
+        for i in range(height):
+            for j in range(width):
+                coarse[k, i // 2 + 1, j // 2 + 1] += fine[k, i + 1, j + 1]
     return coarse
 
 
@@ -163,34 +200,33 @@ def _residual_blocks(stencil, x):  # type: ignore[no-untyped-def]
 
     A sweep satisfies the equation of each pixel with the values after it still zero: these alone are the residual.
     """
-    height, width = x.shape[0] - 2, x.shape[1] - 2
-    coarse = np.zeros(((height + 1) // 2 + 2, (width + 1) // 2 + 2, LANES), np.float32)
+    height, n = x.shape[1] - 2, x.shape[2] - 2
+    coarse = np.zeros((LANES, (height + 1) // 2 + 2, (n + 1) // 2 + 2), np.float32)
+    coupled = np.empty(n, np.float32)
     for i in range(1, height + 1):
-        for j in range(1, width + 1):
-            c0, c2, c4, c6 = stencil[1, i, j], stencil[2, i, j], stencil[3, i, j], stencil[4, i, j]
-            for k in range(LANES):
-                coupled = c0 * x[i, j + 1, k] + c2 * x[i + 1, j, k] + c4 * x[i + 1, j + 1, k] + c6 * x[i + 1, j - 1, k]
-                coarse[(i + 1) // 2, (j + 1) // 2, k] -= coupled
+        to_right = stencil[1, i, 1:]
+        for k in range(LANES):
+            right = x[k, i, 2:]
+            for j in range(n):
+                coupled[j] = to_right[j] * right[j]
+            _add_row_below(stencil, x[k], i, coupled)
+            blocks = coarse[k, (i + 1) // 2, 1:]
+            for j in range(n):
+                blocks[j // 2] -= coupled[j]
     return coarse
 
 
 @numba.njit(cache=True, fastmath=True)
 def _add_blocks(x, coarse):  # type: ignore[no-untyped-def]
     """Add to each pixel the value of its block."""
-    for i in range(1, x.shape[0] - 1):
-        for j in range(1, x.shape[1] - 1):
-            for k in range(LANES):
-                x[i, j, k] += coarse[(i + 1) // 2, (j + 1) // 2, k]
+    for k in range(LANES):
+        for i in range(1, x.shape[1] - 1):
+            for j in range(1, x.shape[2] - 1):
+                x[k, i, j] += coarse[k, (i + 1) // 2, (j + 1) // 2]
 
 
-@numba.njit(cache=True)
-def _inverse_diagonal(stencil, precision):  # type: ignore[no-untyped-def]
-    inverse = np.zeros_like(precision)
-    for i in range(1, precision.shape[0] - 1):
-        for j in range(1, precision.shape[1] - 1):
-            for k in range(LANES):
-                inverse[i, j, k] = np.float32(1.0) / max(stencil[0, i, j] + precision[i, j, k], np.float32(1e-30))
-    return inverse
+def _inverse_diagonal(stencil: Stencil, precision: Fields) -> Fields:
+    return np.float32(1.0) / np.maximum(stencil[0] + precision, np.float32(1e-30))
 
 
 Level = tuple[Any, ...]
@@ -223,14 +259,14 @@ def _cycle(levels: list[Level], b: Fields) -> Fields:
 
 @numba.njit(cache=True, fastmath=True)
 def _dot(a, b):  # type: ignore[no-untyped-def]
+    """Inner product in each lane, shape (LANES,), of the rows in single precision."""
     total = np.zeros(LANES)
-    for i in range(1, a.shape[0] - 1):
-        row = np.zeros(LANES, np.float32)
-        for j in range(1, a.shape[1] - 1):
-            for k in range(LANES):
-                row[k] += a[i, j, k] * b[i, j, k]
-        for k in range(LANES):
-            total[k] += row[k]
+    for k in range(LANES):
+        for i in range(1, a.shape[1] - 1):
+            row = np.float32(0.0)
+            for j in range(1, a.shape[2] - 1):
+                row += a[k, i, j] * b[k, i, j]
+            total[k] += row
     return total
 
 
@@ -238,25 +274,24 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 def _step(size, direction, product, x, residual):  # type: ignore[no-untyped-def]
     """Advance the solution and the residual along the search direction; return the squared residual."""
     total = np.zeros(LANES)
-    for i in range(1, x.shape[0] - 1):
-        row = np.zeros(LANES, np.float32)
-        for j in range(1, x.shape[1] - 1):
-            for k in range(LANES):
-                x[i, j, k] += size[k] * direction[i, j, k]
-                residual[i, j, k] -= size[k] * product[i, j, k]
-                row[k] += residual[i, j, k] * residual[i, j, k]
-        for k in range(LANES):
-            total[k] += row[k]
+    for k in range(LANES):
+        for i in range(1, x.shape[1] - 1):
+            row = np.float32(0.0)
+            for j in range(1, x.shape[2] - 1):
+                x[k, i, j] += size[k] * direction[k, i, j]
+                residual[k, i, j] -= size[k] * product[k, i, j]
+                row += residual[k, i, j] * residual[k, i, j]
+            total[k] += row
     return total
 
 
 @numba.njit(cache=True, fastmath=True)
 def _turn(ratio, conditioned, direction):  # type: ignore[no-untyped-def]
     """Set the next search direction."""
-    for i in range(1, direction.shape[0] - 1):
-        for j in range(1, direction.shape[1] - 1):
-            for k in range(LANES):
-                direction[i, j, k] = conditioned[i, j, k] + ratio[k] * direction[i, j, k]
+    for k in range(LANES):
+        for i in range(1, direction.shape[1] - 1):
+            for j in range(1, direction.shape[2] - 1):
+                direction[k, i, j] = conditioned[k, i, j] + ratio[k] * direction[k, i, j]
 
 
 def solve(
@@ -292,45 +327,3 @@ def solve(
         ratio = np.divide(energy, previous, out=np.zeros(LANES), where=previous > 0)
         _turn(ratio.astype(np.float32), conditioned, direction)
     return x
-
-
-@numba.njit(cache=True)
-def draw_noise(xx, xy, yy, precision, bits):  # type: ignore[no-untyped-def]
-    """Return right-hand sides whose solutions have the covariance of the posterior.
-
-    Their covariance is the matrix of the system. They are sums of independent random signs: the variance of the
-    solutions needs no normal numbers.
-
-    Args:
-        xx, xy, yy: cell weights, shape (height - 1, width - 1).
-        precision: of the data, shape (height + 2, width + 2, LANES).
-        bits: random bytes, a bit for each lane, shape (4, height, width).
-
-    Returns:
-        Shape (height + 2, width + 2, LANES).
-    """
-    height, width = bits.shape[1], bits.shape[2]
-    noise = np.zeros((height + 2, width + 2, LANES), np.float32)
-    for i in range(height):
-        for j in range(width):
-            for k in range(LANES):
-                sign = np.float32(2 * ((bits[3, i, j] >> k) & 1)) - np.float32(1.0)
-                noise[i + 1, j + 1, k] += sign * np.sqrt(precision[i + 1, j + 1, k])
-    for i in range(height - 1):
-        for j in range(width - 1):
-            # The energy of a cell is (p, q) W (p, q)' / 4 + (xx + yy) r^2 / 4, where p and q are the sums of its two
-            # horizontal and its two vertical differences, and r is the difference of its two diagonal sums.
-            r00 = np.sqrt(xx[i, j])
-            r01 = xy[i, j] / r00
-            r11 = np.sqrt(max(yy[i, j] - r01 * r01, 0.0))
-            r22 = np.sqrt(xx[i, j] + yy[i, j])
-            for k in range(LANES):
-                a = (bits[0, i, j] >> k & 1) - 0.5
-                b = (bits[1, i, j] >> k & 1) - 0.5
-                c = (bits[2, i, j] >> k & 1) - 0.5
-                across, down, twist = r00 * a, r01 * a + r11 * b, r22 * c
-                noise[i + 1, j + 1, k] += twist - across - down
-                noise[i + 1, j + 2, k] += across - down - twist
-                noise[i + 2, j + 1, k] += down - across - twist
-                noise[i + 2, j + 2, k] += across + down + twist
-    return noise

@@ -13,7 +13,8 @@ from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
 from recon.imaging.picture_estimate import PICTURE_KINDS, EstimatedPicture, estimate_picture
 from recon.imaging.pixel_noise import measure_noise
-from recon.imaging.posterior_solver import LANES, build_stencil, draw_noise, multiply, solve
+from recon.imaging.posterior_sd import draw_noise
+from recon.imaging.posterior_solver import LANES, build_stencil, multiply, solve
 from scanner.arrays import Array
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion, SampledAngle
@@ -220,30 +221,28 @@ def test_the_solver_agrees_with_a_dense_matrix() -> None:
     size, rng = 21, np.random.default_rng(0)
     weights = cell_weights(size, rng)
     stencil = build_stencil(*weights)
-    precision = np.zeros((size + 2, size + 2, LANES), np.float32)
-    precision[1:-1, 1:-1] = (rng.random((size, size, 1)) < 0.3) * rng.uniform(0.1, 10.0, (size, size, LANES))
+    precision = np.zeros((LANES, size + 2, size + 2), np.float32)
+    precision[:, 1:-1, 1:-1] = (rng.random((size, size)) < 0.3) * rng.uniform(0.1, 10.0, (LANES, size, size))
     b = precision * rng.normal(size=precision.shape).astype(np.float32)
     solved = solve(stencil, precision, b, np.zeros_like(b), 1e-5)
     prior, product = dense_prior(weights, size), np.zeros_like(b)
     multiply(stencil, precision, solved, product)
     for lane in range(LANES):
-        matrix = prior + np.diag(precision[1:-1, 1:-1, lane].ravel())
-        expected = np.linalg.solve(matrix, b[1:-1, 1:-1, lane].ravel())
-        assert solved[1:-1, 1:-1, lane].ravel() == pytest.approx(expected, abs=2e-3)
-        x = solved[1:-1, 1:-1, lane].ravel().astype(float)
-        assert product[1:-1, 1:-1, lane].ravel() == pytest.approx(matrix @ x, abs=1e-3)
+        matrix = prior + np.diag(precision[lane, 1:-1, 1:-1].ravel())
+        expected = np.linalg.solve(matrix, b[lane, 1:-1, 1:-1].ravel())
+        assert solved[lane, 1:-1, 1:-1].ravel() == pytest.approx(expected, abs=2e-3)
+        x = solved[lane, 1:-1, 1:-1].ravel().astype(float)
+        assert product[lane, 1:-1, 1:-1].ravel() == pytest.approx(matrix @ x, abs=1e-3)
 
 
 def test_drawn_noise_has_the_covariance_of_the_system() -> None:
     size, rng = 5, np.random.default_rng(0)
     weights = cell_weights(size, rng)
-    precision = rng.uniform(0.0, 2.0, (size + 2, size + 2, 1)).repeat(LANES, axis=2).astype(np.float32)
-    draws = [
-        draw_noise(*weights, precision, rng.integers(0, 256, (4, size, size), np.uint8))[1:-1, 1:-1].reshape(-1, LANES)
-        for _ in range(4000)
-    ]
-    noise = np.concatenate(draws, axis=1)
-    expected = dense_prior(weights, size) + np.diag(precision[1:-1, 1:-1, 0].ravel())
+    precision = rng.uniform(0.0, 2.0, (1, size + 2, size + 2)).repeat(LANES, axis=0).astype(np.float32)
+    bits = (rng.integers(0, 256, (4, size, size), np.uint8) for _ in range(4000))
+    draws = [draw_noise(*weights, precision, each)[:, 1:-1, 1:-1].reshape(LANES, -1) for each in bits]
+    noise = np.concatenate(draws).T
+    expected = dense_prior(weights, size) + np.diag(precision[0, 1:-1, 1:-1].ravel())
     assert np.abs(noise @ noise.T / noise.shape[1] - expected).max() < 0.05 * expected.max()
 
 
