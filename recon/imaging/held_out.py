@@ -88,7 +88,7 @@ def representative_weights(samples: SplitSums) -> Array:
     held = samples.held_counts > 0
     if not held.any():
         return np.zeros(held.shape)
-    distance, remaining = _sample_distance(samples.counts), _sample_distance(samples.kept_counts)
+    distance, remaining = _rounded_distance(samples.counts), _rounded_distance(samples.kept_counts)
     wanted, found = (
         np.bincount(each.ravel(), minlength=MAX_DISTANCE_PX + 1) / each.size for each in (distance, remaining[held])
     )
@@ -97,12 +97,16 @@ def representative_weights(samples: SplitSums) -> Array:
     return np.asarray(weight / weight[held].mean())
 
 
-def _sample_distance(counts: Array) -> NDArray[np.intp]:
-    """Distance to the nearest visited pixel, rounded and at most ``MAX_DISTANCE_PX`` [px]."""
+def sample_distance(counts: Array) -> Array:
+    """Return the distance of each pixel to the nearest visited one, 0 in that [px]."""
     import cv2
 
-    distance = cv2.distanceTransform((counts <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    return np.minimum(np.rint(distance), MAX_DISTANCE_PX).astype(np.intp)
+    return np.asarray(cv2.distanceTransform((counts <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5), float)
+
+
+def _rounded_distance(counts: Array) -> NDArray[np.intp]:
+    """Distance to the nearest visited pixel, rounded and at most ``MAX_DISTANCE_PX`` [px]."""
+    return np.minimum(np.rint(sample_distance(counts)), MAX_DISTANCE_PX).astype(np.intp)
 
 
 def log_average(values: Array, misfits: Array) -> tuple[float, Array]:

@@ -17,7 +17,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from recon.imaging.held_out import CORRELATED_ERRORS, LOG_SCALES, SplitSums, pixel_means, scale_with_prior
+from recon.imaging.held_out import (
+    CORRELATED_ERRORS,
+    LOG_SCALES,
+    SplitSums,
+    pixel_means,
+    sample_distance,
+    scale_with_prior,
+)
 from recon.imaging.posterior_solver import LANES, build_stencil, multiply, solve
 from recon.imaging.smoothing import smooth
 from recon.imaging.stationary_prior import CentreDetail
@@ -25,6 +32,11 @@ from scanner.arrays import Array
 
 NEIGHBOUR_WIDTH_PX = 1.2
 """Smoothing of the variance that the neighbours leave, which ``LANES`` random solutions determine to 70 % only [px]."""
+
+DISTANCE_POWER = 0.2
+"""Power of the distance to the nearest sample with which the variance grows beyond that of the prior. The prior's
+gradients are independent, those of a scene are alike over a few pixels. Without it, 95 % intervals of sixteen scenes
+held 96.3 to 97.0 % of the pixels beside a sample, but 91.6 to 94.2 % of those more than 3 pixels away."""
 
 DRAW_TOLERANCE = 0.1
 """Relative residual of the random solutions: smaller than their scatter."""
@@ -41,7 +53,7 @@ def variance_from_neighbours(weights: tuple[Array, Array, Array], precision: Arr
     """Return the variance of each pixel given all samples but its own, shape (height, width).
 
     It is the variance given the neighbours' values, and that of the weighted mean of the neighbours, from ``LANES``
-    random solutions.
+    random solutions. Both grow with the distance to the nearest sample.
 
     Args:
         weights: of the prior by cell, see :mod:`recon.imaging.posterior_solver`.
@@ -57,7 +69,8 @@ def variance_from_neighbours(weights: tuple[Array, Array, Array], precision: Arr
     own = stencil[0, 1:-1, 1:-1]
     neighbours = drawn[:, 1:-1, 1:-1] - coupled[:, 1:-1, 1:-1] / own
     spread = smooth(np.mean(neighbours**2, axis=0), NEIGHBOUR_WIDTH_PX)
-    return (1.0 / own + spread).astype(np.float64) / strength
+    distance = np.maximum(sample_distance(precision), 1.0)
+    return distance**DISTANCE_POWER * (1.0 / own + spread) / strength
 
 
 def measure_scale(samples: SplitSums, mean: Array, precision: Array, predicted: Array, expected: float) -> float:
