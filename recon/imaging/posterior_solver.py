@@ -56,24 +56,20 @@ def build_stencil(xx, xy, yy):  # type: ignore[no-untyped-def]
     return stencil
 
 
-@numba.njit(cache=True, fastmath=True, inline="always")
+@numba.njit(cache=True, fastmath=True)
 def _couple_row_above(stencil, x, i, total):  # type: ignore[no-untyped-def]
     """Set ``total``, shape (width,), to the couplings of the pixels of row i to the row above, of one lane."""
-    n = total.size
-    left, above, right = x[i - 1, :n], x[i - 1, 1 : n + 1], x[i - 1, 2:]
-    to_left, to_above, to_right = stencil[3, i - 1, :n], stencil[2, i - 1, 1:], stencil[4, i - 1, 2:]
-    for j in range(n):
-        total[j] = to_left[j] * left[j] + to_above[j] * above[j] + to_right[j] * right[j]
+    above, to_left, to_above, to_right = x[i - 1], stencil[3, i - 1], stencil[2, i - 1], stencil[4, i - 1]
+    for j in range(total.size):
+        total[j] = to_left[j] * above[j] + to_above[j + 1] * above[j + 1] + to_right[j + 2] * above[j + 2]
 
 
-@numba.njit(cache=True, fastmath=True, inline="always")
+@numba.njit(cache=True, fastmath=True)
 def _add_row_below(stencil, x, i, total):  # type: ignore[no-untyped-def]
     """Add to ``total``, shape (width,), the couplings of the pixels of row i to the row below, of one lane."""
-    n = total.size
-    left, below, right = x[i + 1, :n], x[i + 1, 1 : n + 1], x[i + 1, 2:]
-    to_left, to_below, to_right = stencil[4, i, 1:], stencil[2, i, 1:], stencil[3, i, 1:]
-    for j in range(n):
-        total[j] += to_left[j] * left[j] + to_below[j] * below[j] + to_right[j] * right[j]
+    below, to_left, to_below, to_right = x[i + 1], stencil[4, i], stencil[2, i], stencil[3, i]
+    for j in range(total.size):
+        total[j] += to_left[j + 1] * below[j] + to_below[j + 1] * below[j + 1] + to_right[j + 1] * below[j + 2]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -82,15 +78,14 @@ def multiply(stencil, precision, x, out):  # type: ignore[no-untyped-def]
     n = x.shape[2] - 2
     total = np.empty(n, np.float32)
     for i in range(1, x.shape[1] - 1):
-        own, to_left, to_right = stencil[0, i, 1:], stencil[1, i, :n], stencil[1, i, 1:]
+        own, beside = stencil[0, i], stencil[1, i]
         for k in range(LANES):
             _couple_row_above(stencil, x[k], i, total)
             _add_row_below(stencil, x[k], i, total)
-            left, here, right = x[k, i, :n], x[k, i, 1:], x[k, i, 2:]
-            data, product = precision[k, i, 1:], out[k, i, 1:]
+            row, data, product = x[k, i], precision[k, i], out[k, i]
             for j in range(n):
-                neighbours = total[j] + to_left[j] * left[j] + to_right[j] * right[j]
-                product[j] = neighbours + (own[j] + data[j]) * here[j]
+                neighbours = total[j] + beside[j] * row[j] + beside[j + 1] * row[j + 2]
+                product[j + 1] = neighbours + (own[j + 1] + data[j + 1]) * row[j + 1]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -115,23 +110,22 @@ def _relax(stencil, inverse, b, x, forward):  # type: ignore[no-untyped-def]
     """One Gauss-Seidel sweep; ``inverse``: of the diagonal."""
     height, n = x.shape[1] - 2, x.shape[2] - 2
     values, factors = np.empty((LANES, n), np.float32), np.empty((LANES, n), np.float32)
-    for row in range(1, height + 1):
-        i = row if forward else height + 1 - row
-        to_next, to_last = stencil[1, i, 1:], stencil[1, i, :n]
-        if not forward:
-            to_next, to_last = to_last, to_next
+    for step in range(1, height + 1):
+        i = step if forward else height + 1 - step
+        beside = stencil[1, i]
+        old, new = (1, 0) if forward else (0, 1)
         for k in range(LANES):
             value, factor = values[k], factors[k]
             _couple_row_above(stencil, x[k], i, value)
             _add_row_below(stencil, x[k], i, value)
-            target, scale = b[k, i, 1:], inverse[k, i, 1:]
-            not_yet = x[k, i, 2:] if forward else x[k, i, :n]
+            row, target, scale = x[k, i], b[k, i], inverse[k, i]
             for j in range(n):
-                value[j] = (target[j] - value[j] - to_next[j] * not_yet[j]) * scale[j]
-                factor[j] = to_last[j] * scale[j]
+                value[j] = (target[j + 1] - value[j] - beside[j + old] * row[j + 2 * old]) * scale[j + 1]
+                factor[j] = beside[j + new] * scale[j + 1]
         _substitute(values, factors, forward)
         for k in range(LANES):
-            x[k, i, 1 : n + 1] = values[k]
+            for j in range(n):
+                x[k, i, j + 1] = values[k, j]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -141,17 +135,18 @@ def _relax_from_zero(stencil, inverse, b):  # type: ignore[no-untyped-def]
     x = np.zeros_like(b)
     values, factors = np.empty((LANES, n), np.float32), np.empty((LANES, n), np.float32)
     for i in range(1, x.shape[1] - 1):
-        to_left = stencil[1, i, :n]
+        beside = stencil[1, i]
         for k in range(LANES):
             value, factor = values[k], factors[k]
             _couple_row_above(stencil, x[k], i, value)
-            target, scale = b[k, i, 1:], inverse[k, i, 1:]
+            target, scale = b[k, i], inverse[k, i]
             for j in range(n):
-                value[j] = (target[j] - value[j]) * scale[j]
-                factor[j] = to_left[j] * scale[j]
+                value[j] = (target[j + 1] - value[j]) * scale[j + 1]
+                factor[j] = beside[j] * scale[j + 1]
         _substitute(values, factors, True)
         for k in range(LANES):
-            x[k, i, 1 : n + 1] = values[k]
+            for j in range(n):
+                x[k, i, j + 1] = values[k, j]
     return x
 
 
@@ -204,15 +199,14 @@ def _residual_blocks(stencil, x):  # type: ignore[no-untyped-def]
     coarse = np.zeros((LANES, (height + 1) // 2 + 2, (n + 1) // 2 + 2), np.float32)
     coupled = np.empty(n, np.float32)
     for i in range(1, height + 1):
-        to_right = stencil[1, i, 1:]
+        beside = stencil[1, i]
         for k in range(LANES):
-            right = x[k, i, 2:]
+            row, blocks = x[k, i], coarse[k, (i + 1) // 2]
             for j in range(n):
-                coupled[j] = to_right[j] * right[j]
+                coupled[j] = beside[j + 1] * row[j + 2]
             _add_row_below(stencil, x[k], i, coupled)
-            blocks = coarse[k, (i + 1) // 2, 1:]
             for j in range(n):
-                blocks[j // 2] -= coupled[j]
+                blocks[j // 2 + 1] -= coupled[j]
     return coarse
 
 
@@ -276,10 +270,12 @@ def _step(size, direction, product, x, residual):  # type: ignore[no-untyped-def
     total = np.zeros(LANES)
     for k in range(LANES):
         for i in range(1, x.shape[1] - 1):
-            row = np.float32(0.0)
             for j in range(1, x.shape[2] - 1):
                 x[k, i, j] += size[k] * direction[k, i, j]
+            for j in range(1, x.shape[2] - 1):
                 residual[k, i, j] -= size[k] * product[k, i, j]
+            row = np.float32(0.0)
+            for j in range(1, x.shape[2] - 1):
                 row += residual[k, i, j] * residual[k, i, j]
             total[k] += row
     return total
