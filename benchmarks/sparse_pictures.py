@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from recon.imaging.held_out import SplitSums, held_out_ranges
+from recon.imaging.held_out import SplitSums, held_out_ranges, hold_out_neighbours
 from recon.imaging.kernel_picture import kernel_picture
 from recon.imaging.picture import Grid, Picture, fill_holes
 from recon.imaging.pixel_noise import measure_sample_noise
@@ -80,7 +80,7 @@ def sum_samples(pixel: Array, counts: Array) -> SplitSums:
         sums = np.bincount(pixel[part], counts[part], PIXELS**2), np.bincount(pixel[part], minlength=PIXELS**2)
         return tuple(each.reshape(PIXELS, PIXELS).astype(float) for each in sums)  # type: ignore[return-value]
 
-    return SplitSums(*images(slice(None)), *images(held))
+    return hold_out_neighbours(SplitSums(*images(slice(None)), *images(held)))
 
 
 def nearest(samples: SplitSums, means: Array) -> Array:

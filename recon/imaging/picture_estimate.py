@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.held_out import SplitSums, held_out_ranges
+from recon.imaging.held_out import SplitSums, held_out_ranges, hold_out_neighbours
 from recon.imaging.intensity_gridding import add_scattered, empty_sums
 from recon.imaging.kernel_picture import PictureEstimate, choose_width, kernel_image, kernel_picture
 from recon.imaging.picture import Picture, detector_names
@@ -220,7 +220,8 @@ def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:
         counts = picture.coverage.astype(np.float64)
         parts.append((np.moveaxis(np.nan_to_num(images) * counts[..., None], -1, 0), counts))
     (sums, counts), (held_sums, held_counts) = parts
-    return [SplitSums(each, counts, other, held_counts) for each, other in zip(sums, held_sums, strict=True)]
+    pairs = zip(sums, held_sums, strict=True)
+    return [hold_out_neighbours(SplitSums(each, counts, other, held_counts)) for each, other in pairs]
 
 
 def _lies_on_one_line(means: Picture) -> bool:
