@@ -28,9 +28,9 @@ from estimation.diagnosis.significance import satisfies_sign_constraints
 MAX_LINEARISATIONS = 8
 """Fits around which laws are selected, each with the laws selected before."""
 
-SINGLE_LAWS = 6
-"""Single laws that are fitted around a discrepancy that follows the motion, where sensitivities do not rank them well.
-Each costs a fit."""
+MAX_ALTERNATIVES = 6
+"""Laws that are fitted in the place of each other, the best in the linear model: single laws around a discrepancy, as
+sensitivities do not rank them well, and near rivals of selected laws. Each costs a fit."""
 
 
 class Choice(NamedTuple):
@@ -76,7 +76,7 @@ def choose_laws(
         if fitted:
             selected = [linear.select(present, max_moves=1).laws]
         elif any(map(is_discrepancy, fit.model.candidates)):
-            selected = [linear.select().laws, linear.strongest_together(), *linear.strongest(SINGLE_LAWS)]
+            selected = [linear.select().laws, linear.strongest_together(), *linear.strongest(MAX_ALTERNATIVES)]
         else:
             selected = [linear.select().laws, linear.strongest_together(), *((law,) for law in present)]
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, selected)))
@@ -176,20 +176,21 @@ def _exchange_near_rival(
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     best, lowest = None, hypothesis.neg2_log_evidence - MIN_EXCHANGE_GAIN
     compared = {linear.effects(present): fit}
-    for removed in present:
-        rest = tuple(law for law in present if law != removed)
-        for rival in linear.beside(rest, hypothesis.scales):
-            effects = linear.effects(rival.laws)
-            near = rival.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN
-            if not near or effects in fitted:
-                continue
-            fitted[effects] = other = fit_laws(linear, likelihood, fit, rival.laws, fitted)
-            if not satisfies_sign_constraints(other) or other.chi2 > MAX_CHI2_RATIO * fit.chi2:
-                continue
-            compared[effects] = other
-            around = linear_model(likelihood, other, discrepancies)
-            laws = range(len(around.laws))
-            score = around.hypothesis(tuple(laws), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
-            if score < lowest:
-                best, lowest = other, score
+    rests = [tuple(law for law in present if law != removed) for removed in present]
+    others = [rival for rest in rests for rival in linear.beside(rest, hypothesis.scales)]
+    limit = hypothesis.neg2_log_evidence + MIN_SCORE_GAIN
+    near = [one for one in others if one.neg2_log_evidence < limit and linear.effects(one.laws) not in fitted]
+    for rival in sorted(near, key=lambda one: one.neg2_log_evidence)[:MAX_ALTERNATIVES]:
+        effects = linear.effects(rival.laws)
+        if effects in fitted:
+            continue
+        fitted[effects] = other = fit_laws(linear, likelihood, fit, rival.laws, fitted)
+        if not satisfies_sign_constraints(other) or other.chi2 > MAX_CHI2_RATIO * fit.chi2:
+            continue
+        compared[effects] = other
+        around = linear_model(likelihood, other, discrepancies)
+        laws = range(len(around.laws))
+        score = around.hypothesis(tuple(laws), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
+        if score < lowest:
+            best, lowest = other, score
     return best, compared
