@@ -198,7 +198,7 @@ def _choose_around_drift(
         # through a long curved valley. So these values are kept until the whole recording is followed.
         drifting = fit_model(likelihood, model, _fit_with_stated_values(likelihood, model, start, first).x)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, drifting)
-    if nominal_values_are_improbable(drifting) or not absorbed:
+    if not absorbed:
         return None
     selected = _choose_laws(drifting, nominal, pool, progress)
     if selected is not None and nominal_values_are_improbable(selected.fit):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, held_out_samples
+from estimation.device_fit.fit import Fit, Likelihood, held_out_samples, misfit
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.screening import ScoreTest, all_candidates, score_candidates
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
@@ -76,7 +76,8 @@ def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
 
 def leaves_noise_alone(result: SelectionResult) -> bool:
     """Whether the residual of the final fit is called noise and no free correction beside named laws is detected."""
-    return residual_is_noise(result.final) and result.remaining <= DETECTION_THRESHOLD
+    is_detected = bool(result.steps) and result.remaining > DETECTION_THRESHOLD
+    return residual_is_noise(result.final) and not is_detected
 
 
 def residual_is_noise(fit: Fit) -> bool:
@@ -109,7 +110,8 @@ def find_correction(result: SelectionResult) -> ScoreTest | None:
 def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dict[str, Any] | None:
     """The unexplained share of a channel's misfit, and the stage of the correction that would reduce it most.
 
-    The channel is the one whose residual exceeds its noise most: a share of a misfit near the noise means little.
+    The channel is the one whose residual exceeds its noise most. Near the noise a mean square does not determine the
+    share: there it is that of the correction in the fall of the whitened misfit.
 
     Returns:
         ``share``, ``stage`` and ``channel``; None if nothing but noise is left.
@@ -120,6 +122,12 @@ def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dic
     complete, nominal = misfit_by_channel(result.final), misfit_by_channel(result.nominal)
     name = max(complete, key=lambda key: complete[key] / max(noise[key], 1e-300))
     share = remaining_share(complete[name], nominal[name], noise[name])
+    if residual_is_noise(result.final):
+        explained, left = (
+            misfit(result.nominal) - misfit(result.final),
+            correction.predicted_gain if correction else 0.0,
+        )
+        share = left / max(explained + left, left, 1e-300)
     if share < MIN_REMAINDER_SHARE:
         return None
     return {"share": share, "stage": correction.candidate.term.stage if correction else "readout", "channel": name}
@@ -131,10 +139,10 @@ def describe_unexplained(result: SelectionResult) -> str | None:
         return None
     parts = [f"held-out reduced chi-square is still {result.final.validation_chi2:.2f}"]
     noise = noise_by_channel(result.likelihood)
-    for name, misfit in misfit_by_channel(result.final).items():
+    for name, mean_square in misfit_by_channel(result.final).items():
         data = [output.data for run in result.likelihood.runs for output in run.outputs if output.name == name]
         deviation = float(np.sqrt(np.mean([samples.var() for samples in data])))
-        residual = float(np.sqrt(max(0.0, misfit - noise[name])))
+        residual = float(np.sqrt(max(0.0, mean_square - noise[name])))
         if residual > MAX_UNEXPLAINED_SHARE * deviation:
             parts.append(f"{residual / deviation:.0%} of {name} is not explained")
     return "; ".join(parts)

@@ -18,6 +18,7 @@ from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse
 from estimation.diagnosis import shares
 from estimation.diagnosis.clipping import find_rail
 from estimation.diagnosis.identifiability import determined_parameters
+from estimation.diagnosis.screening import ScoreTest
 from estimation.diagnosis.selection import SelectionResult
 from estimation.diagnosis.shares import explained_share, find_remainder, remaining_share
 from scanner.device import Axis, Device
@@ -38,14 +39,16 @@ def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
 def test_what_a_correction_beside_named_laws_still_takes_is_stated(
     monkeypatch: pytest.MonkeyPatch, remaining: float, stated: bool
 ) -> None:
-    """The residual is near the noise. The angle fits within it, and its share, large by chance, is not stated."""
-    complete, nominal = SimpleNamespace(validation_chi2=1.1), SimpleNamespace(validation_chi2=50.0)
+    """The residual is near the noise: the share is that of the whitened misfit, and the angle fits within its noise."""
+    complete = SimpleNamespace(validation_chi2=1.1, chi2=1000.0, penalty=3.0)
+    nominal = SimpleNamespace(validation_chi2=50.0, chi2=50000.0, penalty=3.0)
     misfits = {id(complete): {"sense_x": 1.2, "angle_x": 1.01}, id(nominal): {"sense_x": 41.0, "angle_x": 1.02}}
     monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: misfits[id(fit)])
     monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 1.0, "angle_x": 1.0})
-    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, remaining=remaining)
-    remainder = find_remainder(cast(SelectionResult, result), None)
-    expected = {"share": pytest.approx(0.005), "stage": "readout", "channel": "sense_x"}
+    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, remaining=remaining, steps=("a law",))
+    correction = SimpleNamespace(predicted_gain=1000.0, candidate=SimpleNamespace(term=SimpleNamespace(stage="drive")))
+    remainder = find_remainder(cast(SelectionResult, result), cast(ScoreTest, correction))
+    expected = {"share": pytest.approx(0.02), "stage": "drive", "channel": "sense_x"}
     assert remainder == (expected if stated else None)
 
 
