@@ -94,7 +94,8 @@ def reconstruct_with_both(
     with np.load(angles) as file:
         truths = {axis: file[axis].astype(float) for axis in "xy"}
     with h5py.File(recording) as file:
-        light = file["channels/intensity"][:].astype(float)
+        intensity = file["channels/intensity"]
+        light, light_start = intensity[:].astype(float), float(intensity.attrs.get("start", 0.0))
     results: dict[str, dict[str, float]] = {}
     for name, device in (("nominal", []), ("improved", ["--device", str(out / "device.toml")])):
         folder = out / f"reconstructed-{name}"
@@ -106,8 +107,11 @@ def reconstruct_with_both(
             continue
         if process.returncode == 0:
             with h5py.File(folder / "motion.h5") as file:
-                rate = float(file["x/angle"].attrs["sample_rate"])
+                rate, start = (float(file["x/angle"].attrs[key]) for key in ("sample_rate", "start"))
                 estimates = {axis: file[f"{axis}/angle"][:].astype(float) for axis in "xy"}
-            results[name] = score_motion(estimates, truths, light, rate)
+            first = round((start - light_start) * rate)  # the motion may be known for a part of the scan alone
+            part = slice(first, first + estimates["x"].size)
+            of_part = {axis: angle[part] for axis, angle in truths.items()}
+            results[name] = score_motion(estimates, of_part, light[part], rate)
     (out / "imaging.json").write_text(json.dumps(results))
     return results
