@@ -197,26 +197,31 @@ def _residual_blocks(stencil, x):  # type: ignore[no-untyped-def]
     """
     height, n = x.shape[1] - 2, x.shape[2] - 2
     coarse = np.zeros((LANES, (height + 1) // 2 + 2, (n + 1) // 2 + 2), np.float32)
-    coupled = np.empty(n, np.float32)
+    coupled = np.zeros(n + n % 2, np.float32)
     for i in range(1, height + 1):
         beside = stencil[1, i]
         for k in range(LANES):
             row, blocks = x[k, i], coarse[k, (i + 1) // 2]
             for j in range(n):
                 coupled[j] = beside[j + 1] * row[j + 2]
-            _add_row_below(stencil, x[k], i, coupled)
-            for j in range(n):
-                blocks[j // 2 + 1] -= coupled[j]
+            _add_row_below(stencil, x[k], i, coupled[:n])
+            for block in range(coupled.size // 2):
+                blocks[block + 1] -= coupled[2 * block] + coupled[2 * block + 1]
     return coarse
 
 
 @numba.njit(cache=True, fastmath=True)
 def _add_blocks(x, coarse):  # type: ignore[no-untyped-def]
     """Add to each pixel the value of its block."""
+    n = x.shape[2] - 2
     for k in range(LANES):
         for i in range(1, x.shape[1] - 1):
-            for j in range(1, x.shape[2] - 1):
-                x[k, i, j] += coarse[k, (i + 1) // 2, (j + 1) // 2]
+            row, blocks = x[k, i], coarse[k, (i + 1) // 2]
+            for block in range(n // 2):
+                row[2 * block + 1] += blocks[block + 1]
+                row[2 * block + 2] += blocks[block + 1]
+            if n % 2:
+                row[n] += blocks[n // 2 + 1]
 
 
 def _inverse_diagonal(stencil: Stencil, precision: Fields) -> Fields:
