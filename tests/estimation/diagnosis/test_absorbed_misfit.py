@@ -27,3 +27,13 @@ def test_drifts_of_both_axes_are_found_although_nominal_values_absorb_them(tmp_p
     value = search.final.model.values(found["x"], search.final.x)[0]
     sd = np.sqrt(search.final.covariance[at, at]) * abs(value / search.final.x[at])
     assert value == pytest.approx(blind.truth.dk, abs=4.0 * sd)
+
+
+@pytest.mark.slow
+def test_a_clock_beside_two_drifts_is_found_although_nominal_values_absorb_it_beside_the_drifts(tmp_path: Path) -> None:
+    """The clock of x runs 6.6 ppm slow. Beside the drifts alone, the nominal values are improbable too."""
+    case = Case("blind-001", "one", "imaging", ("clock-skew", "resonance-drift"), "proportional", 3793513552)
+    _, search = search_blind_recording(case, tmp_path, ("feedthrough", "clock-skew", "resonance-drift"))
+    assert nominal_values_are_improbable(search.nominal)
+    assert {step.candidate.key for step in search.steps} == {"x.resonance-drift", "y.resonance-drift", "x.clock-skew"}
+    assert not nominal_values_are_improbable(search.final)
