@@ -11,7 +11,7 @@ nominal ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -57,6 +57,9 @@ CORRECTION_TOLERANCE = 0.02
 """Change of the correction, relative to the readout's noise, below which the iteration has converged: far below what
 the estimate can show."""
 
+SIGN_SIGMA = 5.0
+"""Standard deviations by which one sign of an axis has to explain a recording better than the other."""
+
 MIN_NOISE_RATIO = 1e-3
 """Noise that is assumed at least for that, relative to the signal: a channel may state none."""
 
@@ -87,12 +90,17 @@ def estimate_with_terms(
     without_intensity = _without(absorbed, "intensity")  # angles at the sense signal's samples serve the iteration
     corrected = without_intensity
     motion, functions = run(without_intensity, bare), dict[str, DescribingFunction]()
+
+    def with_signs(motion: Motion) -> Motion:
+        return _with_signs(without_intensity, bare, terms, functions, motion)
+
     for _ in range(MAX_ITERATIONS if any(map(_acts, (active for group in terms.values() for active in group))) else 0):
         if is_model_based:
             functions = {
                 name: describing_function(bare.axis(name), terms[name], motion, name, without_intensity.duration)
                 for name in terms
             }
+            motion = with_signs(motion)
         previous, corrected = corrected, _corrected(without_intensity, bare, terms, functions, motion)
         motion = run(corrected, linearised_device(bare, functions))
         if _converged(previous, corrected, bare):
@@ -100,6 +108,7 @@ def estimate_with_terms(
     if "intensity" in absorbed:
         complete = corrected.with_channel(absorbed["intensity"])
         motion = run(complete, linearised_device(bare, functions))
+    motion = with_signs(motion)
     axes = {name: _with_term_motion(axis, motion, functions, name) for name, axis in motion.axes.items()}
     axes = {
         name: replace(axis, phase=axis.phase + drive_phase_change(recording, absorbed, bare, name, axis.time))
@@ -118,9 +127,44 @@ def _without(recording: Recording, name: str) -> Recording:
     return replace(recording, channels={key: value for key, value in recording.channels.items() if key != name})
 
 
+def _with_signs(recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion) -> Motion:
+    """The motion with the signs with which the terms explain the recording, where an even capacitance leaves them open.
+
+    A torque that is even in the angle moves the mean of the oscillation to one side. With the mean, the sense signal
+    contains odd harmonics, whose sign is that of the motion.
+    """
+    for name, function in functions.items():
+        axis = motion.axes[name]
+        if axis.sign != "ambiguous" or not function.harmonics[::2].any():
+            continue
+        negated = replace(motion, axes={**motion.axes, name: axis.negated()})
+        misfit, other = (_misfit(recording, bare, terms, functions, each) for each in (motion, negated))
+        if abs(other - misfit) > SIGN_SIGMA**2:
+            axis = negated.axes[name] if other < misfit else axis
+            axis = replace(axis, sign="known: a torque of the stated terms that is even in the angle")
+            motion = replace(motion, axes={**motion.axes, name: axis})
+    return motion
+
+
+def _misfit(recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion) -> float:
+    """Minus twice the log likelihood of the recording along a motion, for white noise of unknown variance."""
+    signals = _signals(recording, bare, terms, functions, motion)
+    residuals = [channel.read() - complete for _, channel, _, complete in signals]
+    return float(sum(each.size * np.log(np.nanvar(each)) for each in residuals))
+
+
 def _corrected(recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion) -> Recording:
     """The recording without the terms' contribution along ``motion`` to its sense and angle channels."""
     channels = dict(recording.channels)
+    for key, channel, nominal, complete in _signals(recording, bare, terms, functions, motion):
+        channels[key] = with_samples(channel, channel.read() - (complete - nominal))
+    return replace(recording, channels=MappingProxyType(channels))
+
+
+def _signals(
+    recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion
+) -> Iterator[tuple[str, Channel, Array, Array]]:
+    """Name, channel, and signals without and with the terms along ``motion``, of its sense and angle channels."""
     for key, kind, axes in measured_channels(recording, bare):
         channel = recording[key]
         angles = _angles_at_samples(channel, motion)
@@ -132,12 +176,11 @@ def _corrected(recording: Recording, bare: Device, terms: Terms, functions: Func
             nominal.append(trajectory(axis, (), drive, angles[name]))
             complete.append(trajectory(axis, tuple(terms[name]), drive, with_terms))
         if kind == "angle":
-            contribution = reference_signal(complete[0]) - reference_signal(nominal[0])
+            without, full = reference_signal(nominal[0]), reference_signal(complete[0])
         else:
             readout = bare.sensed_axis(axes[0]).require_readout()
-            contribution = sense_signal(readout, complete) - sense_signal(readout, nominal)
-        channels[key] = with_samples(channel, channel.read() - contribution[:-1])
-    return replace(recording, channels=MappingProxyType(channels))
+            without, full = sense_signal(readout, nominal), sense_signal(readout, complete)
+        yield key, channel, without[:-1], full[:-1]
 
 
 def _angles_at_samples(channel: Channel, motion: Motion) -> dict[str, Array]:
