@@ -18,7 +18,7 @@ from estimation.device_fit.initial import (
 from estimation.device_fit.interference import with_interference_line
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import fit_anchor, fit_growing
+from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, fit_growing, residual_ratio
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.law_selection import choose_laws
@@ -181,7 +181,8 @@ def _choose_around_drift(
 ) -> _Selected | None:
     """Named laws around the stated device with drifting resonances, where nominal values have absorbed a misfit.
 
-    None where they have not, or where they do beside the named laws too.
+    None where they have not, where drifts follow the motion neither with probable nor with improbable nominal values,
+    or where these values are improbable beside the named laws too.
 
     Args:
         first: end of the first window, as a fraction of the recordings.
@@ -198,7 +199,8 @@ def _choose_around_drift(
         # through a long curved valley. So these values are kept until the whole recording is followed.
         drifting = fit_model(likelihood, model, _fit_with_stated_values(likelihood, model, start, first).x)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, drifting)
-    if not absorbed:
+    follows = residual_ratio(likelihood, drifting) < MAX_RESIDUAL_RATIO
+    if not absorbed or (nominal_values_are_improbable(drifting) and not follows):
         return None
     selected = _choose_laws(drifting, nominal, pool, progress)
     if selected is not None and nominal_values_are_improbable(selected.fit):
