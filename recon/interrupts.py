@@ -1,6 +1,6 @@
 """Ctrl-C and SIGTERM: make them stop a command reliably.
 
-Imports the standard library only, because the command line imports this module before it sets up numpy.
+Imports nothing that imports numpy, because the command line imports this module before it sets up numpy.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
+
+from scanner.files import IS_REPLACING
 
 REPEAT_INTERVAL_S = 1.0
 """Time after which KeyboardInterrupt is raised again if the process still runs. Compiled code may discard the first
@@ -33,15 +35,17 @@ class StopRequest:
         """Raise KeyboardInterrupt, and again every ``REPEAT_INTERVAL_S`` until it is acknowledged.
 
         Nothing is raised while another exception is handled, above all the first KeyboardInterrupt: its clean-up runs
-        to the end. Nothing is raised either when the work has ended: its output is in place.
+        to the end. Nothing is raised either when the work has ended: its output is in place. While a finished file
+        takes its place, the interrupt waits for the next repetition.
         """
         if self.ended and not self.came:
             return
-        self.came = True
+        is_late = IS_REPLACING.is_set() and hasattr(signal, "setitimer")
+        self.came = self.came or not is_late
         if hasattr(signal, "setitimer"):
             signal.signal(signal.SIGALRM, self)
             signal.setitimer(signal.ITIMER_REAL, REPEAT_INTERVAL_S)
-        if sys.exc_info()[0] is None:
+        if not is_late and sys.exc_info()[0] is None:
             raise KeyboardInterrupt
 
 

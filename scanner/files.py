@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -59,6 +60,10 @@ def check_writable(folder: Path) -> None:
         raise BadInput(f"cannot be written into: {error.strerror}", file=folder, hint="name another place") from None
 
 
+IS_REPLACING = threading.Event()
+"""Set while a finished file takes its place, which cannot be undone: an interrupt has to wait for the end."""
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the folder of ``path`` to write to. It replaces ``path`` when the block ends and is
@@ -72,6 +77,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield beside
+        IS_REPLACING.set()
         beside.replace(path)
     except OSError as error:
         # The error names no file, or the temporary one, which the user does not know.
@@ -79,6 +85,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise
     finally:
         beside.unlink(missing_ok=True)
+        IS_REPLACING.clear()
 
 
 def check_claim(claimed: int, stored: int, *, file: object, channel: str | None = None) -> None:

@@ -21,6 +21,7 @@ import pytest
 from recon.cli import main
 from recon.interrupts import handle_interrupts
 from scanner import devices
+from scanner.files import replacing
 from scanner.recording import Recording
 from tests.support.fuzzing import run_in_child
 from tests.support.study import small_study
@@ -230,3 +231,26 @@ def test_an_error_without_an_interrupt_is_raised(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("recon.cli.info.run", work)
     with pytest.raises(TypeError, match="of ours"):
         main(["info", "a.h5"])
+
+
+def test_an_interrupt_waits_while_a_finished_file_takes_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is there then, so that the command has done its work."""
+    place = Path.replace
+
+    def interrupted(self: Path, target: Path) -> Path:
+        os.kill(os.getpid(), signal.SIGINT)
+        return place(self, target)
+
+    with handle_interrupts() as stop:
+        monkeypatch.setattr(Path, "replace", interrupted)
+        with replacing(tmp_path / "out.txt") as beside:
+            beside.write_text("done")
+        stop.ended = True
+        monkeypatch.undo()
+    assert (tmp_path / "out.txt").read_text() == "done"
+    assert not stop.came
+    with pytest.raises(KeyboardInterrupt), handle_interrupts(), replacing(tmp_path / "other.txt"):
+        os.kill(os.getpid(), signal.SIGINT)
+    assert not (tmp_path / "other.txt").exists()
