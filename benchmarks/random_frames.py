@@ -27,9 +27,9 @@ from scanner.arrays import Array
 
 ALL_SCENES = (
     *SCENES,
-    *("grass", "brick", "coffee", "clock", "hubble_deep_field", "gravel", "chelsea", "rocket", "page", "text", "cell"),
-    *("immunohistochemistry", "microaneurysms"),
-)
+    "grass", "brick", "coffee", "clock", "hubble_deep_field", "gravel",
+    "chelsea", "rocket", "page", "text", "cell", "immunohistochemistry", "microaneurysms",
+)  # fmt: skip
 
 PHOTONS = 3.0, 10.0, 30.0, 100.0
 """Photons in a sample of the brightest pixel."""

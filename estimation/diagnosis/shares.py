@@ -123,11 +123,9 @@ def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dic
     name = max(complete, key=lambda key: complete[key] / max(noise[key], 1e-300))
     share = remaining_share(complete[name], nominal[name], noise[name])
     if residual_is_noise(result.final):
-        explained, left = (
-            misfit(result.nominal) - misfit(result.final),
-            correction.predicted_gain if correction else 0.0,
-        )
-        share = left / max(explained + left, left, 1e-300)
+        explained = max(misfit(result.nominal) - misfit(result.final), 0.0)
+        left = correction.predicted_gain if correction else 0.0
+        share = left / max(explained + left, 1e-300)
     if share < MIN_REMAINDER_SHARE:
         return None
     return {"share": share, "stage": correction.candidate.term.stage if correction else "readout", "channel": name}

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.held_out import SplitSums, log_average, pixel_means
+from recon.imaging.held_out import SplitSums, log_average, pixel_means, sample_distance
 from recon.imaging.kernel_sd import detail_variance, weigh_samples
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.smoothing import REACH, centre_weight, kernel_mean, mean_of_weighted, smooth
@@ -76,10 +76,7 @@ def choose_width(samples: SplitSums, noise: SampleNoise) -> float:
 
 def find_reached(counts: Array, width: float) -> NDArray[np.bool_]:
     """Return the pixels with a sample within the kernel's reach, shape (height, width)."""
-    import cv2
-
-    distance = cv2.distanceTransform((counts <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    return np.asarray(distance <= REACH * width)
+    return np.asarray(sample_distance(counts) <= REACH * width)
 
 
 def kernel_picture(samples: SplitSums, noise: SampleNoise, width: float | None = None) -> PictureEstimate:
