@@ -201,7 +201,7 @@ def average_cycle(law, amplitude, phase, w, k, b, force):  # type: ignore[no-unt
             slope_at[j] = slope * swing
             mean_curvature += (slope_at[j] + curvature_at[j] * swing * swing) / points
     compliance = 1.0 / (2j * w * law.J + b)
-    rate_per_torque = 1j / amplitude * compliance
+    rate_per_torque = (1.0 / amplitude) * 1j * compliance  # real: numba raises where a complex divisor vanishes
     torque_rate = rate_per_torque * _fourier_coefficient(torque, 1, points)
     rate = torque_rate + (law.J * w * w - k - 1j * w * b) * compliance
     by_phase_rate = rate_per_torque * _fourier_coefficient(by_phase, 1, points)

@@ -24,7 +24,15 @@ from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.observations import MIN_BLOCKS, NO_CLIPPED_BLOCKS, BlockObservations
 from estimation.tracker.phase_measurements import UNKNOWN_PHASE_SD, PhaseMeasurement, with_phase_measurements
 from estimation.tracker.process_noise import MIN_DENSITIES
-from estimation.tracker.state_space import AXIS_STATES, DAMPING, LOG_AMPLITUDE, PHASE, STIFFNESS, STIFFNESS_RATE
+from estimation.tracker.state_space import (
+    AXIS_STATES,
+    DAMPING,
+    LOG_AMPLITUDE,
+    MIN_AMPLITUDE_THETA0,
+    PHASE,
+    STIFFNESS,
+    STIFFNESS_RATE,
+)
 from estimation.tracker.steady_motion import PHASE_STEP_RAD, SteadyBranch, find_steady_branch, steady_motion_at
 from estimation.tracker.to_motion import axis_knots, motion_of_knots
 from scanner.arrays import Array
@@ -69,7 +77,7 @@ def track_drive_only(
 
     Raises:
         ChannelMissing: a drive was not recorded. DeviceInvalid: the device lacks a value.
-        BadInput: a drive cannot be used, or sustains no motion.
+        BadInput: a drive cannot be used, sustains no motion, or none that has the measured phases.
     """
     axes, best_densities = {}, {}
     for name in device.axes:
@@ -77,8 +85,16 @@ def track_drive_only(
         start = steady_state_estimate(observations, device)
         densities = np.array([[[MIN_DENSITIES[0], q, *MIN_DENSITIES[2:]]] for q in STIFFNESS_RATE_DENSITIES])
         tracks = track_blocks(observations, start, densities)
-        best = int(np.argmax([track.log_likelihood for track in tracks]))
         drive = observations.sense.channel
+        in_range = [k for k, track in enumerate(tracks) if _is_in_range(track.states[:, LOG_AMPLITUDE], observations)]
+        if not in_range:
+            raise BadInput(
+                f"no motion of axis {name} under this drive has the phases that the picture shows",
+                file=drive.file,
+                channel=drive.name,
+                hint="check Q, resonance and tolerances of the device",
+            )
+        best = max(in_range, key=lambda k: tracks[k].log_likelihood)
         sign = "ambiguous" if observations.parameters[0].electrostatic_factor else "known: the drive"
         knots = axis_knots(observations, tracks[best].states, tracks[best].sds, 0)
         axis = motion_of_knots(observations.references[name], knots, intensity_clock(recording, drive), sign)
@@ -86,6 +102,14 @@ def track_drive_only(
         axes[name] = axis if is_measured else _state_unmeasured(axis, start)
         best_densities[name] = float(STIFFNESS_RATE_DENSITIES[best])
     return Motion(axes, "picture", {"stiffness_trend_walk": best_densities})
+
+
+def _is_in_range(log_amplitude: Array, observations: BlockObservations) -> bool:
+    """Whether a smoothed amplitude stays where the filter keeps it: few phases leave a fast drift undetermined, and the
+    smoother is linear."""
+    theta0 = observations.parameters[0].theta0
+    low, high = np.log(MIN_AMPLITUDE_THETA0 * theta0), np.log(MAX_AMPLITUDE_THETA0 * theta0)
+    return bool(log_amplitude.min() >= low and log_amplitude.max() <= high)
 
 
 def drive_only_observations(recording: Recording, device: Device, name: str) -> BlockObservations:

@@ -100,7 +100,7 @@ def refine_motion(
         found = {name: _measured_phase(errors, motion.axes[name], name, flips.get(name, False)) for name in refined}
         # The first round compares each slice with a picture of its own.
         phases = {name: keep_determined(phases[name], found[name]) for name in refined} if rounds > 1 else found
-        smoothed = {way: _smooth(recording, device, smooth, phases, flips) for way, smooth in smoothers.items()}
+        smoothed = _smooth_each_way(recording, device, smoothers, phases, flips)
         ways = {name: _better_smoother(smoothed, name, initial_sd[name]) for name in refined}
         axes = {name: smoothed[ways[name]].axes[name] for name in refined}
         improved = replace(motion, axes={**motion.axes, **axes})
@@ -125,6 +125,29 @@ def _available_smoothers(recording: Recording, device: Device, estimator: str) -
         except BadInput:
             del smoothers["picture"]
     return smoothers
+
+
+def _smooth_each_way(
+    recording: Recording,
+    device: Device,
+    smoothers: Mapping[str, Smoother],
+    phases: Mapping[str, PhaseMeasurement],
+    flips: Mapping[str, bool],
+) -> dict[str, Motion]:
+    """The motion by every smoother that finds one with these phases.
+
+    Raises:
+        BadInput: none does.
+    """
+    smoothed, refused = dict[str, Motion](), list[BadInput]()
+    for way, smooth in smoothers.items():
+        try:
+            smoothed[way] = _smooth(recording, device, smooth, phases, flips)
+        except BadInput as error:
+            refused.append(error)
+    if not smoothed:
+        raise refused[0]
+    return smoothed
 
 
 def _smooth(

@@ -105,6 +105,25 @@ def test_a_drive_is_needed_and_must_sustain_a_motion() -> None:
         track_drive_only(weak, weak.device)
 
 
+def _phases_of_x(time: list[float], change: list[float], sd: float) -> dict[str, PhaseMeasurement]:
+    """Measured phases of x that differ by ``change`` [rad] from the steady motion."""
+    recording, _ = scan()
+    axis = track_drive_only(recording, recording.device).axes["x"]
+    phase = np.interp(time, axis.time, axis.phase) + change
+    return {"x": PhaseMeasurement(np.array(time), phase, np.full(len(time), sd))}
+
+
+def test_a_smoothed_motion_that_diverges_is_not_used() -> None:
+    recording, _ = scan()
+    phases = _phases_of_x([0.0045, 0.0191, 0.0198], [0.72, -0.72, 3.08], 0.088)  # one of four drifts diverges
+    axis = track_drive_only(recording, recording.device, phases).axes["x"]
+    assert np.isfinite(axis.phase).all()
+    assert 0.0 < axis.amplitude.min() < axis.amplitude.max() < 1.0
+    phases = _phases_of_x([0.0013, 0.0191, 0.021, 0.0211], [0.69, -2.64, -1.57, 0.46], 0.0015)  # all four do
+    with pytest.raises(BadInput, match="no motion of axis x under this drive has the phases"):
+        track_drive_only(recording, recording.device, phases)
+
+
 def test_the_channels_determine_the_default_estimator() -> None:
     recording, _ = scan()
     device = recording.device
