@@ -85,8 +85,7 @@ def refine_motion(
             motion = replace(motion, axes={**motion.axes, **{name: start.axes[name] for name in response.phases}})
     pixels = {"x": grid.width / 2, "y": grid.height / 2}
     refined = [name for name in AXES if _rms(motion.axes[name].phase_sd) * pixels[name] > MAX_PHASE_ERROR_PX]
-    smoothers = _available_smoothers(recording, device, motion.estimator) if refined else {}
-    if not smoothers:
+    if not refined or not _smoothers(motion.estimator):
         return motion, response_notes
     initial_sd = {name: _rms(motion.axes[name].phase_sd) for name in refined}
     rounds, ended = 0, False
@@ -100,7 +99,7 @@ def refine_motion(
         found = {name: _measured_phase(errors, motion.axes[name], name, flips.get(name, False)) for name in refined}
         # The first round compares each slice with a picture of its own.
         phases = {name: keep_determined(phases[name], found[name]) for name in refined} if rounds > 1 else found
-        smoothed = _smooth_each_way(recording, device, smoothers, phases, flips)
+        smoothed = _smooth_each_way(recording, device, motion.estimator, phases, flips)
         ways = {name: _better_smoother(smoothed, name, initial_sd[name]) for name in refined}
         axes = {name: smoothed[ways[name]].axes[name] for name in refined}
         improved = replace(motion, axes={**motion.axes, **axes})
@@ -113,40 +112,33 @@ def refine_motion(
     return replace(motion, info={**motion.info, "picture": info}), [*response_notes, *notes]
 
 
-def _available_smoothers(recording: Recording, device: Device, estimator: str) -> dict[str, Smoother]:
-    """Smoothers of measured phases by the estimator's name; "picture" only where the drive sustains the motion."""
-    if estimator not in ("tracker", "picture"):
-        return {}
+def _smoothers(estimator: str) -> dict[str, Smoother]:
+    """Smoothers of measured phases for a motion from ``estimator``, by the name of the estimator that each is."""
     smoothers: dict[str, Smoother] = {"picture": track_drive_only}
     if estimator == "tracker":
         smoothers["tracker"] = lambda recording, device, phases: track(recording, device, phases=phases)
-        try:
-            _smooth(recording, device, track_drive_only, {}, {})
-        except BadInput:
-            del smoothers["picture"]
-    return smoothers
+    return smoothers if estimator in smoothers else {}
 
 
 def _smooth_each_way(
     recording: Recording,
     device: Device,
-    smoothers: Mapping[str, Smoother],
+    estimator: str,
     phases: Mapping[str, PhaseMeasurement],
     flips: Mapping[str, bool],
 ) -> dict[str, Motion]:
     """The motion by every smoother that finds one with these phases.
 
     Raises:
-        BadInput: none does.
+        BadInput: that of ``estimator`` finds none.
     """
-    smoothed, refused = dict[str, Motion](), list[BadInput]()
-    for way, smooth in smoothers.items():
+    smoothed = {}
+    for way, smooth in _smoothers(estimator).items():
         try:
             smoothed[way] = _smooth(recording, device, smooth, phases, flips)
-        except BadInput as error:
-            refused.append(error)
-    if not smoothed:
-        raise refused[0]
+        except BadInput:  # another one: a drive that sustains no motion, or none with these phases
+            if way == estimator:
+                raise
     return smoothed
 
 
