@@ -31,6 +31,10 @@ DAMPING_RAISE, DAMPING_LOWER = 6.0, 8.0
 JACOBIAN_REUSE_RATIO = 0.9
 """Share of the predicted fall in misfit from which the Jacobian is kept for one more step."""
 
+MAX_STEPS_PER_JACOBIAN = 10
+"""Steps after which a Jacobian is renewed. A diverged model of 1e8 standard deviations may fall by a hundredth of its
+misfit in thousands of steps, each of which falls by more than predicted."""
+
 DIVERGED_RATIO = 100.0
 """Misfit over ``abort_above`` from which a fit counts as diverged and gets 2 instead of 4 iterations to improve."""
 
@@ -128,7 +132,7 @@ def fit_levenberg_marquardt(
         return float(part @ part + prior_precision @ (trial * trial))
 
     value, slopes = misfit(x, current), jacobian(x, current)
-    damping, fresh, iteration = INITIAL_DAMPING, True, 0
+    damping, fresh, iteration, kept = INITIAL_DAMPING, True, 0, 0
     while iteration < max_iterations:
         part = slopes[used]
         normal = part.T @ part + np.diag(prior_precision)
@@ -156,8 +160,10 @@ def fit_levenberg_marquardt(
             damping *= DAMPING_RAISE
         if fresh and gain < tolerance and iteration > 0:
             break
-        fresh = gain <= JACOBIAN_REUSE_RATIO * predicted or gain <= tolerance
+        kept += 1
+        fresh = gain <= max(JACOBIAN_REUSE_RATIO * predicted, tolerance) or kept == MAX_STEPS_PER_JACOBIAN
         if fresh:
+            kept = 0
             iteration += 1
             slopes = jacobian(x, current)
             patience = 2 if value > DIVERGED_RATIO * abort_above else 4

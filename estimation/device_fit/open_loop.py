@@ -22,7 +22,8 @@ FIXED_PARAMETER_PRECISION = 1e14
 """Prior precision of a value of the device that a prediction may not adjust."""
 
 DIVERGED_ERROR = 1e6
-"""Error that is assumed where a prediction diverges, in the channel's unit: its square is finite."""
+"""Largest error that counts, and the one of a prediction that has no value, in the channel's unit: its fourth power is
+finite."""
 
 ERROR_MARGIN = 0.01
 """Relative increase of an open-loop error that counts as none: fits end within it."""
@@ -70,9 +71,7 @@ def open_loop(runs: Sequence[Run], device: Device) -> dict[str, OpenLoop]:
             model, x = fit_start_only([run], device)
             for output, signal in zip(run.outputs, model.outputs(x)[0], strict=True):
                 rows = held_out_samples(output.data.size, output.guard)
-                error = np.nan_to_num(
-                    output.data - signal, nan=DIVERGED_ERROR, posinf=DIVERGED_ERROR, neginf=DIVERGED_ERROR
-                )
+                error = np.nan_to_num(np.clip(output.data - signal, -DIVERGED_ERROR, DIVERGED_ERROR), nan=DIVERGED_ERROR)
                 blocks = np.floor((np.arange(error.size) + 0.5) / error.size * TIME_BLOCKS)[rows]
                 squares = [float(np.mean(error[rows][blocks == block] ** 2)) for block in np.unique(blocks)]
                 squared_errors.setdefault(output.name, []).append(np.array(squares))

@@ -65,6 +65,18 @@ def test_no_step_is_longer_than_the_largest_allowed():
     assert np.allclose(fit.x, TRUE, atol=0.01)
 
 
+def test_a_slowly_falling_misfit_ends_after_the_stated_iterations():
+    """A wrong slope predicts half of each fall, which is a ten thousandth of a misfit of 1e18: it would take 1e5 steps."""
+    tried = []
+
+    def recorded(x):
+        tried.append(x)
+        return np.array([1e9 - x[0], 0.0])
+
+    fit_levenberg_marquardt(recorded, lambda x, r: np.array([[-1.0], [100.0]]), np.zeros(1), np.zeros(1))
+    assert len(tried) < 200
+
+
 def test_zero_iterations_return_the_start():
     fit = fit_levenberg_marquardt(residual, jacobian, np.array([0.1, 0.1]), np.ones(2), max_iterations=0)
     assert np.array_equal(fit.x, [0.1, 0.1])

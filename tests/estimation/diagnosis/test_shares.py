@@ -150,6 +150,21 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     assert after < 0.3 * before
 
 
+def test_a_device_whose_prediction_diverges_is_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its finite values are so large that their squares are not."""
+    rate = 2e4
+    axis = Axis(Mechanics(1.0, 2.0, (2 * np.pi * 1e3) ** 2), readout=Position(1.0, 1e-3), name="x")
+    decay = np.cos(2 * np.pi * 1e3 * np.arange(5000) / rate)
+    device = Device("beam", {"x": axis})
+    run = prepare_run(Recording.from_arrays({"sense_x": (decay, "V", rate, 0.0)}, device), device)
+    before = open_loop([run], device)
+    growing = SimpleNamespace(outputs=lambda x: [[np.geomspace(1.0, 1e200, decay.size)]])
+    monkeypatch.setattr("estimation.device_fit.open_loop.fit_start_only", lambda runs, device: (growing, np.zeros(0)))
+    after = open_loop([run], device)
+    assert np.isfinite(after["sense_x"].error)
+    assert is_worse(before, after)
+
+
 @pytest.mark.parametrize(
     ("rate", "samples", "what"),
     [(100.0, 5000, "sampled at 100 Hz, too slowly for a resonance at 1000 Hz"), (2e4, 100, "fewer than 8 periods")],
