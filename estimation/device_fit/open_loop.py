@@ -71,7 +71,8 @@ def open_loop(runs: Sequence[Run], device: Device) -> dict[str, OpenLoop]:
             model, x = fit_start_only([run], device)
             for output, signal in zip(run.outputs, model.outputs(x)[0], strict=True):
                 rows = held_out_samples(output.data.size, output.guard)
-                error = np.nan_to_num(np.clip(output.data - signal, -DIVERGED_ERROR, DIVERGED_ERROR), nan=DIVERGED_ERROR)
+                error = np.nan_to_num(output.data - signal, nan=DIVERGED_ERROR)
+                error = np.clip(error, -DIVERGED_ERROR, DIVERGED_ERROR)
                 blocks = np.floor((np.arange(error.size) + 0.5) / error.size * TIME_BLOCKS)[rows]
                 squares = [float(np.mean(error[rows][blocks == block] ** 2)) for block in np.unique(blocks)]
                 squared_errors.setdefault(output.name, []).append(np.array(squares))

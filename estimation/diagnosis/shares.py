@@ -11,6 +11,7 @@ import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, held_out_samples, misfit
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.localisation import chi2_reduction_by_channel
 from estimation.diagnosis.screening import ScoreTest, all_candidates, score_candidates
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from estimation.diagnosis.significance import DETECTION_THRESHOLD
@@ -68,8 +69,9 @@ def noise_by_channel(likelihood: Likelihood) -> dict[str, float]:
 
 
 def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
-    """Share of the misfit of its channel that a finding alone explains."""
-    name, noise = _channel(result, step), noise_by_channel(result.likelihood)
+    """Share that a finding alone explains of the misfit of the channel whose whitened misfit it lowers most."""
+    reduction = chi2_reduction_by_channel(result.likelihood, step.before, result.final)
+    name, noise = max(reduction, key=lambda key: reduction[key]), noise_by_channel(result.likelihood)
     without, complete, nominal = (misfit_by_channel(fit)[name] for fit in (step.before, result.final, result.nominal))
     return explained_share(without, complete, nominal, noise[name])
 
@@ -83,14 +85,6 @@ def leaves_noise_alone(result: SelectionResult) -> bool:
 def residual_is_noise(fit: Fit) -> bool:
     """Whether the residual of a fit is called noise."""
     return fit.validation_chi2 < MAX_HELD_OUT_CHI2
-
-
-def _channel(result: SelectionResult, step: SelectionStep) -> str:
-    """The channel on which the term of a finding acts, or else the first that contains the motion of its axis."""
-    candidate = step.candidate
-    outputs = [output for run in result.likelihood.runs for output in run.outputs if candidate.axis in output.axes]
-    acted_on = [output.name for output in outputs if output.kind == candidate.channel.partition(":")[0]]
-    return (acted_on or [output.name for output in outputs])[0]
 
 
 def find_correction(result: SelectionResult) -> ScoreTest | None:

@@ -66,7 +66,7 @@ def test_no_step_is_longer_than_the_largest_allowed():
 
 
 def test_a_slowly_falling_misfit_ends_after_the_stated_iterations():
-    """A wrong slope predicts half of each fall, which is a ten thousandth of a misfit of 1e18: it would take 1e5 steps."""
+    """A wrong slope predicts half of each fall, a ten thousandth of 1e18: to the end it takes 1e5 steps."""
     tried = []
 
     def recorded(x):

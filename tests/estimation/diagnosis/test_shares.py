@@ -19,8 +19,8 @@ from estimation.diagnosis import shares
 from estimation.diagnosis.clipping import find_rail
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.screening import ScoreTest
-from estimation.diagnosis.selection import SelectionResult
-from estimation.diagnosis.shares import explained_share, find_remainder, remaining_share
+from estimation.diagnosis.selection import SelectionResult, SelectionStep
+from estimation.diagnosis.shares import explained_share, find_remainder, remaining_share, share_of_finding
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -33,6 +33,24 @@ def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
     assert explained_share(without=5.0, complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.95)
     assert remaining_share(complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.05)
     assert explained_share(without=1.0, complete=1.2, nominal=5.0, noise=1.0) == 0.0
+
+
+def test_the_share_is_that_of_the_channel_that_shows_the_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law of the mechanics moves both channels, but the steps of popcorn noise hide it in the sense signal."""
+    without, complete, nominal = object(), object(), object()
+    misfits = {
+        id(without): {"sense_x": 7.9, "angle_x": 4.6},
+        id(complete): {"sense_x": 8.0, "angle_x": 1.0},
+        id(nominal): {"sense_x": 8.1, "angle_x": 5.0},
+    }
+    monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: misfits[id(fit)])
+    monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 8.0, "angle_x": 1.0})
+    reduction = {"sense_x": 20.0, "angle_x": 900.0}
+    monkeypatch.setattr(shares, "chi2_reduction_by_channel", lambda likelihood, before, after: reduction)
+    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None)
+    step = SimpleNamespace(before=without)
+    share = share_of_finding(cast(SelectionResult, result), cast(SelectionStep, step))
+    assert share == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize(("remaining", "stated"), [(-5.0, False), (9.0, False), (800.0, True)])
@@ -126,7 +144,6 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     from estimation.device_fit.parameters import Candidate
     from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
     from estimation.diagnosis.improvement import improve
-    from estimation.diagnosis.selection import SelectionStep
 
     (recording,), _, device = ROWS["pendulum-45"](measured_data)
     run = prepare_run(recording, device)
