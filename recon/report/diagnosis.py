@@ -77,8 +77,8 @@ def _overview(diagnosis: Diagnosis) -> Section:
     head = ["effect", "where", "probability", "share of the misfit", "misfit before", "misfit after"]
     text = (
         "Misfit: reduced chi-square on samples that were not used in the fit; noise alone gives 1. Share: of the mean "
-        "square misfit of the nominal device on these samples, in the unit of the channel; what is not explained near "
-        "the noise is a share of the misfit in units of the noise."
+        "square misfit of the nominal device on these samples, in the channel that shows the effect most; what is "
+        "not explained near the noise is a share of the misfit in units of the noise."
     )
     return Section("Effects", text, Table(head, rows))
 
