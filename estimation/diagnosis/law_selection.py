@@ -1,7 +1,8 @@
 """Named laws that take the bulk of a misfit when no model is exactly right.
 
 Laws are selected in the linear model around a fit, fitted, and selected again around that fit, until the selection no
-longer changes. A law that gains less than a free correction beside it imitates something else and is dropped.
+longer changes. A law that gains less than a free correction beside it imitates something else and is dropped, unless
+the fit without it shows that it is needed; then laws are only added to it.
 """
 
 from __future__ import annotations
@@ -52,6 +53,22 @@ class Choice(NamedTuple):
     certain: bool
 
 
+class _Selection(NamedTuple):
+    """Where the selection ended.
+
+    Attributes:
+        likelihood: under the noise that the fit leaves.
+        linear: the linear model around the fit.
+        fit: with the selected laws.
+        compared: groups of fits that were compared under the same noise.
+    """
+
+    likelihood: Likelihood
+    linear: LinearModel
+    fit: Fit
+    compared: list[dict[Effects, Fit]]
+
+
 def choose_laws(
     anchor: Fit, nominal: Fit, candidates: Sequence[Candidate], progress: Callable[[str], None]
 ) -> Choice | None:
@@ -63,51 +80,11 @@ def choose_laws(
         candidates: named laws and discrepancy terms.
         progress: called with one line of text at every step.
     """
-    fit, fitted, centres = anchor, dict[Effects, Fit](), set[Effects]()
-    compared, returned = list[dict[Effects, Fit]](), False
-    for _ in range(MAX_LINEARISATIONS):
-        likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
-        fit = fit_model(likelihood, fit.model, fit.x)
-        linear = linear_model(likelihood, fit, candidates)
-        present = tuple(i for i, law in enumerate(linear.laws) if law.test is None)
-        centres.add(linear.effects(present))
-        if returned:
-            break
-        if fitted:
-            selected = [linear.select(present, max_moves=1).laws]
-        elif any(map(is_discrepancy, fit.model.candidates)):
-            selected = [linear.select().laws, linear.strongest_together(), *linear.strongest(MAX_ALTERNATIVES)]
-        else:
-            selected = [linear.select().laws, linear.strongest_together(), *((law,) for law in present)]
-        progress("beside a discrepancy: " + " or ".join(map(linear.describe, selected)))
-        options = {linear.effects(laws): laws for laws in selected if laws}
-        if not options:
-            return None
-        if list(options) == [linear.effects(present)]:
-            exchanged, near = _exchange_near_rival(linear, likelihood, fit, present, candidates, fitted)
-            compared.append(near)
-            if exchanged is None:
-                break
-            fit = exchanged
-            continue
-        fits = {names: fit_laws(linear, likelihood, fit, laws, fitted) for names, laws in options.items()}
-        if not fitted and present:
-            fits[linear.effects(present)] = fit
-        followed = MAX_CHI2_RATIO * fit.chi2
-        fits = {names: one for names, one in fits.items() if satisfies_sign_constraints(one) and one.chi2 < followed}
-        if not fits and present:
-            break
-        if not fits:
-            return None
-        compared.append(fits)
-        effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
-        with_laws = fits[effects]
-        returned, is_worse = effects in centres, with_laws.neg2_log_evidence > fit.neg2_log_evidence
-        if present and is_worse and (returned or len(effects) > len(present)):
-            break
-        fitted[effects] = fit = with_laws
-    else:
+    end = _iterate_selection(anchor, candidates, progress)
+    if end is None:
         return None
+    likelihood, linear, fit = end.likelihood, end.linear, end.fit
+    present = _present_laws(linear)
     before = fit_model(likelihood, nominal.model, nominal.x)
     alone = linear.hypothesis(()).neg2_log_evidence
     if any(map(is_discrepancy, anchor.model.candidates)):
@@ -117,8 +94,108 @@ def choose_laws(
         return None
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     linear_rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
-    rivals = {key: _with_fitted_rivals(key, of_law, fit, compared) for key, of_law in linear_rivals.items()}
+    rivals = {key: _with_fitted_rivals(key, of_law, fit, end.compared) for key, of_law in linear_rivals.items()}
     return Choice(likelihood, before, fit, rivals, need.remaining, need.certain)
+
+
+def _iterate_selection(
+    anchor: Fit, candidates: Sequence[Candidate], progress: Callable[[str], None]
+) -> _Selection | None:
+    """Select laws around a fit and fit them until the selection no longer changes; None where no law is selected."""
+    fit, fitted, centres = anchor, dict[Effects, Fit](), set[Effects]()
+    compared, returned, needed = list[dict[Effects, Fit]](), False, Effects()
+    for _ in range(MAX_LINEARISATIONS):
+        likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
+        fit = fit_model(likelihood, fit.model, fit.x)
+        linear = linear_model(likelihood, fit, candidates)
+        present = _present_laws(linear)
+        centres.add(linear.effects(present))
+        if returned:
+            break
+        proposed = _propose_laws(
+            linear, fit, kept=present if needed == linear.effects(present) else (), first=not fitted
+        )
+        progress("beside a discrepancy: " + " or ".join(map(linear.describe, proposed)))
+        options = {linear.effects(laws): laws for laws in proposed if laws}
+        if not options:
+            return None
+        if list(options) != [linear.effects(present)]:
+            fits = _fit_options(linear, likelihood, fit, options, fitted)
+            if not fits and present:
+                break
+            if not fits:
+                return None
+            compared.append(fits)
+            effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
+            with_laws = fits[effects]
+            if effects == linear.effects(present) or _lacks_needed_law(linear, present, fit, with_laws):
+                needed = linear.effects(present)
+                fitted[needed] = fit
+                continue
+            returned, is_worse = effects in centres, with_laws.neg2_log_evidence > fit.neg2_log_evidence
+            if present and is_worse and (returned or len(effects) > len(present)):
+                break
+            fitted[effects] = fit = with_laws
+            continue
+        exchanged, near = _exchange_near_rival(linear, likelihood, fit, present, candidates, fitted)
+        compared.append(near)
+        if exchanged is None:
+            break
+        fit = exchanged
+    else:
+        return None
+    return _Selection(likelihood, linear, fit, compared)
+
+
+def _present_laws(linear: LinearModel) -> tuple[int, ...]:
+    """Laws of the fit around which a model is linear."""
+    return tuple(i for i, law in enumerate(linear.laws) if law.test is None)
+
+
+def _propose_laws(linear: LinearModel, fit: Fit, kept: tuple[int, ...], first: bool) -> list[tuple[int, ...]]:
+    """Sets of laws to be fitted, selected in the linear model around a fit.
+
+    Args:
+        kept: laws of the fit, where they are known to be needed.
+        first: whether no selected laws have been fitted.
+    """
+    present = _present_laws(linear)
+    if not first:
+        return [linear.select(present, max_moves=1, kept=kept).laws]
+    has_discrepancy = any(map(is_discrepancy, fit.model.candidates))
+    alone = linear.strongest(MAX_ALTERNATIVES) if has_discrepancy else [(law,) for law in present]
+    return [linear.select().laws, linear.strongest_together(), *alone]
+
+
+def _fit_options(
+    linear: LinearModel,
+    likelihood: Likelihood,
+    fit: Fit,
+    options: dict[Effects, tuple[int, ...]],
+    fitted: dict[Effects, Fit],
+) -> dict[Effects, Fit]:
+    """Fits of selected laws, and at first the one around which they were selected, that follow the recording."""
+    fits = {effects: fit_laws(linear, likelihood, fit, laws, fitted) for effects, laws in options.items()}
+    present = _present_laws(linear)
+    if not fitted and present:
+        fits[linear.effects(present)] = fit
+    limit = MAX_CHI2_RATIO * fit.chi2
+    return {effects: one for effects, one in fits.items() if satisfies_sign_constraints(one) and one.chi2 < limit}
+
+
+def _lacks_needed_law(linear: LinearModel, present: tuple[int, ...], fit: Fit, reduced: Fit) -> bool:
+    """Whether a fit consists of fewer of the laws and its misfit is higher by more than corrections beside all take.
+
+    The linear model removes a law whose part corrections or other laws seem to take; far from the fit without that law
+    it may be wrong.
+
+    Args:
+        linear: around ``fit``.
+        present: its laws.
+        fit, reduced: with these laws, and the one that was selected.
+    """
+    fewer = {(law.axis, law.term.effect) for law in reduced.model.candidates} < linear.effects(present)
+    return fewer and misfit(reduced) - misfit(fit) > linear.gain_of_discrepancy(present)
 
 
 def _with_fitted_rivals(

@@ -177,7 +177,7 @@ class LinearModel:
         all_scales[used] = values
         return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes + self.cost, misfit)
 
-    def select(self, laws: Sequence[int] = (), max_moves: int | None = None) -> Hypothesis:
+    def select(self, laws: Sequence[int] = (), max_moves: int | None = None, kept: Collection[int] = ()) -> Hypothesis:
         """The laws beside a small discrepancy after the moves that improve them most: additions, removals, exchanges.
 
         Each law has to gain ``MIN_SCORE_GAIN``, and a second or third law more than the discrepancy beside them still
@@ -186,15 +186,16 @@ class LinearModel:
         Args:
             laws: to start from.
             max_moves: None for as many as there are.
+            kept: laws that no move removes.
         """
-        kept = self._without_imitations(tuple(laws))
-        best = self.hypothesis(kept, max_scale=MAX_SCALE_BESIDE)
-        if max_moves is not None and kept != tuple(laws):
+        needed = self._without_imitations(tuple(laws), kept)
+        best = self.hypothesis(needed, max_scale=MAX_SCALE_BESIDE)
+        if max_moves is not None and needed != tuple(laws):
             max_moves -= 1
         while max_moves is None or max_moves > 0:
             limit = self._score(best) - MIN_EXCHANGE_GAIN
-            moves = sorted((move for move in self._moves(best) if self._score(move) < limit), key=self._score)
-            better = next((move for move in moves if self._is_possible(move.laws)), None)
+            moves = sorted((move for move in self._moves(best, kept) if self._score(move) < limit), key=self._score)
+            better = next((move for move in moves if self._is_possible(move.laws, kept)), None)
             if better is None:
                 break
             best, max_moves = better, None if max_moves is None else max_moves - 1
@@ -210,8 +211,8 @@ class LinearModel:
         beside = hypothesis.neg2_log_evidence + (0.0 if laws else MIN_SCORE_GAIN)
         return min(without, beside) + MIN_SCORE_GAIN * len(laws)
 
-    def _is_possible(self, laws: tuple[int, ...]) -> bool:
-        """Whether all estimates have a physically possible sign, and no law is an imitation."""
+    def _is_possible(self, laws: tuple[int, ...], kept: Collection[int] = ()) -> bool:
+        """Whether all estimates have a physically possible sign, and no law that is not kept is an imitation."""
         estimates, first = self.estimate([self.laws[i] for i in laws]), 0
         for i in laws:
             candidate = self.laws[i].candidate
@@ -219,7 +220,7 @@ class LinearModel:
             if any(sign * estimates[first + j] < 0.0 for j, sign in enumerate(signs)):
                 return False
             first += self.laws[i].columns.size
-        return self._without_imitations(laws) == laws
+        return self._without_imitations(laws, kept) == laws
 
     def estimate(self, terms: Sequence[LinearTerm]) -> Array:
         """Estimates of terms without others, one after the other."""
@@ -227,10 +228,10 @@ class LinearModel:
         regression = regress(self.factor[:, at], self.factor[:, -1:], np.ones(at.size))
         return np.asarray(-np.linalg.solve(regression.factor, regression.projected[:, 0]))
 
-    def _without_imitations(self, laws: tuple[int, ...]) -> tuple[int, ...]:
+    def _without_imitations(self, laws: tuple[int, ...], kept: Collection[int] = ()) -> tuple[int, ...]:
         """Several laws without those that gain less than the discrepancy beside all of them, the least first."""
-        while len(laws) > 1:
-            rests = [tuple(law for law in laws if law != removed) for removed in laws]
+        while len(laws) > 1 and not set(laws) <= set(kept):
+            rests = [tuple(law for law in laws if law != removed) for removed in laws if removed not in kept]
             closest = min(rests, key=self._misfit)
             if self._misfit(closest) - self._misfit(laws) > self.gain_of_discrepancy(laws):
                 break
@@ -245,10 +246,10 @@ class LinearModel:
         """Of laws without a discrepancy."""
         return self.without_discrepancy(laws).misfit
 
-    def _moves(self, best: Hypothesis) -> Iterator[Hypothesis]:
+    def _moves(self, best: Hypothesis, kept: Collection[int]) -> Iterator[Hypothesis]:
         if len(best.laws) < MAX_LAWS:
             yield from self.beside(best.laws, best.scales)
-        for i in best.laws:
+        for i in set(best.laws) - set(kept):
             rest = tuple(law for law in best.laws if law != i)
             yield self.hypothesis(rest, best.scales, max_scale=MAX_SCALE_BESIDE)
             yield from self.beside(rest, best.scales)

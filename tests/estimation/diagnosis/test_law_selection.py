@@ -6,14 +6,21 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.fit import Likelihood, fit_model
+from estimation.device_fit.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
+from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.linear_model import LinearModel, LinearTerm
+from estimation.diagnosis.law_selection import choose_laws
+from estimation.diagnosis.linear_model import Hypothesis, LinearModel, LinearTerm
+from estimation.diagnosis.screening import all_candidates
 from scanner.device import Axis, Device
 from scanner.recording import Recording
 from scanner.stages import Mechanics
 from scanner.terms import catalogue
+from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
 
 SAMPLES, FREE = 600, 12
 LAWS = ("cubic-stiffness", "cubic-damping", "sensor-cubic")
@@ -77,6 +84,13 @@ def test_a_law_that_gains_less_than_the_discrepancy_beside_it_is_not_selected() 
     }  # fmt: skip
 
 
+def test_a_kept_law_is_not_removed() -> None:
+    model = linear_model({"sensor-cubic": 3.0, "cubic-damping": 0.02}, 0.2)
+    small = next(i for i, law in enumerate(model.laws) if law.candidate.term.effect == "cubic-damping")
+    assert set(model.select((small,), kept=(small,)).laws) == {small, *model.select().laws}
+    assert small not in model.select((small,)).laws
+
+
 def test_noise_alone_exceeds_the_null_quantile_as_rarely_as_stated() -> None:
     model = linear_model({}, 0.0)
     limit = model.null_gain(0.05)
@@ -106,6 +120,38 @@ def test_rounding_does_not_decide_between_laws_of_nearly_the_same_effect() -> No
     assert exact == pytest.approx(9.0, abs=0.1)  # of the prior
     assert near - exact == pytest.approx(9.0 * SAMPLES, rel=0.2)
     assert selected(model) == {"cubic-damping"}
+
+
+@pytest.mark.slow
+def test_a_law_without_which_the_fit_is_worse_is_kept_although_the_linear_model_removes_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The selection starts from a gain that drifts, adds the spring, and removes the drift beside it."""
+    select, with_spring = LinearModel.select, list[bool]()
+
+    def without_drift_beside_spring(
+        linear: LinearModel, laws: tuple[int, ...] = (), max_moves: int | None = None, kept: tuple[int, ...] = ()
+    ) -> Hypothesis:
+        effects = [law.candidate.term.effect for law in linear.laws]
+        with_spring.append(linear.laws[effects.index("cubic-stiffness")].test is None)
+        removed = {i for i, effect in enumerate(effects) if effect == "gain-drift" and any(with_spring)} - set(kept)
+        best = select(linear, laws, max_moves, kept)
+        return linear.hypothesis(tuple(i for i in best.laws if i not in removed))
+
+    size = np.abs(bench_signals(0.0, 0.0)[1]).max()
+    run = prepare_run(bench_recording(k3=0.06 * STIFFNESS / size**2, gain_drift=0.15, seed=4), DEVICE)
+    nominal = Model([run], DEVICE)
+    likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
+    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
+    laws = ("cubic-stiffness", "gain-drift")
+    terms = [*(catalogue()[name] for name in laws), *DISCREPANCY_TERMS.values()]
+    pool = all_candidates(DEVICE, nominal, terms)
+    model = Model([run], DEVICE, [law for law in pool if law.term.effect == "gain-drift"], nominal.mains)
+    anchor = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x))
+    monkeypatch.setattr(LinearModel, "select", without_drift_beside_spring)
+    choice = choose_laws(anchor, early, pool, lambda text: None)
+    assert choice is not None
+    assert {law.term.effect for law in choice.fit.model.candidates} == set(laws)
 
 
 @pytest.mark.slow
