@@ -10,7 +10,8 @@ data, pictures and reports do not belong here. Modules in the order of the compu
    selected again; ``pruning``: terms and amplitudes that are not required; ``significance``; ``selection``: named laws,
    else a discrepancy, else nothing.
 4. ``localisation``: channel, time and harmonics of a misfit; ``gain_drift``: damping that a drifting gain imitates;
-   ``identifiability``: detectability of every effect; ``experiment_design``: further measurements.
+   ``identifiability``: detectability of every effect; ``experiment_design``: further measurements;
+   ``corrected_parameters``: parameters beside a discrepancy.
 5. ``discrepancy_law``, ``effect_curve``: a fitted effect as formula and curve.
 6. ``improvement``: the improved device; ``shares``: what each finding explains; ``diagnose``: verdict and findings.
 """

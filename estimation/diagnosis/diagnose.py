@@ -9,6 +9,7 @@ from typing import Any
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.open_loop import open_loop
+from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, find_effect
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
@@ -133,7 +134,8 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
     improvement = improve(result)
     result = improvement.search
     correction = find_correction(result)
-    findings = [find_effect(result, step, correction) for step in result.steps]
+    corrected = correct_parameters(result.likelihood, result.final) if correction else None
+    findings = [find_effect(result, step, correction, corrected) for step in result.steps]
     findings.sort(key=lambda finding: -(finding.share or 0.0))
     tension = None if findings else _prior_tension_finding(result.final)
     if tension is not None:

@@ -12,6 +12,7 @@ from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.profile_likelihood import profile_interval
 from estimation.diagnosis.clipping import rail_resolution
+from estimation.diagnosis.corrected_parameters import CorrectedParameters
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
@@ -72,11 +73,17 @@ class Finding:
     curve: Mapping[str, Any] | None = None
 
 
-def find_effect(result: SelectionResult, step: SelectionStep, correction: ScoreTest | None) -> Finding:
+def find_effect(
+    result: SelectionResult,
+    step: SelectionStep,
+    correction: ScoreTest | None,
+    corrected: CorrectedParameters | None,
+) -> Finding:
     """The finding of one step of a selection, with its probability, its rivals and the values of its parameters.
 
     Args:
         correction: of what the final fit leaves, see ``find_correction``.
+        corrected: parameters of the final fit beside corrections, if it leaves more than noise.
     """
     candidate = step.candidate
     has_law = not is_discrepancy(candidate)
@@ -102,7 +109,7 @@ def find_effect(result: SelectionResult, step: SelectionStep, correction: ScoreT
         stage=candidate.term.stage,
         effect=effect,
         equation=candidate.term.equation,
-        parameters=parameter_estimates(result.likelihood, result.final, candidate) if has_law else (),
+        parameters=parameter_estimates(result.likelihood, result.final, candidate, corrected) if has_law else (),
         where=describe_localisation(result.likelihood, candidate, step.before, step.after),
         probability=probabilities[effect],
         share=share_of_finding(result, step),
@@ -197,10 +204,13 @@ def _name(candidate: Candidate) -> str:
     return "unknown" if is_discrepancy(candidate) else candidate.term.effect
 
 
-def parameter_estimates(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> tuple[ParameterEstimate, ...]:
+def parameter_estimates(
+    likelihood: Likelihood, fit: Fit, candidate: Candidate, corrected: CorrectedParameters | None
+) -> tuple[ParameterEstimate, ...]:
     """Physical values of a candidate's parameters with their 95 % intervals, by profile likelihood.
 
     The values are those of the improved device; nominal values that the recording does not determine are as stated.
+    If the fit leaves more than noise, the intervals are extended to those beside corrections of all stages.
     """
     scales = fit.model.scales(candidate.axis)
     values = fit.model.values(candidate, determined_parameters(fit))
@@ -210,7 +220,9 @@ def parameter_estimates(likelihood: Likelihood, fit: Fit, candidate: Candidate) 
         index = fit.model.index("term", candidate.key, parameter.name)
         ends = [value - resolution, value + resolution]
         if index is not None:
-            ends = [parameter.value(end, scales) for end in profile_interval(likelihood, fit, index)]
+            interval = profile_interval(likelihood, fit, index)
+            interval = corrected.widen(index, interval) if corrected else interval
+            ends = [parameter.value(end, scales) for end in interval]
         estimates.append(
             ParameterEstimate(parameter.name, float(value), (float(min(ends)), float(max(ends))), parameter.unit)
         )

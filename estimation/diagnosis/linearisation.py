@@ -38,15 +38,30 @@ MAX_STARTS = 3
 """Values of a law's time constant or frequency that stand for it in the linear model."""
 
 
+_Block = tuple[Candidate, Array, ScoreTest | None, float]
+"""A term, its sensitivities, shape (N, q), where they were computed, and the cost of its shape parameters."""
+
+
 def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> LinearModel:
     """The linear model around a fit, of its own terms and of ``candidates`` as far as the integrator takes them."""
-    rows, base = fit.rows, common_parameters(fit)
+    base = common_parameters(fit)
     residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
-    blocks: list[tuple[Candidate, Array, ScoreTest | None, float]] = []
+    blocks: list[_Block] = []
     for candidate in filter(is_linear, uncertain(fit.model)):
         columns, part = _part_of_fit(fit, candidate)
         residual = residual - part
         blocks.append((candidate, columns, None, _shape_cost(fit, candidate)))
+    return _project_out(fit, base, [*blocks, *_blocks_beside(likelihood, fit, candidates)], residual)
+
+
+def linear_model_of_corrections(likelihood: Likelihood, fit: Fit, corrections: Sequence[Candidate]) -> LinearModel:
+    """The linear model of corrections that a fit does not contain, beside all of its parameters."""
+    blocks = _blocks_beside(likelihood, fit, corrections)
+    return _project_out(fit, list(range(fit.x.size)), blocks, fit.residual - fit.jacobian @ fit.x)
+
+
+def _blocks_beside(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> list[_Block]:
+    """Candidates that a fit does not contain, as far as the integrator takes them."""
     present = {candidate.key for candidate in fit.model.candidates}
     stages = Counter((candidate.axis, candidate.term.stage) for candidate in fit.model.candidates)
     others = [
@@ -56,9 +71,20 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
         and is_linear(candidate)
         and stages[candidate.axis, candidate.term.stage] < MAX_TERMS_PER_STAGE
     ]
-    for tests in score_candidate_starts(likelihood, fit, others):
-        cost = 2.0 * float(np.log(len(tests)))
-        blocks += [(test.candidate, test.columns, test, cost) for test in _linear_starts(tests)]
+    return [
+        (test.candidate, test.columns, test, 2.0 * float(np.log(len(tests))))
+        for tests in score_candidate_starts(likelihood, fit, others)
+        for test in _linear_starts(tests)
+    ]
+
+
+def _project_out(fit: Fit, base: list[int], blocks: Sequence[_Block], residual: Array) -> LinearModel:
+    """The linear model of terms beside the parameters ``base`` of a fit.
+
+    Args:
+        residual: without the terms and without these parameters, shape (N,).
+    """
+    rows = fit.rows
     whole = np.column_stack([*(columns[rows] for _, columns, *_ in blocks), residual[rows]])
     common = regress(fit.jacobian[rows][:, base], whole, fit.model.precision[base])
     profile = np.asarray(np.linalg.solve(common.factor, common.projected))
