@@ -107,7 +107,7 @@ def _finding_section(finding: Finding, index: int, search: SelectionResult | Non
     figures = [measured_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []
     if search is not None:
         figures += _effect_figures(finding, search)
-    table = Table(["parameter", "value ± standard deviation"], rows) if rows else None
+    table = Table(["parameter", "value ± standard deviation, or value (95 % interval)"], rows) if rows else None
     return Section(f"{index + 1}. {finding.effect}", text, table, figures, least="24rem")
 
 
