@@ -128,7 +128,8 @@ def _iterate_selection(
             compared.append(fits)
             effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
             with_laws = fits[effects]
-            if effects == linear.effects(present) or _lacks_needed_law(linear, present, fit, with_laws):
+            removes = effects < linear.effects(present)
+            if effects == linear.effects(present) or (removes and _is_needed(linear, present, fit, with_laws)):
                 needed = linear.effects(present)
                 fitted[needed] = fit
                 continue
@@ -183,8 +184,8 @@ def _fit_options(
     return {effects: one for effects, one in fits.items() if satisfies_sign_constraints(one) and one.chi2 < limit}
 
 
-def _lacks_needed_law(linear: LinearModel, present: tuple[int, ...], fit: Fit, reduced: Fit) -> bool:
-    """Whether a fit consists of fewer of the laws and its misfit is higher by more than corrections beside all take.
+def _is_needed(linear: LinearModel, present: tuple[int, ...], fit: Fit, reduced: Fit) -> bool:
+    """Whether the misfit without some laws is higher by more than corrections beside all of them take.
 
     The linear model removes a law whose part corrections or other laws seem to take; far from the fit without that law
     it may be wrong.
@@ -192,10 +193,9 @@ def _lacks_needed_law(linear: LinearModel, present: tuple[int, ...], fit: Fit, r
     Args:
         linear: around ``fit``.
         present: its laws.
-        fit, reduced: with these laws, and the one that was selected.
+        fit, reduced: with all of these laws, and without some.
     """
-    fewer = {(law.axis, law.term.effect) for law in reduced.model.candidates} < linear.effects(present)
-    return fewer and misfit(reduced) - misfit(fit) > linear.gain_of_discrepancy(present)
+    return misfit(reduced) - misfit(fit) > linear.gain_of_discrepancy(present)
 
 
 def _with_fitted_rivals(

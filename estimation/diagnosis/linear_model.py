@@ -249,7 +249,7 @@ class LinearModel:
     def _moves(self, best: Hypothesis, kept: Collection[int]) -> Iterator[Hypothesis]:
         if len(best.laws) < MAX_LAWS:
             yield from self.beside(best.laws, best.scales)
-        for i in set(best.laws) - set(kept):
+        for i in (law for law in best.laws if law not in kept):
             rest = tuple(law for law in best.laws if law != i)
             yield self.hypothesis(rest, best.scales, max_scale=MAX_SCALE_BESIDE)
             yield from self.beside(rest, best.scales)
