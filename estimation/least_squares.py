@@ -18,6 +18,9 @@ from scanner.arrays import Array, Mask
 
 T = TypeVar("T")
 
+Z_95 = 1.96
+"""Half-width of the 95 % interval of a normal distribution in standard deviations."""
+
 INITIAL_DAMPING = 1e-4
 """Levenberg-Marquardt damping of the first step, relative to the diagonal of the normal matrix: nearly Gauss-Newton,
 because a fit starts from an estimate that is close."""

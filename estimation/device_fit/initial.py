@@ -20,6 +20,9 @@ WINDOW_GROWTH = 3.0
 """Ratio of the lengths of successive windows. A frequency that was fitted over one window predicts the phase over three
 times its length with an error far below half a cycle."""
 
+WINDOW_ITERATIONS = 6
+"""Largest number of iterations over a window: the next one continues the fit. The last has twice as many."""
+
 EXCLUDED_HARMONICS = 12
 """Harmonics of the motion around which no noise is measured, because a misfit concentrates there."""
 
@@ -118,23 +121,18 @@ def _misfit(model: Model, r: int, x: Array, stop: float) -> float:
     return total
 
 
-def fit_progressively(
-    likelihood: Likelihood, model: Model, x: Array, stops: Sequence[float], max_iterations: int = 6
-) -> list[Fit]:
-    """Fits over windows of increasing length, each started at the result of the previous one.
+def fit_progressively(likelihood: Likelihood, model: Model, stops: Sequence[float]) -> list[Fit]:
+    """Fits from the initial state over windows of increasing length, each started at the result of the previous one.
 
     Args:
-        x: start of the first fit, shape (p,).
-        stops: ends of the windows as fractions of the recordings.
-        max_iterations: of each fit; twice as many for the last one.
+        stops: ends of the windows as fractions of the recordings; see :func:`window_schedule`.
     """
+    x = fit_initial_state(likelihood, model, stops[0]).x
     steps = np.full(x.size, INITIAL_STEP)
     fits: list[Fit] = []
     for stop in stops:
         last = stop == stops[-1]
-        fit = fit_model(
-            likelihood, model, x, stop, 2 * max_iterations if last else max_iterations, steps, 0.05 if last else 1.0
-        )
-        fits.append(fit)
-        x = fit.x
+        iterations = 2 * WINDOW_ITERATIONS if last else WINDOW_ITERATIONS
+        fits.append(fit_model(likelihood, model, x, stop, iterations, steps, 0.05 if last else 1.0))
+        x = fits[-1].x
     return fits

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood
+from estimation.least_squares import Z_95
 from scanner.arrays import Array
 from scanner.forward_model import AxisTrajectory
 
@@ -104,7 +105,7 @@ def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int, points: int
     spread = [mean_phase(phasor(final, x) * reference) for x in draw_parameters(final, POSTERIOR_DRAWS // 2)]
     before = mean_phase(phasor(nominal, nominal.x) * reference)
     time = run.inputs[axis].time[at[:-1]].reshape(points, 16).mean(axis=1)
-    return PhaseError(time, before, 1.96 * np.sqrt(np.mean(np.square(spread), axis=0)))
+    return PhaseError(time, before, Z_95 * np.sqrt(np.mean(np.square(spread), axis=0)))
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
-
-Z_95 = 1.96
-"""Half-width of a 95 % interval in standard deviations. At its ends, -2 log posterior has risen by the square of
-this."""
+from estimation.least_squares import Z_95
 
 PARABOLIC_TOLERANCE = 0.1
 """Relative error of the square root of the rise up to which an end is found by scaling, as on a parabola."""

@@ -12,13 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood
-from estimation.device_fit.profile_likelihood import Z_95
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.linear_model import MAX_SCALE_BESIDE
-from estimation.diagnosis.linearisation import linear_model_of_corrections
-from estimation.diagnosis.screening import all_candidates
-from estimation.least_squares import regress
+from estimation.device_fit.fit import Fit
+from estimation.diagnosis.linear_model import MAX_SCALE_BESIDE, LinearModel
+from estimation.least_squares import Z_95, regress
 from scanner.arrays import Array
 
 
@@ -39,14 +35,16 @@ class CorrectedParameters(NamedTuple):
         return min(ends[0], float(self.mean[i]) - half), max(ends[1], float(self.mean[i]) + half)
 
 
-def correct_parameters(likelihood: Likelihood, fit: Fit) -> CorrectedParameters:
-    """Mean and standard deviation of all parameters of a fit beside corrections of all stages, to first order."""
-    corrections = all_candidates(fit.model.device, fit.model, DISCREPANCY_TERMS.values())
-    linear = linear_model_of_corrections(likelihood, fit, corrections)
-    scales = linear.hypothesis((), max_scale=MAX_SCALE_BESIDE).scales
-    precision = np.repeat(1.0 / scales, [term.columns.size for term in linear.discrepancies])
-    regression = regress(linear.factor[:, :-1], linear.factor[:, -1:], precision)
-    by_coefficient = linear.profile[:, :-1] @ regression.inverse_factor
-    mean = by_coefficient @ regression.projected[:, 0] - linear.profile[:, -1]
+def correct_parameters(fit: Fit, corrections: LinearModel) -> CorrectedParameters:
+    """Mean and standard deviation of all parameters of a fit beside corrections, to first order.
+
+    Args:
+        corrections: see :func:`estimation.diagnosis.linearisation.linear_model_of_corrections`.
+    """
+    scales = corrections.hypothesis((), max_scale=MAX_SCALE_BESIDE).scales
+    precision = np.repeat(1.0 / scales, [term.columns.size for term in corrections.discrepancies])
+    regression = regress(corrections.factor[:, :-1], corrections.factor[:, -1:], precision)
+    by_coefficient = corrections.profile[:, :-1] @ regression.inverse_factor
+    mean = by_coefficient @ regression.projected[:, 0] - corrections.profile[:, -1]
     variance = np.diag(fit.covariance) + np.sum(by_coefficient**2, axis=1)
     return CorrectedParameters(mean, np.sqrt(variance))

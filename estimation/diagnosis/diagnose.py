@@ -8,13 +8,13 @@ from typing import Any
 
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.fit import Fit, nominal_values_are_improbable
+from estimation.device_fit.further_modes import describe_modes, with_driven_modes
 from estimation.device_fit.open_loop import open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, find_effect
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
-from estimation.diagnosis.shares import describe_unexplained, find_correction, find_remainder
-from estimation.diagnosis.structure import describe_modes, with_driven_modes
+from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -37,7 +37,7 @@ class Diagnosis:
         remainder: share, stage and channel of the largest misfit that no finding explains, None if there is none.
         open_loop: prediction error of the nominal and the improved device, by channel.
         optics: effects on the picture, for every recording with an intensity.
-        further_modes: see :func:`estimation.diagnosis.structure.describe_modes`.
+        further_modes: see :func:`estimation.device_fit.further_modes.describe_modes`.
         untested: what the recordings do not test, with the reason, in words; None if everything is tested.
     """
 
@@ -133,8 +133,9 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
     """Verdict, findings and improved device from the result of a selection."""
     improvement = improve(result)
     result = improvement.search
-    correction = find_correction(result)
-    corrected = correct_parameters(result.likelihood, result.final) if correction else None
+    corrections = find_corrections(result)
+    correction = best_correction(corrections) if corrections else None
+    corrected = correct_parameters(result.final, corrections) if corrections else None
     findings = [find_effect(result, step, correction, corrected) for step in result.steps]
     findings.sort(key=lambda finding: -(finding.share or 0.0))
     tension = None if findings else _prior_tension_finding(result.final)

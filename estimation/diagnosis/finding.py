@@ -82,7 +82,7 @@ def find_effect(
     """The finding of one step of a selection, with its probability, its rivals and the values of its parameters.
 
     Args:
-        correction: of what the final fit leaves, see ``find_correction``.
+        correction: of what the final fit leaves, see ``best_correction``.
         corrected: parameters of the final fit beside corrections, if it leaves more than noise.
     """
     candidate = step.candidate

@@ -13,10 +13,11 @@ from estimation.device_fit.initial import window_schedule
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_growing
-from estimation.diagnosis.discrepancy import is_discrepancy
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.linear_model import Effects, LinearModel, LinearTerm
 from estimation.diagnosis.screening import (
     ScoreTest,
+    all_candidates,
     damped_start,
     is_amplitude,
     is_linear,
@@ -54,8 +55,9 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     return _project_out(fit, base, [*blocks, *_blocks_beside(likelihood, fit, candidates)], residual)
 
 
-def linear_model_of_corrections(likelihood: Likelihood, fit: Fit, corrections: Sequence[Candidate]) -> LinearModel:
-    """The linear model of corrections that a fit does not contain, beside all of its parameters."""
+def linear_model_of_corrections(likelihood: Likelihood, fit: Fit) -> LinearModel:
+    """The linear model of the corrections of all stages that a fit does not contain, beside all of its parameters."""
+    corrections = all_candidates(fit.model.device, fit.model, DISCREPANCY_TERMS.values())
     blocks = _blocks_beside(likelihood, fit, corrections)
     return _project_out(fit, list(range(fit.x.size)), blocks, fit.residual - fit.jacobian @ fit.x)
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.device_fit.fit import TRAJECTORY_POOL, Fit, Likelihood
 from estimation.device_fit.model import Model
@@ -17,10 +16,6 @@ from scanner.device import Device
 from scanner.integrator.runge_kutta import LANES
 from scanner.terms import Parameter, Term
 from scanner.terms.term import AMPLITUDE_KINDS
-
-MIN_PREDICTED_GAIN = 3.0
-"""Predicted decrease of -2 log evidence from which a candidate is fitted: less than ``DETECTION_THRESHOLD``, because a
-first-order prediction may be too small."""
 
 MAX_CHI2_GROWTH = 2.0
 """Growth of chi-square by a predicted step above which the step is halved: the model is not linear over it."""
@@ -95,48 +90,14 @@ def is_linear(candidate: Candidate) -> bool:
     return any(is_amplitude(candidate, parameter) for parameter in candidate.term.free_parameters)
 
 
-def score_candidates(
-    likelihood: Likelihood,
-    base: Fit,
-    candidates: Iterable[Candidate],
-    stop: float = 1.0,
-    removed: Sequence[Candidate] = (),
-) -> list[ScoreTest]:
-    """The score test with the largest predicted gain of every candidate, around ``base``.
-
-    Args:
-        removed: terms of ``base`` that the candidate would replace.
-    """
-    return [
-        max(starts, key=lambda start: start.predicted_gain)
-        for starts in score_candidate_starts(likelihood, base, candidates, stop, removed)
-    ]
-
-
-def score_candidate_starts(
-    likelihood: Likelihood,
-    base: Fit,
-    candidates: Iterable[Candidate],
-    stop: float = 1.0,
-    removed: Sequence[Candidate] = (),
-) -> list[list[ScoreTest]]:
-    """Score tests of every candidate at each of its points of linearisation; see :func:`score_candidates`."""
-    rows = base.rows & (likelihood.time < stop)
-    base_model = ProfiledLinearModel(base, rows, removed)
-    return list(
-        TRAJECTORY_POOL.map(
-            lambda candidate: _score_starts(likelihood, base, candidate, base_model, rows, stop), candidates
-        )
-    )
+def score_candidate_starts(likelihood: Likelihood, base: Fit, candidates: Iterable[Candidate]) -> list[list[ScoreTest]]:
+    """Score tests of every candidate around ``base``, at each of its points of linearisation."""
+    profiled = ProfiledLinearModel(base)
+    return list(TRAJECTORY_POOL.map(lambda candidate: _score_starts(likelihood, base, candidate, profiled), candidates))
 
 
 def _score_starts(
-    likelihood: Likelihood,
-    base: Fit,
-    candidate: Candidate,
-    base_model: ProfiledLinearModel,
-    rows: NDArray[np.bool_],
-    stop: float,
+    likelihood: Likelihood, base: Fit, candidate: Candidate, profiled: ProfiledLinearModel
 ) -> list[ScoreTest]:
     model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
     indices = [i for i, f in enumerate(model.parameters) if f.kind == "term" and f.owner == candidate.key]
@@ -152,17 +113,17 @@ def _score_starts(
     for first in range(0, len(points), LANES):
         batch = points[first : first + LANES]
         if amplitudes:
-            sensitivities = _sensitivities(likelihood, base, model, batch, amplitudes, hidden_states, rows, stop)
+            sensitivities = _sensitivities(likelihood, base, model, batch, amplitudes, hidden_states)
         else:  # not linear around zero (a clip level, a mode that grows): the change by a finite size
-            model.prefetch_trajectories(batch, stop)
-            sensitivities = [(likelihood.residual(model, x, stop) - base.residual)[:, None] for x in batch]
+            model.prefetch_trajectories(batch, 1.0)
+            sensitivities = [(likelihood.residual(model, x) - base.residual)[:, None] for x in batch]
         for x, columns in zip(batch, sensitivities, strict=True):
-            normal, gradient, response = base_model.normal_equations(columns[rows])
+            normal, gradient, response = profiled.normal_equations(columns[base.rows])
             gain, estimate = linear_gain(normal, gradient)
             step = np.zeros(x.size)
             if amplitudes:
                 estimate = np.clip(estimate, -MAX_PRIOR_SIGMAS, MAX_PRIOR_SIGMAS)
-                step = model.map_parameters_from(base.model, base_model.expand(response @ estimate))
+                step = model.map_parameters_from(base.model, response @ estimate)
                 set_amplitudes(step, model, candidate, estimate)
             elif estimate[0] <= 0.3:
                 gain = 0.0
@@ -210,7 +171,7 @@ def damped_start(likelihood: Likelihood, base: Fit, model: Model, x: Array, step
 
 
 def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequence[Array], amplitudes: Sequence[int],
-                   hidden_states: Sequence[int], rows: NDArray[np.bool_], stop: float) -> list[Array]:  # fmt: skip
+                   hidden_states: Sequence[int]) -> list[Array]:  # fmt: skip
     """At every one of ``points`` the derivatives of the whitened residual by the amplitudes and by the first
     of them times each of the hidden states, shape (N, q + h)."""
     shape = base.residual.size, len(amplitudes) + len(hidden_states)
@@ -222,9 +183,9 @@ def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequ
         for (p, j), numbers in changes.items():
             x = changed[p, j] = points[p].copy()
             x[list(numbers)] = list(numbers.values())
-        model.prefetch_trajectories(list(changed.values()), stop)
+        model.prefetch_trajectories(list(changed.values()), 1.0)
         for (p, j), x in changed.items():
-            yield p, j, likelihood.residual(model, x, stop) - base.residual
+            yield p, j, likelihood.residual(model, x) - base.residual
 
     pending = list(np.ndindex(deltas.shape))
     for attempt in range(2):
@@ -233,7 +194,7 @@ def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequ
             {(p, j): {amplitudes[j]: points[p][amplitudes[j]] + deltas[p, j]} for p, j in requested}
         ):
             columns[p][:, j] = change / deltas[p, j]
-            norm = np.linalg.norm(columns[p][rows, j])
+            norm = np.linalg.norm(columns[p][base.rows, j])
             if attempt == 0 and not 0.05 < norm * deltas[p, j] < 20.0:
                 deltas[p, j] = np.clip(1.0 / norm if norm else 1e-2, 1e-6, 0.1)
                 pending.append((p, j))
@@ -245,28 +206,20 @@ def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequ
     for p, j, change in differences(states_of):
         columns[p][:, j] = change / deltas[p, 0] - columns[p][:, 0]
     for column_block in columns:
-        column_block[:, ~(np.linalg.norm(column_block[rows], axis=0) < DIVERGED_SENSITIVITY)] = 0.0
+        column_block[:, ~(np.linalg.norm(column_block[base.rows], axis=0) < DIVERGED_SENSITIVITY)] = 0.0
     return columns
 
 
 class ProfiledLinearModel:
-    """Linear model of the residual of a fit without the terms ``removed``, with all other parameters projected out.
+    """Linear model of the residual of a fit, with all of its parameters projected out.
 
-    The residual is that of the fit plus the contribution of the removed terms, to first order. Additional columns are
-    fitted jointly with the remaining parameters (profiled), so that only their orthogonal part counts.
+    Additional columns are fitted jointly with the parameters (profiled), so that only their orthogonal part counts.
     """
 
-    def __init__(self, base: Fit, rows: NDArray[np.bool_], removed: Sequence[Candidate] = ()):
-        keys = {candidate.key for candidate in removed}
-        self._is_kept = np.array(
-            [not (f.kind in ("term", "hidden") and f.owner in keys) for f in base.model.parameters]
-        )
-        jacobian = base.jacobian[rows]
-        self._kept_columns = jacobian[:, self._is_kept]
-        self._residual = base.residual[rows] - jacobian[:, ~self._is_kept] @ base.x[~self._is_kept]
-        precision = base.model.precision[self._is_kept]
-        self._normal = self._kept_columns.T @ self._kept_columns + np.diag(precision)
-        self._gradient = self._kept_columns.T @ self._residual + precision * base.x[self._is_kept]
+    def __init__(self, base: Fit):
+        self._jacobian, self._residual = base.jacobian[base.rows], base.residual[base.rows]
+        self._normal = self._jacobian.T @ self._jacobian + np.diag(base.model.precision)
+        self._gradient = self._jacobian.T @ self._residual + base.model.precision * base.x
 
     def normal_equations(self, columns: Array) -> tuple[Array, Array, Array]:
         """Normal equations of amplitudes with standard normal priors, with all other parameters refitted.
@@ -277,19 +230,13 @@ class ProfiledLinearModel:
         Returns:
             normal matrix, shape (q, q); gradient, (q,); change of the other parameters per amplitude, (p, q).
         """
-        cross = self._kept_columns.T @ columns
+        cross = self._jacobian.T @ columns
         try:
             solved = np.linalg.solve(self._normal, np.column_stack([cross, self._gradient]))
         except np.linalg.LinAlgError:  # the trajectory of the fit diverges, so it cannot be linearised
             return np.eye(columns.shape[1]), np.zeros(columns.shape[1]), np.zeros(cross.shape)
         normal = columns.T @ columns - cross.T @ solved[:, :-1] + np.eye(columns.shape[1])
-        return normal, columns.T @ self._residual - cross.T @ solved[:, -1], -solved[:, :-1]
-
-    def expand(self, change: Array) -> Array:
-        """A change of the remaining parameters, shape (p,), as a change of all."""
-        expanded = np.zeros(self._is_kept.size)
-        expanded[self._is_kept] = change
-        return expanded
+        return normal, columns.T @ self._residual - cross.T @ solved[:, -1], np.asarray(-solved[:, :-1])
 
 
 def linear_gain(normal: Array, gradient: Array) -> tuple[float, Array]:

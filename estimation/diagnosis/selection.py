@@ -10,7 +10,6 @@ from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models, mi
 from estimation.device_fit.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
 from estimation.device_fit.initial import (
     estimate_whiteners,
-    fit_initial_state,
     fit_progressively,
     flat_whiteners,
     window_schedule,
@@ -135,7 +134,7 @@ def select_terms(
     progress("nominal device")
     stops = window_schedule(model)
     likelihood = Likelihood(runs, flat_whiteners(model))
-    early = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)
+    early = fit_progressively(likelihood, model, stops)
     likelihood = Likelihood(runs, min_entropy_whiteners(fit_hum_variants(likelihood, early[-1])))
     nominal = select_mains_hum(likelihood, fit_model(likelihood, model, early[-1].x))
     nominal = with_interference_line(likelihood, nominal)

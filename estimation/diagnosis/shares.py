@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, held_out_samples, misfit
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.diagnosis.linear_model import LinearModel
+from estimation.diagnosis.linearisation import linear_model_of_corrections
 from estimation.diagnosis.localisation import chi2_reduction_by_channel
-from estimation.diagnosis.screening import ScoreTest, all_candidates, score_candidates
+from estimation.diagnosis.screening import ScoreTest
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from estimation.diagnosis.significance import DETECTION_THRESHOLD
 
@@ -87,18 +88,18 @@ def residual_is_noise(fit: Fit) -> bool:
     return fit.validation_chi2 < MAX_HELD_OUT_CHI2
 
 
-def find_correction(result: SelectionResult) -> ScoreTest | None:
-    """Score test of the discrepancy term that would explain most of what the final fit leaves.
-
-    None if nothing but noise is left, or if the fit contains all discrepancy terms.
-    """
-    final = result.final
+def find_corrections(result: SelectionResult) -> LinearModel | None:
+    """Corrections of all stages beside the final fit; None if nothing but noise is left, or if it contains all."""
     if leaves_noise_alone(result):
         return None
-    present = {candidate.key for candidate in final.model.candidates}
-    discrepancies = all_candidates(final.model.device, final.model, DISCREPANCY_TERMS.values())
-    scores = score_candidates(result.likelihood, final, [c for c in discrepancies if c.key not in present])
-    return max(scores, key=lambda score: score.predicted_gain, default=None)
+    linear = linear_model_of_corrections(result.likelihood, result.final)
+    return linear if linear.discrepancies else None
+
+
+def best_correction(corrections: LinearModel) -> ScoreTest:
+    """Score test of the correction that would explain most of what a fit leaves."""
+    tests = [term.test for term in corrections.discrepancies if term.test is not None]
+    return max(tests, key=lambda test: test.predicted_gain)
 
 
 def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dict[str, Any] | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.least_squares import fit_linear
+from estimation.least_squares import Z_95, fit_linear
 from scanner.arrays import Array
 from scanner.device import Axis
 from scanner.errors import BadInput
@@ -45,7 +45,7 @@ class IdentifiedValue:
     @property
     def ci95(self) -> tuple[float, float]:
         """95 % confidence interval."""
-        return self.value - 1.96 * self.sd, self.value + 1.96 * self.sd
+        return self.value - Z_95 * self.sd, self.value + Z_95 * self.sd
 
 
 @dataclass(frozen=True)

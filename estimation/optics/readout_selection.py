@@ -24,7 +24,7 @@ import numpy as np
 
 from estimation.diagnosis.finding import Finding, ParameterEstimate
 from estimation.diagnosis.significance import DETECTION_THRESHOLD
-from estimation.least_squares import eliminate_backward
+from estimation.least_squares import Z_95, eliminate_backward
 from estimation.optics.readout_effects import (
     ReadoutEffect,
     ReferencePhase,
@@ -37,7 +37,7 @@ from estimation.optics.readout_effects import (
     phase_change,
     term_values,
 )
-from estimation.optics.reporting import Z_95, EffectDescription, build_finding
+from estimation.optics.reporting import EffectDescription, build_finding
 from scanner.arrays import Array
 from scanner.device import AXES, Device
 from scanner.terms import NaturalScales, Term

@@ -9,6 +9,7 @@ import numpy as np
 
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
+from estimation.least_squares import Z_95
 from estimation.optics.candidates import OpticsEffect, natural_scales
 from estimation.optics.fit import UNRESOLVED_SD_CELLS, validation_error
 from estimation.optics.samples import OpticsParameters, ScanSamples
@@ -28,9 +29,6 @@ LAG_RELATIVE_SD = 0.06
 
 LAG_SEARCH_RANGE = (0.7, 1.5)
 """Lags that are tried, relative to the delay that was measured. A lag's delay comes out up to a tenth short."""
-
-Z_95 = 1.96
-"""Standard deviations to either end of a 95 % interval of a normal distribution."""
 
 MAX_SCORE = 1400.0
 """Bound on a difference in -2 log evidence before exp(-x / 2) is taken, which would underflow beyond it."""

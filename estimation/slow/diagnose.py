@@ -13,6 +13,7 @@ from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE
+from estimation.least_squares import Z_95
 from estimation.lock_in_channels import lock_in_amplitude
 from estimation.slow.decay import LAWS, Law
 from estimation.slow.selection import (
@@ -255,7 +256,7 @@ def _open_loop(
 
 def _parameters(law: Law, fit: DecayFit, axis: Axis, decays: Decays, in_rad: bool) -> tuple[ParameterEstimate, ...]:
     """Parameters of a law in SI units; without an angle, the rate of decay that it adds at the first amplitude."""
-    sd = 1.96 * np.sqrt(np.maximum(np.diag(fit.covariance)[1:], 0.0))
+    sd = Z_95 * np.sqrt(np.maximum(np.diag(fit.covariance)[1:], 0.0))
     duration, first = decays.duration, decays.reference
     if law.power is None:
         beta, log_tau = float(fit.shared[1]), float(fit.shared[2])

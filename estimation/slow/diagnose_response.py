@@ -9,6 +9,7 @@ import numpy as np
 
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
+from estimation.least_squares import Z_95
 from estimation.slow.response import AMPLITUDE_LAWS, FEEDTHROUGH, SECOND_MODE, Response, ResponseFit, fit_response
 from estimation.slow.response_selection import fit_subsets, prediction_error, select_effects, with_common_modes
 from scanner.device import Axis, Device
@@ -127,24 +128,24 @@ def _parameters(response: Response, axis: Axis, effect: str, fit: ResponseFit) -
     """Parameters of an effect: frequencies and qualities of both modes, of laws in SI units where that is possible."""
     if effect == SECOND_MODE:
         return tuple(
-            ParameterEstimate(f"{key}{i + 1}", float(value), (float(value - 1.96 * sd), float(value + 1.96 * sd)), unit)
+            ParameterEstimate(f"{key}{i + 1}", float(value), (float(value - Z_95 * sd), float(value + Z_95 * sd)), unit)
             for i in (0, 1)
             for key, unit, value, sd in zip(("f", "Q"), ("Hz", "1"), fit.modes[i], fit.mode_sd[i], strict=True)
         )
     if effect == FEEDTHROUGH:
         size = abs(fit.feedthrough) / response.largest
-        spread = 1.96 * float(np.sqrt(np.mean(np.abs(response.values - fit.predicted) ** 2)) / response.largest)
+        spread = Z_95 * float(np.sqrt(np.mean(np.abs(response.values - fit.predicted) ** 2)) / response.largest)
         spread /= np.sqrt(response.frequency.size)
         return (ParameterEstimate("fraction_of_largest_amplitude", size, (size - spread, size + spread), "1"),)
     value, sd = fit.laws[effect]
     if not response.in_rad or axis.mechanics is None:
         rate = value / (2 * np.pi * float(fit.modes[0, 0])) ** (2 if effect != "cubic-damping" else 1)
-        spread = 1.96 * sd * rate / value
+        spread = Z_95 * sd * rate / value
         return (ParameterEstimate("at_largest_amplitude", rate, (rate - spread, rate + spread), "1"),)
     power = {"cubic-stiffness": -2, "cubic-damping": -2, "quadratic-drag": -1, "coulomb-friction": 1}[effect]
     factor = axis.mechanics.J * response.largest**power
     parameter = catalogue()[effect].parameters[0]
-    ends = factor * (value - 1.96 * sd), factor * (value + 1.96 * sd)
+    ends = factor * (value - Z_95 * sd), factor * (value + Z_95 * sd)
     return (ParameterEstimate(parameter.name, factor * value, ends, parameter.unit),)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation.least_squares import Z_95
 from recon.imaging.film_equations import ColumnLag, PooledEquations
 from recon.imaging.film_reference import FilmReference, Frame, empty_reference
 from recon.imaging.line_phase import (
@@ -219,7 +220,7 @@ def share_equations(model: FilmModel, pooled: PooledEquations, value: Array, by_
 
 def _significant_fill(fill_squared: float, sd: float) -> tuple[float, float]:
     """Fill and its standard error; (0, nan) where it does not differ from 0."""
-    if fill_squared > 1.96 * sd:
+    if fill_squared > Z_95 * sd:
         return float(np.sqrt(fill_squared)), float(sd / (2.0 * np.sqrt(fill_squared)))
     return 0.0, np.nan
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from estimation.device_fit.posterior import PICTURE_HALF_WIDTH_PX, PhaseError, phase_error, phase_portrait, waveform
 from estimation.diagnosis.diagnose import Diagnosis
-from estimation.diagnosis.effect_curve import effect_curve
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability, detectability
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
@@ -24,6 +23,7 @@ from recon.report.diagnosis_figures import (
     residual_spectrum_figure,
     waveform_figure,
 )
+from recon.report.effect_curve import effect_curve
 from recon.report.numbers import format_interval, format_probability
 from recon.report.page import Figure, Section, Table, render
 from scanner.terms import catalogue

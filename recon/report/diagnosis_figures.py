@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimation.device_fit.posterior import PICTURE_HALF_WIDTH_PX, PhaseError, Waveform
-from estimation.diagnosis.effect_curve import EffectCurve
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability
+from recon.report.effect_curve import EffectCurve
 from recon.report.figures import figure_uri, new_figure, use_plain_ticks
 from recon.report.page import Figure
 from scanner.arrays import Array

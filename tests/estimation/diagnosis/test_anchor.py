@@ -71,7 +71,7 @@ def test_a_drifting_stiffness_follows_the_motion_of_a_spring() -> None:
     run = prepare_run(recording, device)
     nominal = Model([run], device)
     likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
-    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)
+    early = fit_progressively(likelihood, nominal, stops)
     assert residual_ratio(likelihood, early[-1]) > 3.0 * MAX_RESIDUAL_RATIO
     drift = Candidate(DISCREPANCY_TERMS["free-stiffness"], "x", "sense")
     anchor, _ = fit_anchor(likelihood, early[-1], early, stops, [[drift]])
@@ -89,7 +89,7 @@ def test_a_nominal_device_that_follows_the_motion_is_the_anchor() -> None:
     run = prepare_run(bench_recording(seed=9), DEVICE)
     nominal = Model([run], DEVICE)
     likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
-    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)
+    early = fit_progressively(likelihood, nominal, stops)
     terms = [Candidate(DISCREPANCY_TERMS["free-stiffness"], "x", "sense")]
     assert fit_anchor(likelihood, early[-1], early, stops, [terms]) == (early[-1], [])
 
@@ -109,10 +109,11 @@ def test_a_step_that_raises_the_misfit_is_shortened() -> None:
 
 
 def test_a_diverged_motion_predicts_no_gain() -> None:
-    free = [SimpleNamespace(kind="nominal", owner="x")] * 2
-    model = SimpleNamespace(parameters=free, precision=np.ones(2))
-    diverged = SimpleNamespace(jacobian=np.full((3, 2), 1e20), residual=np.full(3, 1e6), x=np.zeros(2), model=model)
-    known = ProfiledLinearModel(diverged, np.ones(3, bool))  # type: ignore[arg-type]
+    model = SimpleNamespace(precision=np.ones(2))
+    diverged = SimpleNamespace(
+        jacobian=np.full((3, 2), 1e20), residual=np.full(3, 1e6), rows=np.ones(3, bool), x=np.zeros(2), model=model
+    )
+    known = ProfiledLinearModel(diverged)  # type: ignore[arg-type]
     assert linear_gain(*known.normal_equations(np.ones((3, 1)))[:2])[0] == 0.0
 
 

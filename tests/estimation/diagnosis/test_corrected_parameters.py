@@ -9,7 +9,6 @@ from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.initial import (
     estimate_whiteners,
-    fit_initial_state,
     fit_progressively,
     flat_whiteners,
     window_schedule,
@@ -18,6 +17,7 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import parameter_estimates
+from estimation.diagnosis.linearisation import linear_model_of_corrections
 from scanner.recording import Recording
 from scanner.terms import catalogue
 from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
@@ -32,7 +32,7 @@ def fit_cubic_stiffness(recording: Recording) -> tuple[Likelihood, Fit]:
     run = prepare_run(recording, DEVICE)
     nominal = Model([run], DEVICE)
     likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
-    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
+    early = fit_progressively(likelihood, nominal, stops)[-1]
     model = Model([run], DEVICE, [LAW], nominal.mains)
     fit = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x))
     likelihood = Likelihood([run], estimate_whiteners(fit.model, fit.x))
@@ -49,7 +49,9 @@ def test_an_interval_beside_an_unlisted_effect_contains_the_truth(imperfection: 
     likelihood, fit = fit_cubic_stiffness(bench_recording(k3=K3, seed=4, **imperfection))
     (alone,) = parameter_estimates(likelihood, fit, LAW, None)
     assert not alone.ci95[0] < K3 < alone.ci95[1]
-    (beside,) = parameter_estimates(likelihood, fit, LAW, correct_parameters(likelihood, fit))
+    (beside,) = parameter_estimates(
+        likelihood, fit, LAW, correct_parameters(fit, linear_model_of_corrections(likelihood, fit))
+    )
     assert beside.ci95[0] < K3 < beside.ci95[1]
     assert beside.value == alone.value
 
@@ -57,7 +59,7 @@ def test_an_interval_beside_an_unlisted_effect_contains_the_truth(imperfection: 
 @pytest.mark.slow
 def test_corrections_hardly_widen_the_interval_of_a_complete_model() -> None:
     likelihood, fit = fit_cubic_stiffness(bench_recording(k3=K3, seed=4))
-    corrected = correct_parameters(likelihood, fit)
+    corrected = correct_parameters(fit, linear_model_of_corrections(likelihood, fit))
     sd = np.sqrt(np.diag(fit.covariance))
     at = fit.model.index("term", LAW.key, "k3")
     assert at is not None

@@ -15,7 +15,6 @@ from estimation.device_fit.drive_lines import is_steady, strongest_line
 from estimation.device_fit.fit import Likelihood, fit_model
 from estimation.device_fit.initial import (
     estimate_whiteners,
-    fit_initial_state,
     fit_progressively,
     flat_whiteners,
     window_schedule,
@@ -102,7 +101,7 @@ def test_the_nominal_fit_recovers_resonance_and_quality() -> None:
     model = Model([run], DEVICE)
     likelihood = Likelihood([run], flat_whiteners(model))
     stops = window_schedule(model)
-    fit = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)[-1]
+    fit = fit_progressively(likelihood, model, stops)[-1]
     axis = model.nominal("x", fit.x)
     assert axis.resonance / RESONANCE_HZ == pytest.approx(np.sqrt(1.004), abs=2e-4)
     assert axis.quality == pytest.approx(40 / 1.05 * np.sqrt(1.004), rel=0.01)
@@ -223,7 +222,7 @@ def test_a_pair_of_laws_is_selected_around_a_discrepancy() -> None:
     nominal = Model([run], DEVICE)
     likelihood = Likelihood([run], flat_whiteners(nominal))
     stops = window_schedule(nominal)
-    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
+    early = fit_progressively(likelihood, nominal, stops)[-1]
     free = Candidate(DISCREPANCY_TERMS["free-mechanics"], "x", "sense")
     model = Model([run], DEVICE, [free], nominal.mains)
     free_fit = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x), max_iterations=20)

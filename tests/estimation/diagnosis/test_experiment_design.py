@@ -7,7 +7,7 @@ import pytest
 
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
-from estimation.device_fit.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
+from estimation.device_fit.initial import fit_progressively, flat_whiteners, window_schedule
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.profile_likelihood import Z_95, profile_interval
@@ -30,7 +30,7 @@ def fitted() -> tuple[Likelihood, Fit]:
     nominal, model = Model([run], DEVICE), Model([run], DEVICE, [CUBIC])
     likelihood = Likelihood([run], flat_whiteners(nominal))
     stops = window_schedule(nominal)
-    start = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
+    start = fit_progressively(likelihood, nominal, stops)[-1]
     return likelihood, fit_model(likelihood, model, model.map_parameters_from(nominal, start.x))
 
 

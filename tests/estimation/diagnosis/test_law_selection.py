@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Likelihood, fit_model
-from estimation.device_fit.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
+from estimation.device_fit.initial import fit_progressively, flat_whiteners, window_schedule
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.diagnose import diagnose
@@ -142,7 +142,7 @@ def test_a_law_without_which_the_fit_is_worse_is_kept_although_the_linear_model_
     run = prepare_run(bench_recording(k3=0.06 * STIFFNESS / size**2, gain_drift=0.15, seed=4), DEVICE)
     nominal = Model([run], DEVICE)
     likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
-    early = fit_progressively(likelihood, nominal, fit_initial_state(likelihood, nominal, stops[0]).x, stops)[-1]
+    early = fit_progressively(likelihood, nominal, stops)[-1]
     laws = ("cubic-stiffness", "gain-drift")
     terms = [*(catalogue()[name] for name in laws), *DISCREPANCY_TERMS.values()]
     pool = all_candidates(DEVICE, nominal, terms)

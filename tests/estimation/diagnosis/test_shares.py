@@ -140,7 +140,7 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     """A pendulum let go at 45 degrees: whatever its law is called, the device that has it predicts its swing."""
     from benchmarks.measured import ROWS
     from estimation.device_fit.fit import Fit
-    from estimation.device_fit.initial import estimate_whiteners, fit_initial_state, fit_progressively, window_schedule
+    from estimation.device_fit.initial import estimate_whiteners, fit_progressively, window_schedule
     from estimation.device_fit.parameters import Candidate
     from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
     from estimation.diagnosis.improvement import improve
@@ -150,7 +150,7 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
 
     def fitted(model: Model) -> Fit:
         likelihood, stops = Likelihood([run], flat_whiteners(model)), window_schedule(model)
-        first = fit_progressively(likelihood, model, fit_initial_state(likelihood, model, stops[0]).x, stops)[-1]
+        first = fit_progressively(likelihood, model, stops)[-1]
         return fit_model(likelihood, model, first.x, max_iterations=20)
 
     nominal = fitted(Model([run], device))

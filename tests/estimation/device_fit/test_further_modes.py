@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from estimation.device_fit.data import Run, prepare_run
+from estimation.device_fit.further_modes import find_modes, with_driven_modes
 from estimation.diagnosis import diagnose as diagnosing
-from estimation.diagnosis.structure import find_modes, with_driven_modes
 from recon.report.conclusions import conclude_diagnosis
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
