@@ -65,7 +65,7 @@ def curvature_share(cutoff: float, step: float) -> float:
     return 0.5 * (first - second) / fall
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def run_section(signal, e, p, q, u, x):  # type: ignore[no-untyped-def]
     """Filter ``signal`` (n,) in place, after an output ``u`` and an input ``x``. Returns the last output and input."""
     for i in range(signal.size):

@@ -233,8 +233,13 @@ def fit_model(
     """
     steps = np.full(x.size, INITIAL_STEP) if steps is None else steps
     rows = likelihood.fitted(stop)
+
+    def residual(trial: Array) -> Array:
+        model.prefetch_trajectories([trial], stop, TRAJECTORY_POOL.map)
+        return likelihood.residual(model, trial, stop)
+
     result = fit_levenberg_marquardt(
-        lambda trial: likelihood.residual(model, trial, stop),
+        residual,
         lambda trial, residual: likelihood.jacobian(model, trial, residual, steps, stop),
         x,
         model.precision,

@@ -65,7 +65,7 @@ of the amplitude."""
 SOURCE = "discrepancy term (Kennedy & O'Hagan 2001): polynomials and cosines without a physical model"
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def apply_play(signal, width):  # type: ignore[no-untyped-def]
     """Output of a play operator of half-width ``width`` for ``signal``, shape (n,), equal to it at the first sample."""
     output = np.empty_like(signal)
@@ -138,7 +138,7 @@ def cosine_series(phase: Array, coefficients: Sequence[float]) -> Array:
     return np.asarray(_chebyshev(np.cos(phase).ravel(), np.asarray(coefficients, float)).reshape(phase.shape))
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _chebyshev(cosine, coefficients):  # type: ignore[no-untyped-def]
     """sum_j coefficients[j] T_j(cosine) by Clenshaw's recurrence, in pieces that fit into the first cache."""
     series = np.empty_like(cosine)

@@ -53,7 +53,7 @@ def _transition(frequency: float, quality: float, step: float) -> tuple[Array, A
     return np.ascontiguousarray(whole[:2, :2]), whole[:2, 2] - whole[:2, 3], np.ascontiguousarray(whole[:2, 3])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _run(voltage, matrix, first, last, q, rate):  # type: ignore[no-untyped-def]
     out = np.empty((2, voltage.size))
     for i in range(voltage.size):

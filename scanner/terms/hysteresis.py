@@ -12,7 +12,7 @@ from scanner.integrator.nodes import from_nodes, to_nodes
 from scanner.terms.term import Parameter, SignalContext, Term
 
 
-@njit(float64[::1](float64[::1]), cache=True)
+@njit(float64[::1](float64[::1]), cache=True, nogil=True)
 def prandtl_ishlinskii(v):  # type: ignore[no-untyped-def]
     """Return the integral of the play operators of all half-widths over a signal ``v`` (n,), shape (n,).
 

@@ -42,7 +42,7 @@ _HEAD = 7
 """Numbers before the coefficients: how many there are, centres, lower and upper ends of two variables."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def polynomial(p, first, second):  # type: ignore[no-untyped-def]
     """Value of a packed law at two variables: a polynomial within its range, straight beyond it."""
     a, b = min(max(first, p[3]), p[5]), min(max(second, p[4]), p[6])
@@ -63,7 +63,7 @@ def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
     return -polynomial(p, theta, omega), 0.0, 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _along(p, values):  # type: ignore[no-untyped-def]
     out = np.empty_like(values)
     for i in range(values.size):
