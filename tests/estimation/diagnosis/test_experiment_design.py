@@ -97,6 +97,9 @@ class Posterior:
             self, at, 0.0, 0.0, np.zeros(2), self.jacobian(self, at), ~self.validation_rows, self.validation_rows, 0.0
         )  # type: ignore[arg-type]
 
+    def prefetch_trajectories(self, *_: object) -> None:
+        """There are none."""
+
 
 class Skewed(Posterior):
     """-2 log posterior (x - 1)^2 / 0.04 above 1 and four times that below."""
