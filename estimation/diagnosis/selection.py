@@ -47,13 +47,14 @@ ANCHOR_EFFECTS = (("cubic-stiffness", "quadratic-drag"), ("free-stiffness",), ("
 """Terms that are fitted in this order, on all axes, where the nominal device does not follow the motion: a frequency
 and a damping that depend on the amplitude, a stiffness and a damping that drift, a free torque."""
 
-ABSORBED_EFFECT = "resonance-drift"
-"""The effect that nominal values absorb most easily: amplitude and phase of the motion follow the resonance through
-every value of mechanics and capacitance."""
+ABSORBED_EFFECTS = (("resonance-drift",), ("resonance-drift", "damping-drift"))
+"""Effects that nominal values absorb most easily, together on all axes: amplitude and phase of the motion follow the
+resonance through every value of mechanics and capacitance. A drifting damping beside it follows slow changes of both
+whatever their cause, as a clock or a lag beside drifting resonances."""
 
 MAX_ABSORBED_PROBABILITY = 0.05
-"""Probability of the fitted nominal values below which drifting resonances around the stated values are tried. It costs
-one in twenty recordings without any effect an additional fit; what is found is judged by its evidence."""
+"""Probability of the fitted nominal values below which drifts around the stated values are tried. It costs one in
+twenty recordings without any effect additional fits; what is found is judged by its evidence."""
 
 MAX_NONLINEAR_STARTS = 8
 """Starts of a law that is linear in no amplitude that are fitted, those with the largest predicted gain. In five
@@ -178,25 +179,21 @@ def _choose_terms(
 def _choose_around_drift(
     likelihood: Likelihood, nominal: Fit, first: float, pool: Sequence[Candidate], progress: Progress
 ) -> _Selected | None:
-    """Named laws around the stated device with drifting resonances, where nominal values have absorbed a misfit.
+    """Named laws around the stated device with drifts, where nominal values have absorbed a misfit.
 
-    None where they have not, where drifts follow the motion neither with probable nor with improbable nominal values,
-    or where these values are improbable beside the named laws too.
+    They are chosen around the drifts with the best evidence of ``ABSORBED_EFFECTS``. None where nominal values have
+    absorbed nothing, where drifts follow the motion neither with probable nor with improbable nominal values, or where
+    the named laws are not the answer or leave improbable values too.
 
     Args:
         first: end of the first window, as a fraction of the recordings.
     """
-    drifts = [candidate for candidate in pool if candidate.term.effect == ABSORBED_EFFECT]
-    if not drifts or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
+    groups = [[candidate for candidate in pool if candidate.term.effect in effects] for effects in ABSORBED_EFFECTS]
+    if not groups[0] or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
         return None
     progress("stated values, with drifting resonances")
-    model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, *drifts], nominal.model.mains)
-    start = stated_values(model, model.map_parameters_from(nominal.model, nominal.x))
-    drifting = fit_growing(likelihood, model, start, first)
-    if nominal_values_are_improbable(drifting):
-        # Short windows of a precise signal hardly limit some combinations of the nominal values, and the way back leads
-        # through a long curved valley. So these values are kept until the whole recording is followed.
-        drifting = fit_model(likelihood, model, _fit_with_stated_values(likelihood, model, start, first).x)
+    fits = [_fit_from_stated_values(likelihood, nominal, drifts, first) for drifts in groups]
+    drifting = min(fits, key=lambda fit: fit.neg2_log_evidence)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, drifting)
     follows = residual_ratio(likelihood, drifting) < MAX_RESIDUAL_RATIO
     if not absorbed or (nominal_values_are_improbable(drifting) and not follows):
@@ -207,7 +204,23 @@ def _choose_around_drift(
         fit = selected.fit
         kept = _fit_with_stated_values(likelihood, fit.model, stated_values(fit.model, fit.x), first)
         selected = _choose_laws(kept, nominal, pool, progress)
-    return None if selected is None or nominal_values_are_improbable(selected.fit) else selected
+    is_answer = selected is not None and selected.certain and not nominal_values_are_improbable(selected.fit)
+    return selected if is_answer else None
+
+
+def _fit_from_stated_values(likelihood: Likelihood, nominal: Fit, terms: Sequence[Candidate], first: float) -> Fit:
+    """The fit of the device with terms over growing windows, from the stated values.
+
+    Short windows of a precise signal hardly limit some combinations of the nominal values, and the way back leads
+    through a long curved valley. If the values end improbably far from the stated ones, they keep those until the
+    whole recording is followed.
+    """
+    model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, *terms], nominal.model.mains)
+    start = stated_values(model, model.map_parameters_from(nominal.model, nominal.x))
+    fit = fit_growing(likelihood, model, start, first)
+    if nominal_values_are_improbable(fit):
+        fit = fit_model(likelihood, model, _fit_with_stated_values(likelihood, model, start, first).x)
+    return fit
 
 
 def _fit_with_stated_values(likelihood: Likelihood, model: Model, start: Array, first: float) -> Fit:

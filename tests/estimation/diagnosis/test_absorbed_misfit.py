@@ -37,3 +37,12 @@ def test_a_clock_beside_two_drifts_is_found_although_nominal_values_absorb_it_be
     assert nominal_values_are_improbable(search.nominal)
     assert {step.candidate.key for step in search.steps} == {"x.resonance-drift", "y.resonance-drift", "x.clock-skew"}
     assert not nominal_values_are_improbable(search.final)
+
+
+@pytest.mark.slow
+def test_a_clock_is_found_where_drifting_resonances_alone_do_not_follow_the_motion(tmp_path: Path) -> None:
+    """The clock of x runs 34 ppm slow. Drifting resonances and dampings follow what it does to amplitude and phase."""
+    case = Case("blind-008", "one", "imaging", ("clock-skew", "resonance-drift"), "coloured", 2309866996)
+    terms = ("filter-lag", "drive-lag", "charging", "damping-drift", "clock-skew", "resonance-drift")
+    _, search = search_blind_recording(case, tmp_path, terms)
+    assert {step.candidate.key for step in search.steps} == {"x.resonance-drift", "y.resonance-drift", "x.clock-skew"}
