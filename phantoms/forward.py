@@ -36,7 +36,7 @@ from scanner.integrator.abi import TORQUE_LAW
 from scanner.integrator.nodes import to_nodes
 from scanner.optics import apply_intensity_terms, beam_position
 from scanner.recording import Recording
-from scanner.stages import Amdm, MotionSensor, Readout
+from scanner.stages import Amdm, MotionSensor, Readout, without_noise
 from scanner.terms import Term
 
 CHUNK_S = 0.01
@@ -307,8 +307,9 @@ def simulate(
         for channel, (readout, axes) in sense_channels(device).items():
             motions = [lead[name].joined_with(paths[name]) if name in lead else paths[name] for name in axes]
             new = len(paths[axes[0]].drive.voltage)
-            clean = sense_signal(readout, motions)[-1 - new : -1 : plan.substeps]
-            noisy = clean + rng.normal(0.0, readout.noise_sd, clean.size)
+            noise, samples = np.zeros(motions[0].angle.size), slice(-1 - new, -1, plan.substeps)
+            noise[samples] = rng.normal(0.0, readout.noise_sd, noise[samples].size)
+            noisy = sense_signal(without_noise(readout), motions, noise)[samples]
             parts.setdefault(channel, []).append(quantise(noisy, readout.bits, plan.sense_range))
             for name, path in zip(axes, motions, strict=True):
                 steps = len(path.drive.voltage)

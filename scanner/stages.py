@@ -5,7 +5,7 @@ Their fields are the keys of the tables of a device file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import pi, sqrt
 from typing import ClassVar
 
@@ -238,3 +238,8 @@ Readout = Amdm | Transimpedance | Position | Velocity | Acceleration
 READOUTS: dict[str, type[Readout]] = {
     readout.kind: readout for readout in (Amdm, Transimpedance, Position, Velocity, Acceleration)
 }
+
+
+def without_noise(readout: Readout) -> Readout:
+    """The readout without noise, for a signal that contains the noise already."""
+    return replace(readout, noise_var=0.0) if isinstance(readout, Amdm) else replace(readout, noise_sd=0.0)

@@ -72,6 +72,13 @@ def test_term_changes_the_channels_of_its_stage(effect: str, plain: dict[str, np
     assert changed == (OPTICS[term.channels[0]] if term.stage == "optics" else CHANGED[term.stage])
 
 
+def test_noise_is_clipped_with_the_signal() -> None:
+    noisy = replace(quiet(), readout=replace(quiet().readout, noise_var=1e-4))
+    sense = recorded(stated(noisy, catalogue()["saturation"]))["sense"]
+    assert np.ptp(sense) == 1.0
+    assert np.mean(np.abs(sense) == 0.5) > 0.05
+
+
 COMPARED = (
     *("cubic-stiffness", "viscoelastic", "cross-axis-coupling", "drive-lag", "profile-shape"),
     *("square-law", "filter-lag", "readout-lag", "feedthrough", "channel-delay"),
