@@ -76,7 +76,7 @@ def estimate(
         check_finite(motion, recording)
         return resolve_signs(motion, recording, flips or {})
 
-    return estimate_with_terms(recording, device, run, estimator.is_model_based)
+    return estimate_with_terms(recording, device, run, estimator.is_model_based, estimator.treats_clipping)
 
 
 def check_finite(motion: Motion, recording: Recording) -> None:

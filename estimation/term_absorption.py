@@ -14,6 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from estimation.clipped_samples import clip_again, find_rails
 from scanner.active_terms import ActiveTerm, with_constants
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -112,7 +113,28 @@ def with_drives(recording: Recording, device: Device, terms: Terms) -> Recording
     return replace(recording, channels=MappingProxyType(channels))
 
 
-def with_outputs(recording: Recording, bare: Device, terms: Terms) -> tuple[Recording, Terms]:
+def without_visible_clipping(recording: Recording, bare: Device, terms: Terms) -> Terms:
+    """The terms without the clipping of channels of which samples stand at a rail.
+
+    Args:
+        bare: device without terms.
+    """
+    remaining = dict(terms)
+    for key, kind, axes in measured_channels(recording, bare):
+        if np.isfinite(find_rails(recording[key].read())).any():
+            for name in axes:
+                remaining[name] = tuple(
+                    replace(active, term=replace(active.term, output=None))
+                    if active.term.after_noise and active.channel.partition(":")[0] == kind
+                    else active
+                    for active in remaining[name]
+                )
+    return remaining
+
+
+def with_outputs(
+    recording: Recording, bare: Device, terms: Terms, treats_clipping: bool = False
+) -> tuple[Recording, Terms]:
     """The recording with output laws inverted where that is possible, and the terms that remain.
 
     A law that maps each sample by the signal at that sample, such as a gain or an offset, is inverted. A law that loses
@@ -120,6 +142,7 @@ def with_outputs(recording: Recording, bare: Device, terms: Terms) -> tuple[Reco
 
     Args:
         bare: device without terms.
+        treats_clipping: whether clipped samples have to be recognisable as such.
     """
     channels, remaining = dict(recording.channels), dict(terms)
     for key, kind, axes in measured_channels(recording, bare):
@@ -145,9 +168,10 @@ def with_outputs(recording: Recording, bare: Device, terms: Terms) -> tuple[Reco
         def law(signal: Array, kind=kind, trajectories=trajectories, readout=readout) -> Array:  # type: ignore[no-untyped-def]
             return apply_channel_terms(kind, np.append(signal, signal[-1]), trajectories, readout)[:-1]
 
-        inverted = _invert(law, channel.read())
+        measured = channel.read()
+        inverted = _invert(law, measured)
         if inverted is not None:
-            channels[key] = with_samples(channel, inverted)
+            channels[key] = with_samples(channel, clip_again(inverted, measured) if treats_clipping else inverted)
             for name in axes:
                 done = laws[name]
                 remaining[name] = tuple(

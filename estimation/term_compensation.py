@@ -6,7 +6,8 @@ motion estimated so far is passed through ``scanner.forward_model`` with and wit
 subtracted from the measured channels, and the motion is estimated again. A torque enters as its equivalent stiffness
 and damping at the motion's amplitude and by the harmonics that it adds (``estimation.describing_function``). Thus every
 estimator handles every term by its single definition in the term's file, and the equations of the estimators are the
-nominal ones.
+nominal ones. An estimator that treats clipped samples itself gets them as such, without a correction of the clipping,
+which would be the motion estimated so far in their place.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from estimation.clipped_samples import clip_again, find_rails
 from estimation.describing_function import (
     DescribingFunction,
     add_term_motion,
@@ -35,6 +37,7 @@ from estimation.term_absorption import (
     with_drives,
     with_outputs,
     with_samples,
+    without_visible_clipping,
 )
 from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.arrays import Array
@@ -65,13 +68,17 @@ MIN_NOISE_RATIO = 1e-3
 
 
 def estimate_with_terms(
-    recording: Recording, device: Device, run: NominalEstimator, is_model_based: bool = True
+    recording: Recording,
+    device: Device,
+    run: NominalEstimator,
+    is_model_based: bool = True,
+    treats_clipping: bool = False,
 ) -> Motion:
     """The motion of a device that may state terms.
 
     Args:
         run: estimates the motion of a nominal device.
-        is_model_based: whether the angle follows from a nominal model; see ``estimation.estimators.Estimator``.
+        is_model_based, treats_clipping: of the estimator; see ``estimation.estimators.Estimator``.
 
     Raises:
         BadInput: a term that no catalogue has, or as ``run``.
@@ -81,12 +88,13 @@ def estimate_with_terms(
         return run(recording, device)
     bare = absorb_constants(device, stated)
     absorbed = with_drives(with_clocks(recording, stated), device, stated)
-    absorbed, terms = with_outputs(
-        absorbed,
-        bare,
-        {name: tuple(remaining_term(active, bare.sensed_axis(name)) for active in axis_terms)
-         for name, axis_terms in stated.items()},
-    )  # fmt: skip
+    remaining: Terms = {
+        name: tuple(remaining_term(active, bare.sensed_axis(name)) for active in axis_terms)
+        for name, axis_terms in stated.items()
+    }
+    if treats_clipping:
+        remaining = without_visible_clipping(absorbed, bare, remaining)
+    absorbed, terms = with_outputs(absorbed, bare, remaining, treats_clipping)
     without_intensity = _without(absorbed, "intensity")  # angles at the sense signal's samples serve the iteration
     corrected = without_intensity
     motion, functions = run(without_intensity, bare), dict[str, DescribingFunction]()
@@ -101,7 +109,7 @@ def estimate_with_terms(
                 for name in terms
             }
             motion = with_signs(motion)
-        previous, corrected = corrected, _corrected(without_intensity, bare, terms, functions, motion)
+        previous, corrected = corrected, _corrected(without_intensity, bare, terms, functions, motion, treats_clipping)
         motion = run(corrected, linearised_device(bare, functions))
         if _converged(previous, corrected, bare):
             break
@@ -148,16 +156,22 @@ def _with_signs(recording: Recording, bare: Device, terms: Terms, functions: Fun
 
 def _misfit(recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion) -> float:
     """Minus twice the log likelihood of the recording along a motion, for white noise of unknown variance."""
-    signals = _signals(recording, bare, terms, functions, motion)
-    residuals = [channel.read() - complete for _, channel, _, complete in signals]
+    signals = [
+        (channel.read(), complete) for _, channel, _, complete in _signals(recording, bare, terms, functions, motion)
+    ]
+    residuals = [measured - np.clip(complete, *find_rails(measured)) for measured, complete in signals]
     return float(sum(each.size * np.log(np.nanvar(each)) for each in residuals))
 
 
-def _corrected(recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion) -> Recording:
+def _corrected(
+    recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion, treats_clipping: bool
+) -> Recording:
     """The recording without the terms' contribution along ``motion`` to its sense and angle channels."""
     channels = dict(recording.channels)
     for key, channel, nominal, complete in _signals(recording, bare, terms, functions, motion):
-        channels[key] = with_samples(channel, channel.read() - (complete - nominal))
+        measured = channel.read()
+        corrected = measured - (complete - nominal)
+        channels[key] = with_samples(channel, clip_again(corrected, measured) if treats_clipping else corrected)
     return replace(recording, channels=MappingProxyType(channels))
 
 

@@ -24,6 +24,7 @@ class Estimator:
         source: paper or method.
         is_model_based: whether the angle follows from a nominal model, so that harmonics that the device's terms add
             to the motion are added to it. False where the angle is a sensor's, which has them already.
+        treats_clipping: whether it takes samples at a rail as clipped, not as measured.
         resume: like ``run``, continued from the motion of an earlier segment of the same scan; None if it cannot.
     """
 
@@ -34,4 +35,5 @@ class Estimator:
     run: Callable[[Recording, Device], Motion]
     source: str
     is_model_based: bool = True
+    treats_clipping: bool = False
     resume: Callable[[Recording, Device, Motion], Motion] | None = None

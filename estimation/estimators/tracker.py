@@ -27,5 +27,6 @@ ESTIMATOR = Estimator(
     use_when="the default with a sense signal: the smallest phase error, at the Cramér-Rao bound",
     run=run,
     source="docs/explanation/tracker.md",
+    treats_clipping=True,
     resume=resume,
 )

@@ -21,4 +21,5 @@ ESTIMATOR = Estimator(
     use_when="a motion that has to be known while the scan runs; half a block of latency",
     run=run,
     source="docs/explanation/tracker.md",
+    treats_clipping=True,
 )

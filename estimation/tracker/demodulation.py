@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from estimation.clipped_samples import find_rails
 from scanner.arrays import Array, Index
 from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, Channel
 from scanner.lock_in import BLOCKS_PER_PASS, block_products, contiguous_samples
@@ -153,7 +154,7 @@ def project_blocks(
                 k, row = part.start + int(i), stored[part_starts[i] : part_starts[i] + length]
                 used = np.isfinite(row)
                 if may_clip:
-                    rails[k] = np.sort(channel.scaled(_find_rails(row)))
+                    rails[k] = np.sort(channel.scaled(find_rails(row)))
                 used[: max(settling - int(starts[k]), 0)] = False
                 columns, measured = table[:, used], channel.scaled(row[used])
                 values = measured**2 if squared else _impute_clipped(measured, rails[k])
@@ -292,25 +293,4 @@ def _find_clipped(values, starts, length):  # type: ignore[no-untyped-def]
                 if row[j] == low or row[j] == high:
                     out[i] = True
                     break
-    return out
-
-
-@njit(cache=True)
-def _find_rails(row):  # type: ignore[no-untyped-def]
-    """Rails of a block, shape (2,); infinite where no run of equal samples is at that extreme.
-
-    A rail is placed half-way between the extreme and the value next to it. With few bits a sample at the extreme may be
-    off by that much, and the threshold of a comparator is half-way between its two values.
-    """
-    out, finite = np.array([-np.inf, np.inf]), row[np.isfinite(row)]
-    if finite.size == 0 or finite.min() == finite.max():
-        return out
-    for i, extreme in ((0, finite.min()), (1, finite.max())):
-        run, longest = 0, 0
-        for j in range(row.size):
-            run = run + 1 if row[j] == extreme else 0
-            longest = max(longest, run)
-        if longest >= MIN_CLIPPED_RUN_SAMPLES:
-            rest = finite[finite != extreme]
-            out[i] = 0.5 * (float(extreme) + float(rest.min() if i == 0 else rest.max()))
     return out

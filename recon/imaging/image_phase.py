@@ -160,7 +160,7 @@ def _smooth(
         }
         return resolve_signs(smooth(compensated, nominal, referred), compensated, flips)
 
-    return estimate_with_terms(recording, device, run)
+    return estimate_with_terms(recording, device, run, treats_clipping=True)
 
 
 def registration_windows(motion: Motion, intensity: Channel, periods: int) -> list[tuple[int, int]]:
