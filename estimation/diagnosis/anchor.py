@@ -32,8 +32,8 @@ MAX_WINDOW_GROWTH, MIN_WINDOW_GROWTH = 3.0, 1.1
 MAX_SIGNAL = 1e100
 """Signal from which a trajectory has diverged: its square would overflow."""
 
-WINDOW_ITERATIONS = 8
-"""Iterations of the fit over a window."""
+WINDOW_ITERATIONS, WINDOW_TOLERANCE = 8, 1.0
+"""Iterations of the fit over a window, and the fall of the misfit by a step below which it ends."""
 
 
 def residual_ratio(likelihood: Likelihood, fit: Fit, stop: float = 1.0) -> float:
@@ -117,7 +117,7 @@ def fit_growing(
     """
     growth, stop = MAX_WINDOW_GROWTH, reached
     while True:
-        fit = fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=1.0, fixed=fixed)
+        fit = fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=WINDOW_TOLERANCE, fixed=fixed)
         if stop == reached or residual_ratio(likelihood, fit, stop) < limit:
             if stop >= 1.0:
                 return fit
@@ -126,7 +126,7 @@ def fit_growing(
         elif growth < MIN_WINDOW_GROWTH:
             if stop >= 1.0:
                 return fit
-            return fit_model(likelihood, model, fit.x, 1.0, WINDOW_ITERATIONS, tolerance=1.0, fixed=fixed)
+            return fit_model(likelihood, model, fit.x, 1.0, WINDOW_ITERATIONS, tolerance=WINDOW_TOLERANCE, fixed=fixed)
         else:
             growth = np.sqrt(growth)
         stop = min(1.0, reached * growth)

@@ -18,7 +18,7 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, flat_psd, make_whitener
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
-from estimation.diagnosis.shares import residual_is_noise
+from estimation.diagnosis.significance import residual_is_noise
 from scanner.arrays import Array
 from scanner.errors import BadInput
 from scanner.terms import Term

@@ -15,7 +15,7 @@ from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.shares import residual_is_noise
+from estimation.diagnosis.significance import residual_is_noise
 from scanner.device import Axis, Device
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 

@@ -90,14 +90,24 @@ def is_linear(candidate: Candidate) -> bool:
     return any(is_amplitude(candidate, parameter) for parameter in candidate.term.free_parameters)
 
 
-def score_candidate_starts(likelihood: Likelihood, base: Fit, candidates: Iterable[Candidate]) -> list[list[ScoreTest]]:
-    """Score tests of every candidate around ``base``, at each of its points of linearisation."""
+def score_candidate_starts(
+    likelihood: Likelihood, base: Fit, candidates: Iterable[Candidate], stop: float = 1.0
+) -> list[list[ScoreTest]]:
+    """Score tests of every candidate around ``base``, at each of its points of linearisation.
+
+    Args:
+        stop: end of the window of ``base`` as a fraction of the recordings.
+    """
     profiled = ProfiledLinearModel(base)
-    return list(TRAJECTORY_POOL.map(lambda candidate: _score_starts(likelihood, base, candidate, profiled), candidates))
+
+    def score(candidate: Candidate) -> list[ScoreTest]:
+        return _score_starts(likelihood, base, candidate, profiled, stop)
+
+    return list(TRAJECTORY_POOL.map(score, candidates))
 
 
 def _score_starts(
-    likelihood: Likelihood, base: Fit, candidate: Candidate, profiled: ProfiledLinearModel
+    likelihood: Likelihood, base: Fit, candidate: Candidate, profiled: ProfiledLinearModel, stop: float
 ) -> list[ScoreTest]:
     model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
     indices = [i for i, f in enumerate(model.parameters) if f.kind == "term" and f.owner == candidate.key]
@@ -113,10 +123,10 @@ def _score_starts(
     for first in range(0, len(points), LANES):
         batch = points[first : first + LANES]
         if amplitudes:
-            sensitivities = _sensitivities(likelihood, base, model, batch, amplitudes, hidden_states)
+            sensitivities = _sensitivities(likelihood, base, model, batch, amplitudes, hidden_states, stop)
         else:  # not linear around zero (a clip level, a mode that grows): the change by a finite size
-            model.prefetch_trajectories(batch, 1.0)
-            sensitivities = [(likelihood.residual(model, x) - base.residual)[:, None] for x in batch]
+            model.prefetch_trajectories(batch, stop)
+            sensitivities = [(likelihood.residual(model, x, stop) - base.residual)[:, None] for x in batch]
         for x, columns in zip(batch, sensitivities, strict=True):
             normal, gradient, response = profiled.normal_equations(columns[base.rows])
             gain, estimate = linear_gain(normal, gradient)
@@ -171,7 +181,7 @@ def damped_start(likelihood: Likelihood, base: Fit, model: Model, x: Array, step
 
 
 def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequence[Array], amplitudes: Sequence[int],
-                   hidden_states: Sequence[int]) -> list[Array]:  # fmt: skip
+                   hidden_states: Sequence[int], stop: float) -> list[Array]:  # fmt: skip
     """At every one of ``points`` the derivatives of the whitened residual by the amplitudes and by the first
     of them times each of the hidden states, shape (N, q + h)."""
     shape = base.residual.size, len(amplitudes) + len(hidden_states)
@@ -183,9 +193,9 @@ def _sensitivities(likelihood: Likelihood, base: Fit, model: Model, points: Sequ
         for (p, j), numbers in changes.items():
             x = changed[p, j] = points[p].copy()
             x[list(numbers)] = list(numbers.values())
-        model.prefetch_trajectories(list(changed.values()), 1.0)
+        model.prefetch_trajectories(list(changed.values()), stop)
         for (p, j), x in changed.items():
-            yield p, j, likelihood.residual(model, x) - base.residual
+            yield p, j, likelihood.residual(model, x, stop) - base.residual
 
     pending = list(np.ndindex(deltas.shape))
     for attempt in range(2):

@@ -20,20 +20,22 @@ from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, fit_growing, residual_ratio
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
+from estimation.diagnosis.from_stated_values import (
+    fit_from_stated_values,
+    fit_nonlinear_law,
+    fit_with_stated_values,
+    nonlinear_starts,
+)
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
 from estimation.diagnosis.necessity import MAX_REMAINDER_RATIO, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import (
-    ScoreTest,
     all_candidates,
     damped_start,
-    is_linear,
-    score_candidate_starts,
 )
-from estimation.diagnosis.significance import DETECTION_THRESHOLD, evidence_gain, satisfies_sign_constraints
-from scanner.arrays import Array
+from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
 from scanner.device import Device
 from scanner.terms import Term
 
@@ -157,9 +159,9 @@ def _choose_terms(
     progress: Progress,
 ) -> _Selected:
     """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
-    around_drift = _choose_around_drift(likelihood, nominal, stops[0], pool, progress)
-    if around_drift is not None:
-        return _with_nonlinear_term(around_drift, nominal, pool, stops[0], progress)
+    from_stated_values = _choose_from_stated_values(likelihood, nominal, stops, pool, progress)
+    if from_stated_values is not None:
+        return _with_nonlinear_term(from_stated_values, nominal, pool, stops[0], progress)
     groups = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
     anchor, tried = fit_anchor(likelihood, nominal, early, stops, [group for group in groups if group])
     selected = _choose_laws(anchor, nominal, pool, progress)
@@ -176,57 +178,42 @@ def _choose_terms(
     return _with_nonlinear_term(laws if laws and laws.certain else discrepancy, nominal, pool, stops[0], progress)
 
 
-def _choose_around_drift(
-    likelihood: Likelihood, nominal: Fit, first: float, pool: Sequence[Candidate], progress: Progress
+def _choose_from_stated_values(
+    likelihood: Likelihood, nominal: Fit, stops: Sequence[float], pool: Sequence[Candidate], progress: Progress
 ) -> _Selected | None:
-    """Named laws around the stated device with drifts, where nominal values have absorbed a misfit.
+    """Named laws around a fit from the stated values, where nominal values have absorbed a misfit.
 
-    They are chosen around the drifts with the best evidence of ``ABSORBED_EFFECTS``. None where nominal values have
-    absorbed nothing, where drifts follow the motion neither with probable nor with improbable nominal values, or where
-    the named laws are not the answer or leave improbable values too.
+    It is that with the drifts of ``ABSORBED_EFFECTS`` that have the best evidence or, where all drifts leave more than
+    noise, with a law that is linear in no amplitude and leaves but noise. None where nominal values have absorbed
+    nothing, where drifts follow the motion neither with probable nor with improbable nominal values, or where the named
+    laws are not the answer or leave improbable values too.
 
     Args:
-        first: end of the first window, as a fraction of the recordings.
+        stops: ends of growing windows as fractions of the recordings.
     """
     groups = [[candidate for candidate in pool if candidate.term.effect in effects] for effects in ABSORBED_EFFECTS]
     if not groups[0] or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
         return None
     progress("stated values, with drifting resonances")
-    fits = [_fit_from_stated_values(likelihood, nominal, drifts, first) for drifts in groups]
-    drifting = min(fits, key=lambda fit: fit.neg2_log_evidence)
-    absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, drifting)
-    follows = residual_ratio(likelihood, drifting) < MAX_RESIDUAL_RATIO
-    if not absorbed or (nominal_values_are_improbable(drifting) and not follows):
+    fits = [fit_from_stated_values(likelihood, nominal, drifts, stops[0]) for drifts in groups]
+    if not any(map(residual_is_noise, fits)):
+        progress("stated values, with laws that are linear in no amplitude")
+        nonlinear = fit_nonlinear_law(likelihood, nominal, pool, stops)
+        if nonlinear is not None:
+            return _choose_beside(likelihood, nominal, nonlinear, nominal, pool, progress)
+    base = min(fits, key=lambda fit: fit.neg2_log_evidence)
+    absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, base)
+    follows = residual_ratio(likelihood, base) < MAX_RESIDUAL_RATIO
+    if not absorbed or (nominal_values_are_improbable(base) and not follows):
         return None
-    selected = _choose_laws(drifting, nominal, pool, progress)
+    selected = _choose_laws(base, nominal, pool, progress)
     if selected is not None and nominal_values_are_improbable(selected.fit):
         # They have absorbed a further effect, which is visible beside these laws at the stated values only.
         fit = selected.fit
-        kept = _fit_with_stated_values(likelihood, fit.model, stated_values(fit.model, fit.x), first)
+        kept = fit_with_stated_values(likelihood, fit.model, stated_values(fit.model, fit.x), stops[0])
         selected = _choose_laws(kept, nominal, pool, progress)
     is_answer = selected is not None and selected.certain and not nominal_values_are_improbable(selected.fit)
     return selected if is_answer else None
-
-
-def _fit_from_stated_values(likelihood: Likelihood, nominal: Fit, terms: Sequence[Candidate], first: float) -> Fit:
-    """The fit of the device with terms over growing windows, from the stated values.
-
-    Short windows of a precise signal hardly limit some combinations of the nominal values, and the way back leads
-    through a long curved valley. If the values end improbably far from the stated ones, they keep those until the
-    whole recording is followed.
-    """
-    model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, *terms], nominal.model.mains)
-    start = stated_values(model, model.map_parameters_from(nominal.model, nominal.x))
-    fit = fit_growing(likelihood, model, start, first)
-    if nominal_values_are_improbable(fit):
-        fit = fit_model(likelihood, model, _fit_with_stated_values(likelihood, model, start, first).x)
-    return fit
-
-
-def _fit_with_stated_values(likelihood: Likelihood, model: Model, start: Array, first: float) -> Fit:
-    """The fit over growing windows whose nominal values keep those of ``start``."""
-    stated = [i for i, parameter in enumerate(model.parameters) if parameter.kind == "nominal"]
-    return fit_growing(likelihood, model, start, first, fixed=stated)
 
 
 def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected | None:
@@ -269,15 +256,6 @@ def _choose_discrepancy(
     return _Selected(likelihood, before, best) if evidence_gain(likelihood, before, best) else None
 
 
-def _nonlinear_starts(likelihood: Likelihood, base: Fit, pool: Sequence[Candidate]) -> list[ScoreTest]:
-    """Starts of laws that are linear in no amplitude beside those of a fit, the largest predicted gain first."""
-    present = {candidate.key for candidate in base.model.candidates}
-    others = [candidate for candidate in pool if not is_linear(candidate) and candidate.key not in present]
-    scores = [score for starts in score_candidate_starts(likelihood, base, others) for score in starts]
-    promising = [score for score in scores if score.predicted_gain > DETECTION_THRESHOLD]
-    return sorted(promising, key=lambda score: -score.predicted_gain)[:MAX_NONLINEAR_STARTS]
-
-
 def _with_nonlinear_term(
     selected: _Selected, nominal: Fit, pool: Sequence[Candidate], first: float, progress: Progress
 ) -> _Selected:
@@ -296,7 +274,11 @@ def _with_nonlinear_term(
     if uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates)):
         takes_bulk = misfit(selected.fit) < MAX_REMAINDER_RATIO * misfit(selected.nominal)
         bases = [selected.fit] if takes_bulk else [selected.nominal, selected.fit]
-    scored = [(base, score) for base in bases for score in _nonlinear_starts(selected.likelihood, base, pool)]
+    scored = [
+        (base, score)
+        for base in bases
+        for score in nonlinear_starts(selected.likelihood, base, pool)[:MAX_NONLINEAR_STARTS]
+    ]
     starts = [(s.model, damped_start(selected.likelihood, base, s.model, s.x, s.step)) for base, s in scored]
     fitted = fit_models(selected.likelihood, starts, abort_above=misfit(selected.fit))
     fits = zip((base for base, _ in scored), fitted, strict=True)
@@ -306,19 +288,30 @@ def _with_nonlinear_term(
         return selected
     converged = fit_to_convergence(selected.likelihood, best.model, best.x)
     best = min(converged, fit_growing(selected.likelihood, best.model, converged.x, first), key=misfit)
+    return _choose_beside(selected.likelihood, base, best, nominal, pool, progress) or selected
+
+
+def _choose_beside(
+    likelihood: Likelihood, base: Fit, with_law: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress
+) -> _Selected | None:
+    """A law that is linear in no amplitude and named laws beside it; None where corrections do not need it.
+
+    Args:
+        base, with_law: fits without and with it.
+    """
     discrepancies = list(filter(is_discrepancy, pool))
-    without, beside = (linear_model(selected.likelihood, fit, discrepancies) for fit in (base, best))
+    without, beside = (linear_model(likelihood, fit, discrepancies) for fit in (base, with_law))
     laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
-    need = need_of_laws(beside, laws, misfit(base) - misfit(best), alone)
+    need = need_of_laws(beside, laws, misfit(base) - misfit(with_law), alone)
     if not need.possible:
-        return selected
-    progress(f"laws beside {best.model.candidates[-1].key}")
-    with_laws = _choose_laws(best, nominal, pool, progress)
+        return None
+    progress(f"laws beside {with_law.model.candidates[-1].key}")
+    with_laws = _choose_laws(with_law, nominal, pool, progress)
     if with_laws is not None:
         return with_laws
-    likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
+    likelihood = Likelihood(with_law.model.runs, estimate_whiteners(with_law.model, with_law.x))
     before = fit_model(likelihood, nominal.model, nominal.x)
-    fit, removed = drop_redundant(likelihood, fit_model(likelihood, best.model, best.x))
+    fit, removed = drop_redundant(likelihood, fit_model(likelihood, with_law.model, with_law.x))
     return _Selected(likelihood, before, fit, removed, remaining=need.remaining, certain=need.certain)
 
 

@@ -15,10 +15,7 @@ from estimation.diagnosis.linearisation import linear_model_of_corrections
 from estimation.diagnosis.localisation import chi2_reduction_by_channel
 from estimation.diagnosis.screening import ScoreTest
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.significance import DETECTION_THRESHOLD
-
-MAX_HELD_OUT_CHI2 = 1.3
-"""Held-out reduced chi-square above which a part of the misfit is reported as unexplained."""
+from estimation.diagnosis.significance import DETECTION_THRESHOLD, residual_is_noise
 
 MAX_UNEXPLAINED_SHARE = 0.1
 """Largest residual, without the noise and as a share of a channel's standard deviation, of a fit that is called
@@ -81,11 +78,6 @@ def leaves_noise_alone(result: SelectionResult) -> bool:
     """Whether the residual of the final fit is called noise and no free correction beside named laws is detected."""
     is_detected = bool(result.steps) and result.remaining > DETECTION_THRESHOLD
     return residual_is_noise(result.final) and not is_detected
-
-
-def residual_is_noise(fit: Fit) -> bool:
-    """Whether the residual of a fit is called noise."""
-    return fit.validation_chi2 < MAX_HELD_OUT_CHI2
 
 
 def find_corrections(result: SelectionResult) -> LinearModel | None:

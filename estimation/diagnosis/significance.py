@@ -13,6 +13,9 @@ UNIQUE_NAME_THRESHOLD = 6.0
 """Difference in -2 log evidence from which a term is reported as the only explanation: a factor of 20 in probability.
 Within it, the next candidate is reported as a rival."""
 
+MAX_HELD_OUT_CHI2 = 1.3
+"""Held-out reduced chi-square above which a part of the misfit is reported as unexplained."""
+
 
 def satisfies_sign_constraints(fit: Fit) -> bool:
     """Whether every parameter of the terms has a physically possible sign."""
@@ -32,3 +35,8 @@ def evidence_gain(likelihood: Likelihood, before: Fit, after: Fit) -> float:
     gain = before.neg2_log_evidence - after.neg2_log_evidence
     gain += steeper_noise_gain(likelihood, after) - steeper_noise_gain(likelihood, before)
     return gain if gain >= DETECTION_THRESHOLD else 0.0
+
+
+def residual_is_noise(fit: Fit) -> bool:
+    """Whether the residual of a fit is called noise."""
+    return fit.validation_chi2 < MAX_HELD_OUT_CHI2
