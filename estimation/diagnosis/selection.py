@@ -31,10 +31,7 @@ from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
 from estimation.diagnosis.necessity import MAX_REMAINDER_RATIO, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
-from estimation.diagnosis.screening import (
-    all_candidates,
-    damped_start,
-)
+from estimation.diagnosis.screening import all_candidates, damped_start
 from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
 from scanner.device import Device
 from scanner.terms import Term
@@ -200,7 +197,9 @@ def _choose_from_stated_values(
         progress("stated values, with laws that are linear in no amplitude")
         nonlinear = fit_nonlinear_law(likelihood, nominal, pool, stops)
         if nonlinear is not None:
-            return _choose_beside(likelihood, nominal, nonlinear, nominal, pool, progress)
+            selected = _choose_beside_nonlinear_term(likelihood, nominal, nonlinear, nominal, pool, progress)
+            if selected is not None and _is_answer(selected):
+                return selected
     base = min(fits, key=lambda fit: fit.neg2_log_evidence)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, base)
     follows = residual_ratio(likelihood, base) < MAX_RESIDUAL_RATIO
@@ -212,8 +211,12 @@ def _choose_from_stated_values(
         fit = selected.fit
         kept = fit_with_stated_values(likelihood, fit.model, stated_values(fit.model, fit.x), stops[0])
         selected = _choose_laws(kept, nominal, pool, progress)
-    is_answer = selected is not None and selected.certain and not nominal_values_are_improbable(selected.fit)
-    return selected if is_answer else None
+    return selected if selected is not None and _is_answer(selected) else None
+
+
+def _is_answer(selected: _Selected) -> bool:
+    """Whether selected laws are the answer and have left the nominal values probable."""
+    return selected.certain and not nominal_values_are_improbable(selected.fit)
 
 
 def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected | None:
@@ -288,10 +291,10 @@ def _with_nonlinear_term(
         return selected
     converged = fit_to_convergence(selected.likelihood, best.model, best.x)
     best = min(converged, fit_growing(selected.likelihood, best.model, converged.x, first), key=misfit)
-    return _choose_beside(selected.likelihood, base, best, nominal, pool, progress) or selected
+    return _choose_beside_nonlinear_term(selected.likelihood, base, best, nominal, pool, progress) or selected
 
 
-def _choose_beside(
+def _choose_beside_nonlinear_term(
     likelihood: Likelihood, base: Fit, with_law: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress
 ) -> _Selected | None:
     """A law that is linear in no amplitude and named laws beside it; None where corrections do not need it.
