@@ -9,7 +9,7 @@ from scipy.ndimage import percentile_filter
 
 from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.model import Model
-from estimation.device_fit.noise import near_lines, noise_psd, periodogram
+from estimation.device_fit.noise import MEDIAN_TO_MEAN_POWER, near_lines, noise_psd, periodogram
 from scanner.arrays import Array
 
 LINE_DETECTION_RATIO = 30.0
@@ -25,7 +25,8 @@ MIN_LINES_OF_BROAD_DRIVE = 50
 among the lines of the drive, as a line that exceeds its neighbours in the residual."""
 
 NEIGHBOUR_BINS = 64
-"""Bins on either side of a line among those of a broad drive, whose 90 % quantile is the level it is compared with."""
+"""Bins on either side of a line that it has to exceed. Their median tells it from a resonance of an amplifier, which is
+narrower than a band of the noise spectrum; among the lines of a broad drive it is their 90 % quantile."""
 
 
 def strongest_interfering_line(fit: Fit) -> float | None:
@@ -54,7 +55,9 @@ def strongest_interfering_line(fit: Fit) -> float | None:
             motion = run.scales[output.axes[0]].rate / (2 * np.pi)
             lines = [*(motion * np.arange(1, MOTION_HARMONICS + 1)), *run.lines[output.axes[0]]]
             width = max(0.06 * motion, 4.0 / duration) if run.lines[output.axes[0]].size < 200 else 4.0 / duration
-            ratio = power / noise_psd(residual, power.size, output.step, lines, width)[0]
+            noise = noise_psd(residual, power.size, output.step, lines, width)[0]
+            around = percentile_filter(power, 50, 2 * NEIGHBOUR_BINS + 1) / MEDIAN_TO_MEAN_POWER
+            ratio = power / np.maximum(noise, around)
             ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0
             off_lines = max(off_lines, _strongest(ratio, power, duration))
             if run.lines[output.axes[0]].size > MIN_LINES_OF_BROAD_DRIVE:

@@ -19,7 +19,6 @@ from estimation.device_fit.initial import (
     flat_whiteners,
     window_schedule,
 )
-from estimation.device_fit.interference import strongest_interfering_line
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, make_whitener, noise_psd
 from estimation.device_fit.parameters import Candidate
@@ -34,7 +33,7 @@ from scanner.arrays import Array
 from scanner.device import Device
 from scanner.recording import Recording
 from scanner.terms import catalogue
-from tests.support.bench import DEVICE, RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES, STIFFNESS, bench_recording, bench_signals
+from tests.support.bench import DEVICE, RESONANCE_HZ, SAMPLES, STIFFNESS, bench_recording, bench_signals
 
 
 @pytest.mark.slow
@@ -229,29 +228,6 @@ def test_a_pair_of_laws_is_selected_around_a_discrepancy() -> None:
     pool = all_candidates(DEVICE, nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
     linear = linear_model(likelihood, free_fit, [c for c in pool if not c.channel.startswith("angle")])
     assert linear.effects(linear.select().laws) == {("x", "cubic-stiffness"), ("x", "gain-drift")}
-
-
-def test_a_foreign_tone_among_the_lines_of_a_multisine_is_detected() -> None:
-    """A multisine of many lines leaves few bins free, and the tone is one line next to a line of the drive."""
-    rng = np.random.default_rng(7)
-    time, lines = np.arange(SAMPLES) / SAMPLE_RATE_HZ, 20.0 + 15.0 * np.arange(80)
-    drive = 0.3 * np.sin(2 * np.pi * np.multiply.outer(time, lines) + rng.uniform(0, 2 * np.pi, 80)).sum(-1)
-    channels = {
-        "drive_x": (drive, "V", SAMPLE_RATE_HZ, 0.0),
-        "sense_x": (rng.normal(0, 2e-3, SAMPLES), "V", SAMPLE_RATE_HZ, 0.0),
-    }
-    run = prepare_run(Recording.from_arrays(channels, device=DEVICE, name="tone"), DEVICE)
-    model = Model([run], DEVICE)
-    moved = model.outputs(np.zeros(len(model.parameters)))[0][0]
-    wave = np.cos(2 * np.pi * 336.0 * run.outputs[0].step * np.arange(moved.size))
-    for tone, detected in ((0.0, False), (5e-3, True)):
-        data = moved + rng.normal(0, 2e-3, moved.size) + tone * wave
-        disturbed = Model([replace(run, outputs=(replace(run.outputs[0], data=data),))], DEVICE)
-        likelihood = Likelihood(disturbed.runs, flat_whiteners(disturbed))
-        line = strongest_interfering_line(
-            fit_model(likelihood, disturbed, np.zeros(len(disturbed.parameters)), max_iterations=1)
-        )
-        assert (line is not None and abs(line - 336.0) < 3.0) == detected
 
 
 @pytest.mark.parametrize("seconds", [0.005, 0.02, 0.3])  # 3e5 samples are more than the line search uses
