@@ -4,10 +4,11 @@ Terms that are equivalent to other nominal values or to a corrected recording ar
 (``estimation.term_absorption``). Every other law depends on the unknown motion, so it is compensated iteratively: the
 motion estimated so far is passed through ``scanner.forward_model`` with and without the terms, the difference is
 subtracted from the measured channels, and the motion is estimated again. A torque enters as its equivalent stiffness
-and damping at the motion's amplitude and by the harmonics that it adds (``estimation.describing_function``). Thus every
-estimator handles every term by its single definition in the term's file, and the equations of the estimators are the
-nominal ones. An estimator that treats clipped samples itself gets them as such, without a correction of the clipping,
-which would be the motion estimated so far in their place.
+and damping at the motion's amplitude and by the harmonics that it adds (``estimation.describing_function``). A mode
+that grows from its hidden states has no steady torque at an amplitude: an estimator follows what it does to the motion
+as changes of stiffness and damping. Thus every estimator handles every term by its single definition in the term's
+file, and the equations of the estimators are the nominal ones. An estimator that treats clipped samples itself gets
+them as such, without a correction of the clipping, which would be the motion estimated so far in their place.
 """
 
 from __future__ import annotations
@@ -89,7 +90,9 @@ def estimate_with_terms(
     bare = absorb_constants(device, stated)
     absorbed = with_drives(with_clocks(recording, stated), device, stated)
     remaining: Terms = {
-        name: tuple(remaining_term(active, bare.sensed_axis(name)) for active in axis_terms)
+        name: tuple(
+            remaining_term(active, bare.sensed_axis(name)) for active in axis_terms if not active.term.initial_seeds
+        )
         for name, axis_terms in stated.items()
     }
     if treats_clipping:

@@ -45,6 +45,15 @@ CONVERGENCE_RATIO = 0.5
 MAX_PHASE_ERROR_PX = 0.1
 """Displacement by the phase's standard deviation, at the middle of a line, up to which an axis is not refined."""
 
+MIN_RELATIVE_AMPLITUDE = 0.5
+"""Amplitude of the middle block of a slice, relative to the root mean square of the slice, below which no phase is
+measured. The picture shows the mean error with the squared amplitude as weight, to which such a block adds little; and
+where an amplitude vanishes, the phase can turn by half a cycle within the slice."""
+
+MAX_DISAGREEMENT_SIGMA = 3.0
+"""Disagreement of the motion from drive and picture with the sensed one from which its device is wrong, for example by
+a coupled mode, and its standard deviations are."""
+
 Smoother = Callable[[Recording, Device, Mapping[str, PhaseMeasurement]], Motion]
 """Computes the motion from a recording, its device and the measured phases of each axis."""
 
@@ -84,10 +93,10 @@ def refine_motion(
             start = _smooth(recording, device, track_drive_only, response.phases, flips)
             motion = replace(motion, axes={**motion.axes, **{name: start.axes[name] for name in response.phases}})
     pixels = {"x": grid.width / 2, "y": grid.height / 2}
-    refined = [name for name in AXES if _rms(motion.axes[name].phase_sd) * pixels[name] > MAX_PHASE_ERROR_PX]
+    refined = [name for name in AXES if rms_phase_sd(motion.axes[name]) * pixels[name] > MAX_PHASE_ERROR_PX]
     if not refined or not _smoothers(motion.estimator):
         return motion, response_notes
-    initial_sd = {name: _rms(motion.axes[name].phase_sd) for name in refined}
+    sensed = motion
     rounds, ended = 0, False
     smoothed_with: dict[str, str] = {}
     phases: dict[str, PhaseMeasurement] = {}
@@ -100,7 +109,7 @@ def refine_motion(
         # The first round compares each slice with a picture of its own.
         phases = {name: keep_determined(phases[name], found[name]) for name in refined} if rounds > 1 else found
         smoothed = _smooth_each_way(recording, device, motion.estimator, phases, flips)
-        ways = {name: _better_smoother(smoothed, name, initial_sd[name]) for name in refined}
+        ways = {name: _better_smoother(smoothed, name, sensed.axes[name]) for name in refined}
         axes = {name: smoothed[ways[name]].axes[name] for name in refined}
         improved = replace(motion, axes={**motion.axes, **axes})
         ended, chosen = end_of_rounds(before, motion, improved, refined)
@@ -187,6 +196,9 @@ def _measured_phase(errors: list[PhaseError], axis: AxisMotion, name: str, flipp
     )
     value, sd = np.array([getattr(error, name) for error in errors]).T
     phase = axis.phase[nearest] - (np.pi if flipped else 0.0)  # smoothing happens before the user's flips
+    slices = np.argmin(np.abs(axis.time[:, None] - axis.time[nearest]), axis=1)
+    power = np.bincount(slices, axis.amplitude**2, nearest.size) / np.bincount(slices, minlength=nearest.size).clip(1)
+    sd = np.where(axis.amplitude[nearest] < MIN_RELATIVE_AMPLITUDE * np.sqrt(power), np.inf, sd)
     return PhaseMeasurement(axis.time[nearest], phase + value, sd)
 
 
@@ -212,15 +224,38 @@ def end_of_rounds(before: Motion, motion: Motion, improved: Motion, names: Seque
         return True, improved
     if before is motion or not all(_has_converged(before.axes[name], improved.axes[name]) for name in names):
         return False, improved
-    variances = [sum(_rms(each.axes[name].phase_sd) ** 2 for name in names) for each in (motion, improved)]
+    variances = [sum(rms_phase_sd(each.axes[name]) ** 2 for name in names) for each in (motion, improved)]
     return True, motion if variances[0] < variances[1] else improved
 
 
-def _better_smoother(smoothed: Mapping[str, Motion], name: str, initial_sd: float) -> str:
-    """The smoother for an axis whose phase the sense signal alone gives with ``initial_sd`` [rad]."""
-    if "picture" in smoothed and _rms(smoothed["picture"].axes[name].phase_sd) < initial_sd:
+def _better_smoother(smoothed: Mapping[str, Motion], name: str, sensed: AxisMotion) -> str:
+    """The smoother for an axis: without the sense signal only if that is more precise and agrees with the signal.
+
+    Args:
+        sensed: the axis as the sense signal alone gives it.
+    """
+    if "tracker" not in smoothed:
         return "picture"
-    return "tracker" if "tracker" in smoothed else "picture"
+    if "picture" not in smoothed:
+        return "tracker"
+    driven = smoothed["picture"].axes[name]
+    more_precise = rms_phase_sd(driven) < rms_phase_sd(sensed)
+    return "picture" if more_precise and _disagreement(driven, sensed) < MAX_DISAGREEMENT_SIGMA else "tracker"
+
+
+def _disagreement(axis: AxisMotion, other: AxisMotion) -> float:
+    """Root mean square difference of two phases, whatever their signs, in standard deviations of the difference."""
+    phase, sd = (np.interp(axis.time, other.time, values) for values in (other.phase, other.phase_sd))
+    difference = 0.5 * np.angle(np.exp(2j * (axis.phase - phase)))
+    return _rms(difference / np.hypot(axis.phase_sd, sd))
+
+
+def rms_phase_sd(axis: AxisMotion) -> float:
+    """Root mean square of the phase's standard deviation, weighted with the squared amplitude [rad].
+
+    An error of the phase moves a sample in proportion to the amplitude: where the mirror nearly rests it moves none.
+    """
+    return _rms(axis.phase_sd * axis.amplitude) / _rms(axis.amplitude)
 
 
 def _rms(values: Array) -> float:
