@@ -93,7 +93,7 @@ def refine_motion(
             start = _smooth(recording, device, track_drive_only, response.phases, flips)
             motion = replace(motion, axes={**motion.axes, **{name: start.axes[name] for name in response.phases}})
     pixels = {"x": grid.width / 2, "y": grid.height / 2}
-    refined = [name for name in AXES if rms_phase_sd(motion.axes[name]) * pixels[name] > MAX_PHASE_ERROR_PX]
+    refined = [name for name in AXES if _rms_phase_sd(motion.axes[name]) * pixels[name] > MAX_PHASE_ERROR_PX]
     if not refined or not _smoothers(motion.estimator):
         return motion, response_notes
     sensed = motion
@@ -196,7 +196,7 @@ def _measured_phase(errors: list[PhaseError], axis: AxisMotion, name: str, flipp
     )
     value, sd = np.array([getattr(error, name) for error in errors]).T
     phase = axis.phase[nearest] - (np.pi if flipped else 0.0)  # smoothing happens before the user's flips
-    slices = np.argmin(np.abs(axis.time[:, None] - axis.time[nearest]), axis=1)
+    slices = np.searchsorted(0.5 * (axis.time[nearest][1:] + axis.time[nearest][:-1]), axis.time)
     power = np.bincount(slices, axis.amplitude**2, nearest.size) / np.bincount(slices, minlength=nearest.size).clip(1)
     sd = np.where(axis.amplitude[nearest] < MIN_RELATIVE_AMPLITUDE * np.sqrt(power), np.inf, sd)
     return PhaseMeasurement(axis.time[nearest], phase + value, sd)
@@ -224,7 +224,7 @@ def end_of_rounds(before: Motion, motion: Motion, improved: Motion, names: Seque
         return True, improved
     if before is motion or not all(_has_converged(before.axes[name], improved.axes[name]) for name in names):
         return False, improved
-    variances = [sum(rms_phase_sd(each.axes[name]) ** 2 for name in names) for each in (motion, improved)]
+    variances = [sum(_rms_phase_sd(each.axes[name]) ** 2 for name in names) for each in (motion, improved)]
     return True, motion if variances[0] < variances[1] else improved
 
 
@@ -239,7 +239,7 @@ def _better_smoother(smoothed: Mapping[str, Motion], name: str, sensed: AxisMoti
     if "picture" not in smoothed:
         return "tracker"
     driven = smoothed["picture"].axes[name]
-    more_precise = rms_phase_sd(driven) < rms_phase_sd(sensed)
+    more_precise = _rms_phase_sd(driven) < _rms_phase_sd(sensed)
     return "picture" if more_precise and _disagreement(driven, sensed) < MAX_DISAGREEMENT_SIGMA else "tracker"
 
 
@@ -250,7 +250,7 @@ def _disagreement(axis: AxisMotion, other: AxisMotion) -> float:
     return _rms(difference / np.hypot(axis.phase_sd, sd))
 
 
-def rms_phase_sd(axis: AxisMotion) -> float:
+def _rms_phase_sd(axis: AxisMotion) -> float:
     """Root mean square of the phase's standard deviation, weighted with the squared amplitude [rad].
 
     An error of the phase moves a sample in proportion to the amplitude: where the mirror nearly rests it moves none.

@@ -29,6 +29,9 @@ in the wrong direction at 0.13 and below."""
 PIXELS_PER_DETAIL = 25
 """Pixels that deviate together: a detail of the specimen and an error of the phase reach over some pixels each way."""
 
+LISTED_TIMES = 3
+"""Times that a note lists."""
+
 MIN_EVIDENCE = 25.0
 """Twice the log likelihood ratio of the two signs from which the picture decides: five standard deviations."""
 
@@ -46,7 +49,7 @@ def follow_signs(
         origin: start of the recording [s].
 
     Returns:
-        The motion, and a line for every such time after which the sign was changed or is not determined.
+        The motion, and a line on the times after which a sign was changed, and on those after which it is unknown.
     """
     notes = []
     for name, axis in motion.axes.items():
@@ -54,20 +57,30 @@ def follow_signs(
         inner = [round((time - intensity.start) * intensity.sample_rate) for time in rests]
         edges = np.clip([0, *inner, intensity.size], 0, intensity.size).tolist()
         lead, sign = np.zeros(axis.time.size), 1
+        changed, unknown = list[float](), list[float]()
         evidences = _evidence_of_signs(motion, device, intensity, grid, origin, edges, name)
         for time, evidence in zip(rests, evidences, strict=True):
-            found = int(np.sign(evidence)) if abs(evidence) > MIN_EVIDENCE else sign
-            lead[axis.time >= time] += 0.5 * np.pi * (found - sign)
+            found = sign
             if abs(evidence) < MIN_EVIDENCE:
-                notes.append(f"{name} nearly rests at {time:.4g} s: the picture does not show its sign after that")
-            elif found != sign:
-                notes.append(
-                    f"{name} nearly rests at {time:.4g} s: its sign after that was changed, as the picture shows"
-                )
+                unknown.append(time)
+            elif np.sign(evidence) != sign:
+                found = -sign
+                changed.append(time)
+            lead[axis.time >= time] += 0.5 * np.pi * (found - sign)
             sign = found
+        if changed:
+            notes.append(f"{name} nearly rests {_at(changed)}: its sign after that was changed, as the picture shows")
+        if unknown:
+            notes.append(f"{name} nearly rests {_at(unknown)}: the picture does not show its sign after that")
         if lead.any():
             motion = replace(motion, axes={**motion.axes, name: axis.advanced(lead)})
     return motion, notes
+
+
+def _at(times: Sequence[float]) -> str:
+    """The first times of a list, and how many more there are."""
+    more = f" and {len(times) - LISTED_TIMES} more times" if len(times) > LISTED_TIMES else ""
+    return "at " + ", ".join(f"{time:.4g} s" for time in times[:LISTED_TIMES]) + more
 
 
 def find_rests(axis: AxisMotion) -> list[float]:
