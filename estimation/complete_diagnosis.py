@@ -16,8 +16,10 @@ from estimation.diagnosis.undriven import steady_without_drive
 from estimation.slow.diagnose import diagnose_decays, slow_decays
 from estimation.slow.diagnose_response import diagnose_responses
 from estimation.slow.response import frequency_responses
+from scanner.channel import Channel
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
+from scanner.motion import Motion
 from scanner.recording import Recording
 from scanner.terms import catalogue
 
@@ -33,12 +35,16 @@ DETECTORS = {"sensor": "angle", "edges": "sync"}
 MeasureReference = Callable[[Recording, Device], "ReferencePhase | None"]
 """Measures the phase errors of the motion independently of the readout; None if the recording does not allow it."""
 
+FollowSigns = Callable[[Motion, Device, Channel, float], tuple[Motion, list[str]]]
+"""Makes the signs of a motion the same before and after a rest, by the intensity of a recording with a given start."""
+
 
 def diagnose_with_optics(
     recordings: Sequence[Recording],
     device: Device | None = None,
     progress: Progress = lambda text: None,
     measure_reference: MeasureReference = lambda recording, device: None,
+    follow_signs: FollowSigns = lambda motion, device, intensity, origin: (motion, []),
 ) -> Diagnosis:
     """Diagnose drive, mechanics and readout of all recordings together, then each that has an intensity by its picture.
 
@@ -54,6 +60,7 @@ def diagnose_with_optics(
         device: the nominal one; None takes that of the first recording.
         progress: called with one line of text at every step.
         measure_reference: measures the phase by the picture.
+        follow_signs: follows the signs of the motion by the picture.
 
     Raises:
         BadInput: no device, or a recording that cannot be compared with it.
@@ -62,7 +69,7 @@ def diagnose_with_optics(
     diagnosis = _diagnose_motion(recordings, nominal, progress)
     pictures = [each for each in recordings if "intensity" in each and set(nominal.axes) == set(AXES)]
     try:
-        return _diagnose_pictures(recordings, pictures, nominal, diagnosis, measure_reference, progress)
+        return _diagnose_pictures(recordings, pictures, nominal, diagnosis, measure_reference, follow_signs, progress)
     except BadInput as error:
         if diagnosis.untested:
             raise
@@ -75,6 +82,7 @@ def _diagnose_pictures(
     nominal: Device,
     diagnosis: Diagnosis,
     measure_reference: MeasureReference,
+    follow_signs: FollowSigns,
     progress: Progress,
 ) -> Diagnosis:
     """The diagnosis with what the pictures show of the readout and the optics."""
@@ -88,7 +96,7 @@ def _diagnose_pictures(
         diagnosis = replace(again, verdict="mismatch", findings=(*findings, *again.findings), open_loop=open_loop)
     for recording in pictures:
         progress(f"optics of {recording.name}")
-        diagnosis = add_optics(diagnosis, recording)
+        diagnosis = add_optics(diagnosis, recording, follow_signs)
     return diagnosis
 
 
@@ -185,7 +193,7 @@ def _sense_evidence(diagnosis: Diagnosis) -> Callable[[Device], float]:
     return evidence
 
 
-def add_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:
+def add_optics(diagnosis: Diagnosis, recording: Recording, follow_signs: FollowSigns) -> Diagnosis:
     """Return the diagnosis with the optical effects that the picture of one recording shows.
 
     The motion is estimated with the improved device of ``diagnosis``, so that its terms are not diagnosed again.
@@ -196,7 +204,8 @@ def add_optics(diagnosis: Diagnosis, recording: Recording) -> Diagnosis:
 
     device = diagnosis.device
     corrected = correct_intensity(recording, device)
-    motion = beam_motion(estimate(corrected, device), device, corrected.start)
+    motion, _ = follow_signs(estimate(corrected, device), device, corrected["intensity"], corrected.start)
+    motion = beam_motion(motion, device, corrected.start)
     kind, recorded = DETECTORS.get(motion.estimator), {*recording.channels, *recording.edges}
     detectors = {axis: f"{kind}_{axis}" for axis in AXES if f"{kind}_{axis}" in recorded} if kind else {}
     optics = diagnose_optics(motion, corrected["intensity"], device, detectors)

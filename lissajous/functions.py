@@ -192,10 +192,11 @@ def diagnose(
     """
     from estimation.complete_diagnosis import diagnose_with_optics
     from recon.reference_phase import measure_reference_phase
+    from recon.sign_after_rest import follow_signs
 
     opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
     nominal = None if device is None else load_device(device)
-    return diagnose_with_optics(opened, nominal, progress, measure_reference_phase)
+    return diagnose_with_optics(opened, nominal, progress, measure_reference_phase, follow_signs)
 
 
 def identify(

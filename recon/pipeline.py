@@ -25,7 +25,6 @@ from recon.imaging.picture_estimate import estimate_picture
 from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
-from recon.imaging.sign_after_rest import follow_signs
 from recon.notes import (
     describe_clock_jumps,
     describe_coarse_sampling,
@@ -47,6 +46,7 @@ from recon.quality.structure import describe_unstructured
 from recon.reconstruction import Options, Reconstruction
 from recon.registration_segments import registration_segments
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
+from recon.sign_after_rest import follow_signs
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
@@ -140,7 +140,7 @@ def estimate_motion(
     grid, _ = _picture_grid(device, motion, options)
     check_units(grid, motion)
     motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)
-    motion, sign_notes = follow_signs(motion, device, prepared.intensity, grid, recording.start)
+    motion, sign_notes = follow_signs(motion, device, prepared.intensity, recording.start)
     grid, field_notes = _picture_grid(device, motion, options)
     notes = [*notes, *sign_notes, *motion.notes, *describe_unconfirmed_signs(recording, device, motion)]
     return EstimatedMotion(prepared, motion, grid, field_notes, notes)

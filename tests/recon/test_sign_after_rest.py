@@ -9,8 +9,7 @@ import pytest
 from skimage import data
 from skimage.transform import resize
 
-from recon.imaging.picture import Grid
-from recon.imaging.sign_after_rest import find_rests, follow_signs
+from recon.sign_after_rest import find_rests, follow_signs
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
@@ -19,7 +18,6 @@ from tests.support.two_axis_scan import EDGES
 
 RATE, DURATION, REST = 1e6, 0.04, 0.017
 DEVICE = Device.from_toml(EDGES)
-GRID = Grid(128, 128, 0.2, 0.2)
 TIME = np.arange(int(RATE * DURATION)) / RATE
 
 
@@ -55,7 +53,7 @@ def scan(name: str, photons: float = 100.0, structured: bool = True) -> tuple[Mo
 @pytest.mark.parametrize(("name", "photons"), [("x", 100.0), ("y", 100.0), ("x", 3.0)])
 def test_a_sign_that_the_noise_chose_is_corrected_by_the_picture(name: str, photons: float) -> None:
     true, wrong, intensity = scan(name, photons)
-    found, notes = follow_signs(wrong, DEVICE, intensity, GRID, 0.0)
+    found, notes = follow_signs(wrong, DEVICE, intensity, 0.0)
     assert [note.split(":")[0] for note in notes] == [f"{name} nearly rests at 0.017 s"]
     assert "was changed" in notes[0]
     error = found.axes[name].angle.read() - true.axes[name].angle.read()
@@ -65,18 +63,18 @@ def test_a_sign_that_the_noise_chose_is_corrected_by_the_picture(name: str, phot
 
 def test_a_right_sign_is_kept_without_a_note() -> None:
     true, _, intensity = scan("x")
-    assert follow_signs(true, DEVICE, intensity, GRID, 0.0) == (true, [])
+    assert follow_signs(true, DEVICE, intensity, 0.0) == (true, [])
 
 
 def test_a_known_sign_is_not_questioned() -> None:
     _, wrong, intensity = scan("x")
     known = replace(wrong, axes={**wrong.axes, "x": replace(wrong.axes["x"], sign="known: sync edges")})
-    assert follow_signs(known, DEVICE, intensity, GRID, 0.0) == (known, [])
+    assert follow_signs(known, DEVICE, intensity, 0.0) == (known, [])
 
 
 def test_a_specimen_without_structure_shows_no_sign() -> None:
     _, wrong, intensity = scan("x", structured=False)
-    found, notes = follow_signs(wrong, DEVICE, intensity, GRID, 0.0)
+    found, notes = follow_signs(wrong, DEVICE, intensity, 0.0)
     assert found is wrong
     assert notes == ["x nearly rests at 0.017 s: the picture does not show its sign after that"]
 

@@ -15,16 +15,20 @@ import numpy as np
 from scipy.ndimage import label
 
 from estimation.optics.correction import beam_motion
+from recon.field_check import own_half_angle
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid, Picture
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.device import Device
+from scanner.device import AXES, Device
 from scanner.motion import AxisMotion, Motion
 
 REST_AMPLITUDE = 0.25
 """Amplitude over its root mean square below which an axis nearly rests. In scans with a coupled mode the phase turned
 in the wrong direction at 0.13 and below."""
+
+PIXELS = 200
+"""Pixels of the compared pictures in either direction: half of a usual picture, so that sparse parts meet."""
 
 PIXELS_PER_DETAIL = 25
 """Pixels that deviate together: a detail of the specimen and an error of the phase reach over some pixels each way."""
@@ -36,16 +40,13 @@ MIN_EVIDENCE = 25.0
 """Twice the log likelihood ratio of the two signs from which the picture decides: five standard deviations."""
 
 
-def follow_signs(
-    motion: Motion, device: Device, intensity: Channel, grid: Grid, origin: float
-) -> tuple[Motion, list[str]]:
+def follow_signs(motion: Motion, device: Device, intensity: Channel, origin: float) -> tuple[Motion, list[str]]:
     """The motion with the same sign before and after every time at which an axis nearly rests.
 
     Args:
         motion: of the mirror; only axes with an ambiguous sign are changed.
         device: with the terms of its optics.
         intensity: shape (n,) or (n, detectors).
-        grid: the pixels.
         origin: start of the recording [s].
 
     Returns:
@@ -58,7 +59,7 @@ def follow_signs(
         edges = np.clip([0, *inner, intensity.size], 0, intensity.size).tolist()
         lead, sign = np.zeros(axis.time.size), 1
         changed, unknown = list[float](), list[float]()
-        evidences = _evidence_of_signs(motion, device, intensity, grid, origin, edges, name)
+        evidences = _evidence_of_signs(motion, device, intensity, origin, edges, name)
         for time, evidence in zip(rests, evidences, strict=True):
             found = sign
             if abs(evidence) < MIN_EVIDENCE:
@@ -93,7 +94,7 @@ def find_rests(axis: AxisMotion) -> list[float]:
 
 
 def _evidence_of_signs(
-    motion: Motion, device: Device, intensity: Channel, grid: Grid, origin: float, edges: Sequence[int], name: str
+    motion: Motion, device: Device, intensity: Channel, origin: float, edges: Sequence[int], name: str
 ) -> Iterator[float]:
     """Twice the log likelihood ratio of the sign of each later part of a scan: positive where it is that of the first.
 
@@ -106,11 +107,12 @@ def _evidence_of_signs(
     if len(edges) < 3:
         return
     beam = beam_motion(motion, device, origin)
-    parts = [grid_intensity(beam, intensity, grid, [], first, stop) for first, stop in pairwise(edges)]
+    half_x, half_y = (own_half_angle(motion.axes[axis]) for axis in AXES)
+    grid = Grid(PIXELS, PIXELS, half_x, half_y)
+    parts = (_sums(grid_intensity(beam, intensity, grid, [], first, stop)) for first, stop in pairwise(edges))
     across = 1 if name == "x" else 0
-    total, count = _sums(parts[0])
-    for part in parts[1:]:
-        sums = _sums(part)
+    total, count = next(parts)
+    for sums in parts:
         mirrored = [np.flip(values, across) for values in sums]
         evidence = _misfit(total, count, *mirrored) - _misfit(total, count, *sums)
         more, visits = sums if evidence > 0.0 else mirrored
