@@ -44,7 +44,7 @@ def follow_signs(motion: Motion, device: Device, intensity: Channel, origin: flo
     """The motion with the same sign before and after every time at which an axis nearly rests.
 
     Args:
-        motion: of the mirror; only axes with an ambiguous sign are changed.
+        motion: of the mirror; only axes whose sign is ambiguous, or was chosen by the user, are changed.
         device: with the terms of its optics.
         intensity: shape (n,) or (n, detectors).
         origin: start of the recording [s].
@@ -54,18 +54,16 @@ def follow_signs(motion: Motion, device: Device, intensity: Channel, origin: flo
     """
     notes = []
     for name, axis in motion.axes.items():
-        rests = find_rests(axis) if axis.sign == "ambiguous" else []
+        rests = find_rests(axis) if axis.sign in ("ambiguous", f"known: --flip-{name}") else []
         inner = [round((time - intensity.start) * intensity.sample_rate) for time in rests]
         edges = np.clip([0, *inner, intensity.size], 0, intensity.size).tolist()
         lead, sign = np.zeros(axis.time.size), 1
         changed, unknown = list[float](), list[float]()
-        evidences = _evidence_of_signs(motion, device, intensity, origin, edges, name)
-        for time, evidence in zip(rests, evidences, strict=True):
-            found = sign
-            if abs(evidence) < MIN_EVIDENCE:
+        signs = _signs_of_parts(motion, device, intensity, origin, edges, name)
+        for time, (found, is_determined) in zip(rests, signs, strict=True):
+            if not is_determined:
                 unknown.append(time)
-            elif np.sign(evidence) != sign:
-                found = -sign
+            elif found != sign:
                 changed.append(time)
             lead[axis.time >= time] += 0.5 * np.pi * (found - sign)
             sign = found
@@ -93,12 +91,13 @@ def find_rests(axis: AxisMotion) -> list[float]:
     return [float(axis.time[gap[np.argmin(axis.amplitude[gap])]]) for gap in gaps]
 
 
-def _evidence_of_signs(
+def _signs_of_parts(
     motion: Motion, device: Device, intensity: Channel, origin: float, edges: Sequence[int], name: str
-) -> Iterator[float]:
-    """Twice the log likelihood ratio of the sign of each later part of a scan: positive where it is that of the first.
+) -> Iterator[tuple[int, bool]]:
+    """Sign by which each later part of a scan shows the scene of the first, and whether the picture determines it.
 
-    A part is compared with the picture of all parts before it, each with its more probable sign.
+    A part is compared with the picture of all parts before it. One whose sign is not determined takes that of the part
+    before it.
 
     Args:
         edges: samples at which the parts begin and end.
@@ -111,13 +110,15 @@ def _evidence_of_signs(
     grid = Grid(PIXELS, PIXELS, half_x, half_y)
     parts = (_sums(grid_intensity(beam, intensity, grid, [], first, stop)) for first, stop in pairwise(edges))
     across = 1 if name == "x" else 0
-    total, count = next(parts)
+    (total, count), sign = next(parts), 1
     for sums in parts:
         mirrored = [np.flip(values, across) for values in sums]
         evidence = _misfit(total, count, *mirrored) - _misfit(total, count, *sums)
-        more, visits = sums if evidence > 0.0 else mirrored
+        is_determined = abs(evidence) > MIN_EVIDENCE
+        sign = int(np.sign(evidence)) if is_determined else sign
+        more, visits = sums if sign > 0 else mirrored
         total, count = total + more, count + visits
-        yield evidence
+        yield sign, is_determined
 
 
 def _sums(picture: Picture) -> tuple[Array, Array]:

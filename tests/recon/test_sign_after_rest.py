@@ -17,6 +17,7 @@ from scanner.motion import AxisMotion, Motion, SampledAngle
 from tests.support.two_axis_scan import EDGES
 
 RATE, DURATION, REST = 1e6, 0.04, 0.017
+FREQUENCIES = {"x": 13_800.0, "y": 3_270.0}
 DEVICE = Device.from_toml(EDGES)
 TIME = np.arange(int(RATE * DURATION)) / RATE
 
@@ -36,18 +37,25 @@ def axis_motion(frequency: float, amplitude: Array, sign: str = "ambiguous") -> 
     )
 
 
+def motion_of(name: str, amplitude: Array) -> Motion:
+    """Motion whose axis ``name`` has an amplitude; the other's is constant."""
+    amplitudes = dict.fromkeys("xy", np.full(TIME.size, 0.19)) | {name: amplitude}
+    return Motion({key: axis_motion(FREQUENCIES[key], amplitudes[key]) for key in "xy"}, "tracker")
+
+
+def intensity_along(motion: Motion, photons: float = 100.0, structured: bool = True) -> Channel:
+    """Photon counts along a motion over a picture, or over a specimen that is the same everywhere."""
+    scene = resize(data.camera().astype(float) / 255, (128, 128)) if structured else np.full((128, 128), 0.5)
+    column, row = (np.clip(((motion.axes[key].angle.read() / 0.2 + 1) * 64).astype(int), 0, 127) for key in "xy")
+    counts = np.random.default_rng(3).poisson(photons * scene[row, column])
+    return Channel("intensity", "counts", RATE, 0.0, counts.astype(float), 0, counts.size)
+
+
 def scan(name: str, photons: float = 100.0, structured: bool = True) -> tuple[Motion, Motion, Channel]:
     """True motion, whose axis ``name`` passes rest, the same with the wrong sign after it, and the intensity."""
-    full = np.full(TIME.size, 0.19)
-    through_rest = np.where(TIME < REST, 1.0, -1.0) * 0.19 * np.minimum(1.0, np.abs(TIME - REST) / 4e-3)
-    amplitudes = {"x": full, "y": full} | {name: through_rest}
-    frequencies = {"x": 13_800.0, "y": 3_270.0}
-    true = Motion({key: axis_motion(frequencies[key], amplitudes[key]) for key in "xy"}, "tracker")
-    wrong = replace(true, axes={**true.axes, name: axis_motion(frequencies[name], np.abs(through_rest))})
-    scene = resize(data.camera().astype(float) / 255, (128, 128)) if structured else np.full((128, 128), 0.5)
-    column, row = (np.clip(((true.axes[key].angle.read() / 0.2 + 1) * 64).astype(int), 0, 127) for key in ("x", "y"))
-    counts = np.random.default_rng(3).poisson(photons * scene[row, column])
-    return true, wrong, Channel("intensity", "counts", RATE, 0.0, counts.astype(float), 0, counts.size)
+    amplitude = 0.19 * np.minimum(1.0, np.abs(TIME - REST) / 4e-3)
+    true, wrong = motion_of(name, np.where(TIME < REST, amplitude, -amplitude)), motion_of(name, amplitude)
+    return true, wrong, intensity_along(true, photons, structured)
 
 
 @pytest.mark.parametrize(("name", "photons"), [("x", 100.0), ("y", 100.0), ("x", 3.0)])
@@ -61,9 +69,30 @@ def test_a_sign_that_the_noise_chose_is_corrected_by_the_picture(name: str, phot
     assert np.abs(error[np.abs(TIME - REST) > 1e-3]).max() < 0.05 * 0.19  # half a cycle while the amplitude grows
 
 
+def test_parts_agree_with_each_other_after_a_first_part_that_is_too_short() -> None:
+    """The first millisecond suggests the wrong sign for all that follows, and does not determine it."""
+    early = 1e-3
+    amplitude = 0.19 * np.minimum(1.0, np.minimum(np.abs(TIME - early), np.abs(TIME - REST)) / 8e-4)
+    estimated = motion_of("x", amplitude)
+    intensity = intensity_along(motion_of("x", np.where(early > TIME, amplitude, -amplitude)), photons=3.0)
+    assert [round(time, 3) for time in find_rests(estimated.axes["x"])] == [early, REST]
+    found, notes = follow_signs(estimated, DEVICE, intensity, 0.0)
+    assert found is estimated
+    assert notes == ["x nearly rests at 0.001 s: the picture does not show its sign after that"]
+
+
 def test_a_right_sign_is_kept_without_a_note() -> None:
     true, _, intensity = scan("x")
     assert follow_signs(true, DEVICE, intensity, 0.0) == (true, [])
+
+
+def test_a_sign_that_the_user_turned_is_followed_too() -> None:
+    true, wrong, intensity = scan("x")
+    turned = replace(wrong, axes={**wrong.axes, "x": replace(wrong.axes["x"].negated(), sign="known: --flip-x")})
+    found, notes = follow_signs(turned, DEVICE, intensity, 0.0)
+    assert len(notes) == 1
+    error = found.axes["x"].angle.read() + true.axes["x"].angle.read()
+    assert np.abs(error[np.abs(TIME - REST) > 4.2e-3]).max() < 1e-3 * 0.19
 
 
 def test_a_known_sign_is_not_questioned() -> None:
