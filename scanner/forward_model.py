@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -43,10 +44,15 @@ class DriveInput:
     step: float
     t0: float = 0.0
 
-    @property
+    @cached_property
     def time(self) -> Array:
         """Times of the n + 1 samples, shape (n + 1,) [s]."""
         return self.t0 + self.step * np.arange(len(self.voltage) + 1, dtype=np.float64)
+
+    @cached_property
+    def samples(self) -> Array:
+        """Voltage at the n + 1 samples, shape (n + 1,) [V]."""
+        return nodes_to_samples(self.voltage)
 
 
 @dataclass(frozen=True)
@@ -153,8 +159,7 @@ def simulate_batch(
 
 def effective_drive(axis: Axis, terms: Sequence[ActiveTerm], drive: DriveInput) -> Array:
     """Return the voltage on the actuator, after the drive terms, at the nodes of every step, shape (n, 3) [V]."""
-    recorded = nodes_to_samples(drive.voltage)
-    context = SignalContext(drive.time, drive.step, axis.readout, _EMPTY, recorded, _EMPTY, _EMPTY)
+    context = SignalContext(drive.time, drive.step, axis.readout, _EMPTY, drive.samples, _EMPTY, _EMPTY)
     voltage = drive.voltage
     for active in in_stage_order(terms):
         if active.term.voltage is not None:
@@ -225,7 +230,7 @@ def sense_signal(readout: Readout, motions: Sequence[AxisTrajectory], background
     readout = effective_readout(readout, motions)
     match readout:
         case Amdm():
-            signal = np.sum([_capacitance(motion) for motion in motions], axis=0)
+            signal = sum(map(_capacitance, motions[1:]), start=_capacitance(motions[0]))
             for motion in motions:
                 for active in motion.active_terms:
                     if active.term.pre_demodulation is not None:
@@ -242,7 +247,7 @@ def sense_signal(readout: Readout, motions: Sequence[AxisTrajectory], background
                 transimpedance_voltage(_capacitance_slope(motion), motion.rate, readout.R_s, motion.voltage)
                 for motion in motions
             ]
-            signal = np.sum(currents, axis=0)
+            signal = sum(currents[1:], start=currents[0])
     return apply_channel_terms("sense", signal, motions, readout, background)
 
 
@@ -317,5 +322,6 @@ def _term_capacitance(motion: AxisTrajectory, derivative: int) -> Array | float:
 
 def _signal_context(motion: AxisTrajectory, readout: Readout | None, variant: str = "") -> SignalContext:
     drive = motion.drive
-    recorded = nodes_to_samples(drive.voltage)
-    return SignalContext(drive.time, drive.step, readout, motion.voltage, recorded, motion.angle, motion.rate, variant)
+    return SignalContext(
+        drive.time, drive.step, readout, motion.voltage, drive.samples, motion.angle, motion.rate, variant
+    )

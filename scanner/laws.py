@@ -1,6 +1,7 @@
 """The physical laws of one axis, defined once for simulator, estimators and diagnosis.
 
-Every function is compiled by numba and takes scalars or arrays. Angles are in rad, other values in SI units.
+Every function takes scalars or arrays. Those that compiled code calls are compiled by numba; the capacitance is not,
+because numpy evaluates the exponentials of an array faster. Angles are in rad, other values in SI units.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
 def capacitance(theta, C0, Cb, theta0, theta_th):  # type: ignore[no-untyped-def]
     """Comb capacitance C(theta) = C0 exp(-((theta - theta_th)/theta0)^2) + Cb [F] (chen2020 eq 13)."""
     u = (theta - theta_th) / theta0

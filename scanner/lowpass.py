@@ -94,7 +94,20 @@ def apply_lowpass(signal: Array, cutoff: float, step: float) -> Array:
     """
     if not np.isfinite(cutoff):
         return signal
-    filtered = signal.copy()
-    filtered[1:-1] -= curvature_share(abs(cutoff), step) * (signal[2:] - 2.0 * signal[1:-1] + signal[:-2])
-    run_section(filtered, *section_coefficients(abs(cutoff), step), filtered[0], filtered[0])
+    filtered = np.empty(signal.size)
+    _run_smooth(signal, curvature_share(abs(cutoff), step), *section_coefficients(abs(cutoff), step), filtered)
     return filtered if cutoff > 0 else 2.0 * signal - filtered
+
+
+@njit(cache=True, nogil=True)
+def _run_smooth(signal, share, e, p, q, out):  # type: ignore[no-untyped-def]
+    """:func:`run_section` from the first value on, of ``signal`` (n,) less ``share`` of its second differences."""
+    u = x = signal[0]
+    last = signal.size - 1
+    for i in range(signal.size):
+        new = signal[i]
+        if 0 < i < last:
+            new -= share * (signal[i + 1] - 2.0 * signal[i] + signal[i - 1])
+        u = e * u + p * x + q * new
+        x = new
+        out[i] = u

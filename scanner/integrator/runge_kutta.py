@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from math import factorial
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numba import carray, njit, types
 from numba.extending import intrinsic, register_jitable
 
 from scanner.integrator.abi import MAX_TERMS_PER_STAGE, TORQUE_LAW, Nominal
+from scanner.integrator.exponential import negative_exponential
 from scanner.integrator.function_addresses import FunctionAddress
 from scanner.laws import angular_acceleration, electrostatic_torque, gaussian_slope
 
@@ -46,46 +46,16 @@ lane; 1.0 for an electrostatic drive and 0.0 for another; number of hidden state
 
 _COMPILER_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
-_MIN_EXPONENT = -700.0
-"""Exponents below are taken as this: exp(-700) = 1e-304 is negligible against any capacitance and still a normal
-number."""
-
-_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
-"""ln 2 in two parts. The last bits of the first are zero, so its product with an exponent is exact (Cody & Waite)."""
-
-_ROUNDER = 1.5 * 2.0**52
-"""Adding this to a number rounds it to an integer, which is then in the lowest bits of the sum."""
-
-_ROUNDER_BITS = int(np.float64(_ROUNDER).view(np.int64))
-
-C2, C3, C4, C5, C6, C7, C8, C9, C10, C11, C12, C13 = (1.0 / factorial(n) for n in range(2, 14))
-# Taylor coefficients of exp; the first one left out is below 1e-17 for |r| <= ln(2) / 2.
-
 (THETA, OMEGA, TERM_TORQUE, TERM_SLOPE, ALPHA1, ALPHA2, ALPHA3, OMEGA2, OMEGA3, OMEGA4, STAGE_THETA,
- J, B, K, C0, THETA0, THETA_TH, TORQUE_PER_VOLT) = range(18)  # fmt: skip
+ PER_J, B_PER_J, K_PER_J, C0_PER_THETA0, PER_THETA0, THETA_TH, TORQUE_PER_VOLT) = range(18)  # fmt: skip
 Z, STAGE_Z, DZ1, DZ2, DZ3, DZ4 = (18 + 2 * MAX_TERMS_PER_STAGE * i for i in range(6))
 ROWS = 18 + 12 * MAX_TERMS_PER_STAGE
 """Rows of the state, shape (ROWS, LANES).
 
 Angle and rate at the start of the step; torque and slope of the capacitance that the terms add; accelerations and rates
-of the four stages of the step, and the angle of the present stage; nominal values; then, two for each torque law, the
-hidden states at the start of the step and at the present stage, and their derivatives at the four stages."""
-
-
-@njit(forceinline=True, **_COMPILER_OPTIONS)
-def negative_exponential(x):  # type: ignore[no-untyped-def]
-    """Return exp(x) for x <= 0 with a relative error of 3e-16, and 1e-304 below x = -700.
-
-    It calls no library function, so the compiler evaluates it in all lanes at once.
-    """
-    x = x if x > _MIN_EXPONENT else _MIN_EXPONENT
-    rounded = x * (1.0 / (_LN2_HIGH + _LN2_LOW)) + _ROUNDER
-    k = rounded - _ROUNDER
-    r = (x - k * _LN2_HIGH) - k * _LN2_LOW
-    p = C6 + r * (C7 + r * (C8 + r * (C9 + r * (C10 + r * (C11 + r * (C12 + r * C13))))))
-    p = 1.0 + r * (1.0 + r * (C2 + r * (C3 + r * (C4 + r * (C5 + r * p)))))
-    power = np.int64((np.float64(rounded).view(np.int64) - _ROUNDER_BITS + 1023) << 52)  # the bits of 2^k
-    return p * power.view(np.float64)
+of the four stages of the step, and the angle of the present stage; nominal values, divided before, because a division
+takes longer than all other operations of a law; then, two for each torque law, the hidden states at the start of the
+step and at the present stage, and their derivatives at the four stages."""
 
 
 @intrinsic
@@ -192,10 +162,13 @@ def _acceleration(s, lane, theta_row, omega_row, volt, electrostatic, electrosta
     """Angular acceleration in one lane [rad/s2], from the nominal laws and what the terms add."""
     torque = s[TORQUE_PER_VOLT, lane] * volt + s[TERM_TORQUE, lane]
     if electrostatic:
-        u = (s[theta_row, lane] - s[THETA_TH, lane]) / s[THETA0, lane]
-        slope = gaussian_slope(u, negative_exponential(-u * u), s[C0, lane], s[THETA0, lane]) + s[TERM_SLOPE, lane]
+        u = (s[theta_row, lane] - s[THETA_TH, lane]) * s[PER_THETA0, lane]
+        slope = gaussian_slope(u, negative_exponential(-u * u), s[C0_PER_THETA0, lane], 1.0) + s[TERM_SLOPE, lane]
         torque += electrostatic_torque(slope, electrostatic_volt)
-    return angular_acceleration(s[theta_row, lane], s[omega_row, lane], torque, s[J, lane], s[B, lane], s[K, lane])
+    # of a unit of inertia
+    return angular_acceleration(
+        s[theta_row, lane], s[omega_row, lane], torque * s[PER_J, lane], 1.0, s[B_PER_J, lane], s[K_PER_J, lane]
+    )
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)
@@ -223,7 +196,10 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
         motion = min(lane, used - 1)
         s[THETA, lane], s[OMEGA, lane] = start[motion, 0], start[motion, 1]
         s[Z : Z + 2 * MAX_TERMS_PER_STAGE, lane] = start[motion, 2:]
-        s[J : TORQUE_PER_VOLT + 1, lane] = laws[6][motion]
+        J, b, k, C0, theta0, theta_th, torque_per_volt = laws[6][motion]
+        s[PER_J, lane], s[B_PER_J, lane], s[K_PER_J, lane] = 1.0 / J, b / J, k / J
+        s[C0_PER_THETA0, lane], s[PER_THETA0, lane] = C0 / theta0, 1.0 / theta0
+        s[THETA_TH, lane], s[TORQUE_PER_VOLT, lane] = theta_th, torque_per_volt
     s[STAGE_Z : STAGE_Z + 2 * MAX_TERMS_PER_STAGE] = s[Z : Z + 2 * MAX_TERMS_PER_STAGE]
     angle[:, 0], rate[:, 0] = start[:, 0], start[:, 1]
     terms = _terms(s, laws)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numba import njit
 
 from scanner.integrator.abi import TORQUE_LAW
+from scanner.integrator.exponential import negative_exponential
 from scanner.terms.term import Parameter, Term
 
 
 @njit(TORQUE_LAW, cache=True)
 def torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
     alpha, tau = p[0], p[1]
-    return alpha * nominal.k * np.expm1(-max(t, 0.0) / tau) * theta, 0.0, 0.0
+    return alpha * nominal.k * (negative_exponential(-max(t, 0.0) / tau) - 1.0) * theta, 0.0, 0.0
 
 
 TERM = Term(
