@@ -34,15 +34,20 @@ def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none.
 
     Where there is hum, the evidence also chooses between few and many harmonics, and between the nominal and the fitted
-    frequency.
+    frequency. Hum before a clip level is not linear: fits choose its frequency, and no harmonics.
     """
-    best = min(fit_hum_variants(likelihood, fit), key=lambda variant: variant.neg2_log_evidence)
-    refined = [option for mains in best.model.mains for option in _refined_mains(likelihood, best, mains)]
-    if not refined or min(refined)[1] in best.model.mains:
-        return best
-    model = _with_mains(best.model, min(refined)[1])
-    other = fit_model(likelihood, model, model.map_parameters_from(best.model, best.x), max_iterations=3)
-    return min(best, other, key=lambda variant: variant.neg2_log_evidence)
+    if not any(_hum_columns(likelihood, fit, mains).size for mains in NOMINAL_MAINS):
+        return min(fit_hum_variants(likelihood, fit), key=lambda variant: variant.neg2_log_evidence)
+    beside = _beside_hum(fit)
+    without = beside.evaluate(np.zeros((beside.residual.size, 0)))[0]
+    lowest, strongest = min((beside.evaluate(_hum_columns(likelihood, fit, m))[0], m) for m in NOMINAL_MAINS)
+    selected = min(_refined_mains(likelihood, fit, beside, strongest))[1:] if lowest < without else ()
+    if selected == fit.model.mains:
+        return fit
+    model = _with_mains(fit.model, *selected)
+    other = fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x), max_iterations=3)
+    is_possible = len(fit.model.mains) < len(NOMINAL_MAINS)
+    return fit if is_possible and fit.neg2_log_evidence < other.neg2_log_evidence else other
 
 
 def fit_hum_variants(likelihood: Likelihood, fit: Fit) -> list[Fit]:
@@ -66,17 +71,11 @@ def _with_mains(model: Model, *mains: Mains) -> Model:
     return Model(model.runs, model.device, model.candidates, mains)
 
 
-def _refined_mains(likelihood: Likelihood, fit: Fit, nominal: Mains) -> list[tuple[float, Mains]]:
+def _refined_mains(likelihood: Likelihood, fit: Fit, beside: _BesideHum, nominal: Mains) -> list[tuple[float, Mains]]:
     """Hum with few and with many harmonics, at the nominal and at the fitted frequency, with -2 log evidence of each.
 
-    All but the frequency is linear around the fit. Hum that is added before a clip level is not, and is not refined.
-
-    Args:
-        fit: with hum of the mains ``nominal``.
+    All but the frequency is linear around the fit.
     """
-    if not _hum_columns(likelihood, fit, nominal).size:
-        return []
-    beside = _beside_hum(fit)
     refined = []
     for harmonics in (HUM_HARMONICS, STRONG_HUM_HARMONICS):
         stated = Mains(nominal.frequency, harmonics)
