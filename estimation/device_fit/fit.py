@@ -7,9 +7,10 @@ whitened by the noise that was estimated before. A fifth of the samples is held 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -19,6 +20,9 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener
 from estimation.least_squares import fit_levenberg_marquardt, laplace_neg2_log_evidence
 from scanner.arrays import Array, Mask
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 TRAJECTORY_POOL = ThreadPoolExecutor(
     len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -162,7 +166,8 @@ class Likelihood:
                 difference[: signal.size] = output.data[: signal.size] - signal
                 parts.append(whitener(difference))
         residual = np.concatenate(parts)
-        return np.where(np.abs(residual) < MAX_RESIDUAL, residual, DIVERGED_RESIDUAL)
+        residual[~(np.abs(residual) < MAX_RESIDUAL)] = DIVERGED_RESIDUAL
+        return residual
 
     def _additive_columns(self, model: Model, stop: float) -> dict[int, Array]:
         """Jacobian columns, by index in x, of the parameters that only add to a channel; they do not depend on x."""
@@ -265,7 +270,15 @@ def fit_models(
     def fit(start: tuple[Model, Array]) -> Fit:
         return fit_model(likelihood, *start, stop, max_iterations, tolerance=tolerance, abort_above=abort_above)
 
-    return list(FIT_POOL.map(fit, starts))
+    return map_fits(fit, starts)
+
+
+def map_fits(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """``function``, which makes fits one after the other, of each item, ``MAX_PARALLEL_FITS`` at a time, in order.
+
+    A function that calls this one itself would wait for its own thread.
+    """
+    return list(FIT_POOL.map(function, items))
 
 
 def linearise_at(likelihood: Likelihood, model: Model, x: Array, stop: float = 1.0) -> Fit:

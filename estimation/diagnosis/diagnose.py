@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from estimation.device_fit.data import Run, prepare_run
-from estimation.device_fit.fit import Fit, nominal_values_are_improbable
+from estimation.device_fit.fit import Fit, map_fits, nominal_values_are_improbable
 from estimation.device_fit.further_modes import describe_modes, with_driven_modes
 from estimation.device_fit.open_loop import open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
@@ -136,7 +136,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
     corrections = find_corrections(result)
     correction = best_correction(corrections) if corrections else None
     corrected = correct_parameters(result.final, corrections) if corrections else None
-    findings = [find_effect(result, step, correction, corrected) for step in result.steps]
+    findings = map_fits(lambda step: find_effect(result, step, correction, corrected), result.steps)
     findings.sort(key=lambda finding: -(finding.share or 0.0))
     tension = None if findings else _prior_tension_finding(result.final)
     if tension is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, map_fits, misfit
 from estimation.device_fit.initial import estimate_whiteners
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.discrepancy import is_discrepancy
@@ -176,7 +176,8 @@ def _fit_options(
     fitted: dict[Effects, Fit],
 ) -> dict[Effects, Fit]:
     """Fits of selected laws, and at first the one around which they were selected, that follow the recording."""
-    fits = {effects: fit_laws(linear, likelihood, fit, laws, fitted) for effects, laws in options.items()}
+    of_laws = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), options.values())
+    fits = dict(zip(options, of_laws, strict=True))
     present = _present_laws(linear)
     if not fitted and present:
         fits[linear.effects(present)] = fit
@@ -257,11 +258,12 @@ def _exchange_near_rival(
     others = [rival for rest in rests for rival in linear.beside(rest, hypothesis.scales)]
     limit = hypothesis.neg2_log_evidence + MIN_SCORE_GAIN
     near = [one for one in others if one.neg2_log_evidence < limit and linear.effects(one.laws) not in fitted]
+    rivals: dict[Effects, tuple[int, ...]] = {}
     for rival in sorted(near, key=lambda one: one.neg2_log_evidence)[:MAX_ALTERNATIVES]:
-        effects = linear.effects(rival.laws)
-        if effects in fitted:
-            continue
-        fitted[effects] = other = fit_laws(linear, likelihood, fit, rival.laws, fitted)
+        rivals.setdefault(linear.effects(rival.laws), rival.laws)
+    fits = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), rivals.values())
+    for effects, other in zip(rivals, fits, strict=True):
+        fitted[effects] = other
         if not satisfies_sign_constraints(other) or other.chi2 > MAX_CHI2_RATIO * fit.chi2:
             continue
         compared[effects] = other

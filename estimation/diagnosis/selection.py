@@ -6,7 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models, misfit, nominal_values_are_improbable
+from estimation.device_fit.fit import (
+    Fit,
+    Likelihood,
+    fit_model,
+    fit_models,
+    map_fits,
+    misfit,
+    nominal_values_are_improbable,
+)
 from estimation.device_fit.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
 from estimation.device_fit.initial import (
     estimate_whiteners,
@@ -192,7 +200,7 @@ def _choose_from_stated_values(
     if not groups[0] or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
         return None
     progress("stated values, with drifting resonances")
-    fits = [fit_from_stated_values(likelihood, nominal, drifts, stops[0]) for drifts in groups]
+    fits = map_fits(lambda drifts: fit_from_stated_values(likelihood, nominal, drifts, stops[0]), groups)
     if not any(map(residual_is_noise, fits)):
         progress("stated values, with laws that are linear in no amplitude")
         nonlinear = fit_nonlinear_law(likelihood, nominal, pool, stops)
@@ -243,13 +251,14 @@ def _choose_discrepancy(
     linear = linear_model(likelihood, anchor, list(filter(is_discrepancy, pool)))
     stages = range(len(linear.discrepancies))
     alone = {i: linear.hypothesis((), without=[j for j in stages if j != i]).neg2_log_evidence for i in stages}
-    fits = [fit_model(likelihood, fit.model, fit.x) for fit in fitted]
-    fits += [
-        fit_terms(linear, likelihood, anchor, [linear.discrepancies[i]])
-        for i in sorted(stages, key=lambda i: alone[i])[:MAX_DISCREPANCY_FITS]
-    ]
+    fits = map_fits(lambda fit: fit_model(likelihood, fit.model, fit.x), fitted)
+    fits += map_fits(
+        lambda i: fit_terms(linear, likelihood, anchor, [linear.discrepancies[i]]),
+        sorted(stages, key=lambda i: alone[i])[:MAX_DISCREPANCY_FITS],
+    )
     converged = [fit for fit in fits if fit.chi2 < MAX_CHI2_RATIO * anchor.chi2]
-    pruned = [fewer for fewer in (prune_by_evidence(likelihood, fit) for fit in converged) if fewer is not None]
+    reduced = map_fits(lambda fit: prune_by_evidence(likelihood, fit), converged)
+    pruned = [fewer for fewer in reduced if fewer is not None]
     best = min(pruned, key=lambda fit: fit.neg2_log_evidence, default=None)
     if best is None:
         return None
