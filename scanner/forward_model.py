@@ -125,7 +125,7 @@ def simulate_batch(
     """Return :func:`simulate_axis` of several (axis, terms, start) in one call of the integrator.
 
     The cases have the same terms and differ in numbers only. The values of their drive terms do not differ. Up to
-    ``scanner.integrator.runge_kutta.LANES`` cases take little longer than one.
+    ``scanner.integrator.abi.LANES`` cases take little longer than one.
     """
     # Imported here because loading the compiled kernels takes half a second.
     from scanner.integrator.trajectories import CapacitanceTerm, TorqueTerm, TrajectorySpec, integrate_batch

@@ -30,7 +30,7 @@ from scanner.forward_model import (
     simulate_batch,
     simulate_coupled,
 )
-from scanner.integrator.runge_kutta import LANES
+from scanner.integrator.abi import LANES
 from scanner.stages import Amdm
 from scanner.terms import NaturalScales
 

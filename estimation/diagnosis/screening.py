@@ -13,7 +13,7 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
 from scanner.device import Device
-from scanner.integrator.runge_kutta import LANES
+from scanner.integrator.abi import LANES
 from scanner.terms import Parameter, Term
 from scanner.terms.term import AMPLITUDE_KINDS
 

@@ -47,6 +47,9 @@ volt: drive [V]. z0, z1: the law's own hidden states. p: its parameters. nominal
 CAPACITANCE_LAW = types.UniTuple(_f8, 2)(_f8, _vector, NOMINAL_TYPE)
 """(theta, p, nominal) -> (additional capacitance [F], its slope [F/rad]); arguments as in ``TORQUE_LAW``."""
 
+LANES = 8
+"""Motions that are integrated together: two AVX registers or one AVX-512 register of doubles."""
+
 MAX_TERMS_PER_STAGE = 4
 """Torque laws that can act together, and capacitance laws that can. A device with more than four at once has not been
 needed, and the kernel has one call in its source for each."""

@@ -16,46 +16,47 @@ import numpy as np
 from numba import carray, njit, types
 from numba.extending import intrinsic, register_jitable
 
-from scanner.integrator.abi import MAX_TERMS_PER_STAGE, TORQUE_LAW, Nominal
+from scanner.integrator.abi import LANES, MAX_TERMS_PER_STAGE, TORQUE_LAW, Nominal
 from scanner.integrator.exponential import negative_exponential
 from scanner.integrator.function_addresses import FunctionAddress
+from scanner.integrator.lane_parameters import lane_parameters
 from scanner.laws import angular_acceleration, electrostatic_torque, gaussian_slope
-
-LANES = 8
-"""Motions that are integrated together: two AVX registers or one AVX-512 register of doubles."""
 
 BYTES_PER_FLOAT = 8
 
 _f8, _i8 = types.float64, types.int64
 
-_LANE_LAW = types.void(_i8, _f8, _f8, _f8, *[_i8] * 8)
-"""(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used): one law in all used lanes.
+_LANE_LAW = types.void(_i8, _f8, _f8, _f8, _i8, _i8, _i8)
+"""(state, t, other, volt, p, p_count, used): one law in the first ``used`` lanes.
 
-It adds its result to the row ``TERM_TORQUE`` or ``TERM_SLOPE`` of the state. state, p and nominal are addresses, which
-are cheaper to pass than arrays: of the state (``ROWS``, ``LANES``), of the first lane's parameters in a table with
-``p_stride`` places for each term, and of the nominal values. The rows say which angle, rate and hidden states of the
-state the law is evaluated at."""
+It reads the rows ``LAW_THETA`` to ``LAW_NOMINAL`` of the state and adds its result to the row ``TERM_TORQUE`` or
+``TERM_SLOPE``. A torque law sets the rows ``LAW_DZ``. The rows are the same for all laws and stages, so the compiler
+knows that no two of them overlap and computes several lanes at once. state and p are addresses, which are cheaper to
+pass than arrays: of the state (``ROWS``, ``LANES``) and of the law's parameters (``p_count``, ``LANES``)."""
 
 _LANE_LAWS = types.UniTuple(types.FunctionType(_LANE_LAW), MAX_TERMS_PER_STAGE)
 
 _LAWS = types.Tuple(
     [_LANE_LAWS, _f8[:, :, ::1], _i8, _LANE_LAWS, _f8[:, :, ::1], _i8, _f8[:, ::1], _f8, _i8]
 )  # fmt: skip
-"""Torque laws, their parameters by lane and term, their number; the same of the capacitance laws; nominal values by
-lane; 1.0 for an electrostatic drive and 0.0 for another; number of hidden states."""
+"""Torque laws, their parameters by term, place and lane, their number; the same of the capacitance laws; nominal values
+by motion; 1.0 for an electrostatic drive and 0.0 for another; number of hidden states."""
 
 _COMPILER_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
 (THETA, OMEGA, TERM_TORQUE, TERM_SLOPE, ALPHA1, ALPHA2, ALPHA3, OMEGA2, OMEGA3, OMEGA4, STAGE_THETA,
- PER_J, B_PER_J, K_PER_J, C0_PER_THETA0, PER_THETA0, THETA_TH, TORQUE_PER_VOLT) = range(18)  # fmt: skip
-Z, STAGE_Z, DZ1, DZ2, DZ3, DZ4 = (18 + 2 * MAX_TERMS_PER_STAGE * i for i in range(6))
-ROWS = 18 + 12 * MAX_TERMS_PER_STAGE
+ PER_J, B_PER_J, K_PER_J, C0_PER_THETA0, PER_THETA0, THETA_TH, TORQUE_PER_VOLT,
+ LAW_THETA, LAW_OMEGA) = range(20)  # fmt: skip
+LAW_Z, LAW_DZ, LAW_NOMINAL = 20, 22, 24
+Z, STAGE_Z, DZ1, DZ2, DZ3, DZ4 = (31 + 2 * MAX_TERMS_PER_STAGE * i for i in range(6))
+ROWS = 31 + 12 * MAX_TERMS_PER_STAGE
 """Rows of the state, shape (ROWS, LANES).
 
 Angle and rate at the start of the step; torque and slope of the capacitance that the terms add; accelerations and rates
 of the four stages of the step, and the angle of the present stage; nominal values, divided before, because a division
-takes longer than all other operations of a law; then, two for each torque law, the hidden states at the start of the
-step and at the present stage, and their derivatives at the four stages."""
+takes longer than all other operations of a law; what a law reads and sets: angle, rate, two hidden states and their
+derivatives, and the seven nominal values; then, two for each torque law, the hidden states at the start of the step and
+at the present stage, and their derivatives at the four stages."""
 
 
 @intrinsic
@@ -74,7 +75,7 @@ def _data_address(array):  # type: ignore[no-untyped-def]
 
 
 @njit(_LANE_LAW, cache=True)
-def no_law(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used):  # type: ignore[no-untyped-def]
+def no_law(state, t, other, volt, p, p_count, used):  # type: ignore[no-untyped-def]
     """The law in the place of a term that is not there. The kernel never calls it."""
 
 
@@ -88,31 +89,33 @@ def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
     inlined, code = register_jitable(law.py_func), law.py_func.__code__  # type: ignore[attr-defined]
     law_content = repr((code.co_code, code.co_consts, code.co_names))
 
-    def torque(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used):  # type: ignore[no-untyped-def]
+    def torque(state, t, other, volt, p, p_count, used):  # type: ignore[no-untyped-def]
         law_content  # noqa: B018
-        s, own = carray(_pointer(state), (ROWS, LANES)), carray(_pointer(nominal), (LANES, 7))
+        s, table = carray(_pointer(state), (ROWS, LANES)), _pointer(p)
         for lane in range(used):
-            values = carray(_pointer(p + lane * MAX_TERMS_PER_STAGE * p_stride * BYTES_PER_FLOAT), (p_stride,))
-            n = Nominal(
-                own[lane, 0], own[lane, 1], own[lane, 2], own[lane, 3], own[lane, 4], own[lane, 5], own[lane, 6]
-            )
-            added, s[dz_row, lane], s[dz_row + 1, lane] = inlined(
-                t, s[theta_row, lane], s[omega_row, lane], other, volt, s[z_row, lane], s[z_row + 1, lane], values, n
-            )
+            added, s[LAW_DZ, lane], s[LAW_DZ + 1, lane] = inlined(
+                t, s[LAW_THETA, lane], s[LAW_OMEGA, lane], other, volt, s[LAW_Z, lane], s[LAW_Z + 1, lane],
+                lane_parameters(table, lane), _nominal(s, lane),
+            )  # fmt: skip
             s[TERM_TORQUE, lane] += added
 
-    def slope(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, p_stride, nominal, used):  # type: ignore[no-untyped-def]
+    def slope(state, t, other, volt, p, p_count, used):  # type: ignore[no-untyped-def]
         law_content  # noqa: B018
-        s, own = carray(_pointer(state), (ROWS, LANES)), carray(_pointer(nominal), (LANES, 7))
+        s, table = carray(_pointer(state), (ROWS, LANES)), _pointer(p)
         for lane in range(used):
-            values = carray(_pointer(p + lane * MAX_TERMS_PER_STAGE * p_stride * BYTES_PER_FLOAT), (p_stride,))
-            n = Nominal(
-                own[lane, 0], own[lane, 1], own[lane, 2], own[lane, 3], own[lane, 4], own[lane, 5], own[lane, 6]
-            )
-            s[TERM_SLOPE, lane] += inlined(s[theta_row, lane], values, n)[1]
+            s[TERM_SLOPE, lane] += inlined(s[LAW_THETA, lane], lane_parameters(table, lane), _nominal(s, lane))[1]
 
     lane_law = torque if law.nopython_signatures[0] == TORQUE_LAW else slope  # type: ignore[attr-defined]
     return FunctionAddress(njit(_LANE_LAW, cache=True, nogil=True, **_COMPILER_OPTIONS)(lane_law))
+
+
+@njit(forceinline=True)
+def _nominal(s, lane):  # type: ignore[no-untyped-def]
+    """The nominal values of a lane."""
+    return Nominal(
+        s[LAW_NOMINAL, lane], s[LAW_NOMINAL + 1, lane], s[LAW_NOMINAL + 2, lane], s[LAW_NOMINAL + 3, lane],
+        s[LAW_NOMINAL + 4, lane], s[LAW_NOMINAL + 5, lane], s[LAW_NOMINAL + 6, lane],
+    )  # fmt: skip
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)
@@ -120,13 +123,13 @@ def _terms(s, laws):  # type: ignore[no-untyped-def]
     """What :func:`_evaluate_terms` needs of the state and the laws, without an array: a function that is passed an
     array counts references to it, which takes longer than most laws.
 
-    Torque laws, their number, address and ``p_stride`` of their parameters; the same of the capacitance laws;
-    addresses of the state and of the nominal values.
+    Torque laws, their number, address and number of places of their parameters; the same of the capacitance laws;
+    address of the state; number of hidden states.
     """
     return (
-        laws[0], laws[2], _data_address(laws[1]), laws[1].shape[2],
-        laws[3], laws[5], _data_address(laws[4]), laws[4].shape[2],
-        _data_address(s), _data_address(laws[6]),
+        laws[0], laws[2], _data_address(laws[1]), laws[1].shape[1],
+        laws[3], laws[5], _data_address(laws[4]), laws[4].shape[1],
+        _data_address(s), laws[8],
     )  # fmt: skip
 
 
@@ -134,27 +137,49 @@ def _terms(s, laws):  # type: ignore[no-untyped-def]
 def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, terms, used):  # type: ignore[no-untyped-def]
     """Set ``TERM_TORQUE``, ``TERM_SLOPE`` and the derivatives ``dz_row`` of the hidden states, in all used lanes."""
     # Unpacked, because an index into the tuple would copy all of its functions at every call.
-    (first, second, third, fourth), n, p, stride, capacitance_laws, m, capacitance_p, capacitance_stride, state, own = (
-        terms
-    )
+    (first, second, third, fourth), n, p, count, slopes, m, slopes_p, slopes_count, state, hidden = terms
     s = carray(_pointer(state), (ROWS, LANES))
-    for lane in range(used):
+    for lane in range(LANES):
+        s[LAW_THETA, lane], s[LAW_OMEGA, lane] = s[theta_row, lane], s[omega_row, lane]
         s[TERM_TORQUE, lane], s[TERM_SLOPE, lane] = 0.0, 0.0
-    term = stride * BYTES_PER_FLOAT
+    of_term = count * LANES * BYTES_PER_FLOAT
     if n > 0:
-        first(state, t, other, volt, theta_row, omega_row, z_row, dz_row, p, stride, own, used)
+        _read_hidden_states(state, z_row, hidden)
+        first(state, t, other, volt, p, count, used)
+        _store_derivatives(state, dz_row, hidden)
     if n > 1:
-        second(state, t, other, volt, theta_row, omega_row, z_row + 2, dz_row + 2, p + term, stride, own, used)
+        _read_hidden_states(state, z_row + 2, hidden)
+        second(state, t, other, volt, p + of_term, count, used)
+        _store_derivatives(state, dz_row + 2, hidden)
     if n > 2:
-        third(state, t, other, volt, theta_row, omega_row, z_row + 4, dz_row + 4, p + 2 * term, stride, own, used)
+        _read_hidden_states(state, z_row + 4, hidden)
+        third(state, t, other, volt, p + 2 * of_term, count, used)
+        _store_derivatives(state, dz_row + 4, hidden)
     if n > 3:
-        fourth(state, t, other, volt, theta_row, omega_row, z_row + 6, dz_row + 6, p + 3 * term, stride, own, used)
-    term = capacitance_stride * BYTES_PER_FLOAT
+        _read_hidden_states(state, z_row + 6, hidden)
+        fourth(state, t, other, volt, p + 3 * of_term, count, used)
+        _store_derivatives(state, dz_row + 6, hidden)
+    of_term = slopes_count * LANES * BYTES_PER_FLOAT
     for i in range(m):
-        capacitance_laws[i](
-            state, t, other, volt, theta_row, omega_row, z_row, dz_row,
-            capacitance_p + i * term, capacitance_stride, own, used,
-        )  # fmt: skip
+        slopes[i](state, t, other, volt, slopes_p + i * of_term, slopes_count, used)
+
+
+@njit(forceinline=True)
+def _read_hidden_states(state, z_row, hidden):  # type: ignore[no-untyped-def]
+    """Give a law its hidden states, if any law has some."""
+    if hidden > 0:
+        s = carray(_pointer(state), (ROWS, LANES))
+        for lane in range(LANES):
+            s[LAW_Z, lane], s[LAW_Z + 1, lane] = s[z_row, lane], s[z_row + 1, lane]
+
+
+@njit(forceinline=True)
+def _store_derivatives(state, dz_row, hidden):  # type: ignore[no-untyped-def]
+    """Keep the derivatives of a law's hidden states, if any law has some."""
+    if hidden > 0:
+        s = carray(_pointer(state), (ROWS, LANES))
+        for lane in range(LANES):
+            s[dz_row, lane], s[dz_row + 1, lane] = s[LAW_DZ, lane], s[LAW_DZ + 1, lane]
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)
@@ -197,6 +222,7 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
         s[THETA, lane], s[OMEGA, lane] = start[motion, 0], start[motion, 1]
         s[Z : Z + 2 * MAX_TERMS_PER_STAGE, lane] = start[motion, 2:]
         J, b, k, C0, theta0, theta_th, torque_per_volt = laws[6][motion]
+        s[LAW_NOMINAL : LAW_NOMINAL + 7, lane] = laws[6][motion]
         s[PER_J, lane], s[B_PER_J, lane], s[K_PER_J, lane] = 1.0 / J, b / J, k / J
         s[C0_PER_THETA0, lane], s[PER_THETA0, lane] = C0 / theta0, 1.0 / theta0
         s[THETA_TH, lane], s[TORQUE_PER_VOLT, lane] = theta_th, torque_per_volt

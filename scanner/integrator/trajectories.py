@@ -11,9 +11,9 @@ from numba import njit, types
 
 from scanner.arrays import Array
 from scanner.device import Axis
-from scanner.integrator.abi import CAPACITANCE_LAW, MAX_TERMS_PER_STAGE, NOMINAL_TYPE, nominal_values
+from scanner.integrator.abi import CAPACITANCE_LAW, LANES, MAX_TERMS_PER_STAGE, NOMINAL_TYPE, nominal_values
 from scanner.integrator.function_addresses import FunctionAddress, address_of
-from scanner.integrator.runge_kutta import LANES, in_all_lanes, no_law, run_kernel
+from scanner.integrator.runge_kutta import in_all_lanes, no_law, run_kernel
 
 _f8, _vector = types.float64, types.float64[::1]
 
@@ -164,10 +164,13 @@ def _lane_laws(laws: list[Callable[..., Any]]) -> tuple[FunctionAddress, ...]:
 
 
 def _parameter_table(parameters: Sequence[Sequence[Sequence[float]]]) -> Array:
-    """Parameters by motion, term and place, shape (motions, ``MAX_TERMS_PER_STAGE``, largest number of any term)."""
+    """Parameters by term, place and lane, shape (``MAX_TERMS_PER_STAGE``, largest number of any term, ``LANES``).
+
+    Lanes without a motion have the parameters of the last one.
+    """
     most = max([1, *(len(row) for rows in parameters for row in rows)])
-    table = np.zeros((len(parameters), MAX_TERMS_PER_STAGE, most))
-    for motion_rows, rows in zip(table, parameters, strict=True):
-        for i, row in enumerate(rows):
-            motion_rows[i, : len(row)] = row
+    table = np.zeros((MAX_TERMS_PER_STAGE, most, LANES))
+    for lane in range(LANES):
+        for i, row in enumerate(parameters[min(lane, len(parameters) - 1)]):
+            table[i, : len(row), lane] = row
     return table

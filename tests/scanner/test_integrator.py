@@ -64,7 +64,7 @@ def test_integrator_equals_a_plain_runge_kutta_method() -> None:
 
 
 def test_too_many_motions_or_terms_are_refused() -> None:
-    from scanner.integrator.runge_kutta import LANES
+    from scanner.integrator.abi import LANES
     from scanner.integrator.trajectories import TorqueTerm, TrajectorySpec, integrate, integrate_batch
 
     voltage = np.zeros((10, 3))

@@ -12,9 +12,8 @@ from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.forward_model import DriveInput, sense_signal, simulate_axis
-from scanner.integrator.abi import Nominal
+from scanner.integrator.abi import LANES, Nominal
 from scanner.integrator.exponential import negative_exponential
-from scanner.integrator.runge_kutta import LANES
 from scanner.integrator.trajectories import CapacitanceTerm, TorqueTerm, TrajectorySpec, integrate, integrate_batch
 from scanner.stages import Capacitance, Drive, Mechanics, Position
 from scanner.terms import STAGES, NaturalScales, apply_lowpass, catalogue, load_terms, shift_samples
