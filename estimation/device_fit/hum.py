@@ -34,7 +34,7 @@ def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none.
 
     Where there is hum, the evidence also chooses between few and many harmonics, and between the nominal and the fitted
-    frequency. Hum before a clip level is not linear: fits choose its frequency, and no harmonics.
+    frequency. Hum before a clip level is not linear: there fits choose between the nominal frequencies and none.
     """
     if not any(_hum_columns(likelihood, fit, mains).size for mains in NOMINAL_MAINS):
         return min(fit_hum_variants(likelihood, fit), key=lambda variant: variant.neg2_log_evidence)

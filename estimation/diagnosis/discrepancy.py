@@ -16,6 +16,7 @@ from numba import njit
 from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
 from scanner.integrator.abi import CAPACITANCE_LAW, TORQUE_LAW
+from scanner.integrator.elementary import cosine_of_half_turns
 from scanner.lowpass import apply_lowpass
 from scanner.terms import Parameter, SignalContext, Term
 
@@ -76,20 +77,26 @@ def apply_play(signal, width):  # type: ignore[no-untyped-def]
     return output
 
 
+@njit(forceinline=True)
+def _force_of_degree(n, x, y, p):  # type: ignore[no-untyped-def]
+    """Terms of total degree ``n`` of the force polynomial; with a constant degree the compiler unrolls the loop."""
+    total, power = 0.0, 1.0
+    for j in range(n + 1):
+        total = total * x + p[n * (n + 1) // 2 + j] * power
+        power *= y
+    return total
+
+
 @njit(TORQUE_LAW, cache=True)
 def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    """Force polynomial, drift and memory: torque [N m] and the rates of the two hidden states.
+    """Force polynomial up to ``FORCE_DEGREE``, drift and memory: torque [N m] and the rates of two hidden states.
 
-    Sums are evaluated by nested products over constant ranges, which the compiler unrolls.
+    All loops have constant ranges, so the compiler unrolls them and evaluates several motions at once.
     """
     x, y = theta / p[0], omega / (p[0] * p[1])
-    total, cosine = 0.0, np.cos(np.pi * t / p[2])
-    for j in range(FORCE_DEGREE, -1, -1):
-        in_angle = 0.0
-        for i in range(FORCE_DEGREE - j, -1, -1):
-            n = i + j
-            in_angle = in_angle * x + (p[n * (n + 1) // 2 + j] if n > 1 else 0.0)
-        total = total * y + in_angle
+    cosine = cosine_of_half_turns(t / p[2])
+    total = _force_of_degree(2, x, y, p) + _force_of_degree(3, x, y, p)
+    total += _force_of_degree(4, x, y, p) + _force_of_degree(5, x, y, p)
     memory = 3 + N_FORCE_POWERS
     stiffness = p[memory] * z0 + p[memory + 1] * z1
     damping = p[memory + 2] * z0 + p[memory + 3] * z1
@@ -107,16 +114,21 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
     )
 
 
+@njit(forceinline=True)
+def _cosine_sum(p, first, count, cosine):  # type: ignore[no-untyped-def]
+    """sum_j p[first + j - 1] cos(j phase), j = 1 to ``count``, from cos(phase) by Clenshaw's recurrence."""
+    newer, older = 0.0, 0.0
+    for i in range(count):
+        newer, older = p[first + count - 1 - i] + 2.0 * cosine * newer - older, newer
+    return cosine * newer - older
+
+
 @njit(TORQUE_LAW, cache=True)
 def _drifting_force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    """Torque [N m] of a stiffness and a damping that depend on time, both cosine series by Clenshaw's recurrence."""
-    cosine, first_damping = np.cos(np.pi * t / p[1]), 2 + STIFFNESS_COSINES
-    stiffness, older_stiffness, damping, older_damping = 0.0, 0.0, 0.0, 0.0
-    for j in range(STIFFNESS_COSINES - 1, -1, -1):
-        stiffness, older_stiffness = p[2 + j] + 2.0 * cosine * stiffness - older_stiffness, stiffness
-        if j < DAMPING_COSINES:
-            damping, older_damping = p[first_damping + j] + 2.0 * cosine * damping - older_damping, damping
-    stiffness, damping = cosine * stiffness - older_stiffness, cosine * damping - older_damping
+    """Torque [N m] of a stiffness and a damping that depend on time."""
+    cosine = cosine_of_half_turns(t / p[1])
+    stiffness = _cosine_sum(p, 2, STIFFNESS_COSINES, cosine)
+    damping = _cosine_sum(p, 2 + STIFFNESS_COSINES, DAMPING_COSINES, cosine)
     return -(stiffness * theta + damping * omega / p[0]) * nominal.k, 0.0, 0.0
 
 

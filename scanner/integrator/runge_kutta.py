@@ -17,7 +17,7 @@ from numba import carray, njit, types
 from numba.extending import intrinsic, register_jitable
 
 from scanner.integrator.abi import LANES, MAX_TERMS_PER_STAGE, TORQUE_LAW, Nominal
-from scanner.integrator.exponential import negative_exponential
+from scanner.integrator.elementary import negative_exponential
 from scanner.integrator.function_addresses import FunctionAddress
 from scanner.integrator.lane_parameters import lane_parameters
 from scanner.laws import angular_acceleration, electrostatic_torque, gaussian_slope
@@ -27,7 +27,7 @@ BYTES_PER_FLOAT = 8
 _f8, _i8 = types.float64, types.int64
 
 _LANE_LAW = types.void(_i8, _f8, _f8, _f8, _i8, _i8, _i8)
-"""(state, t, other, volt, p, p_count, used): one law in the first ``used`` lanes.
+"""(state, t, other, volt, p, p_count, lanes): one law in the first ``lanes`` lanes.
 
 It reads the rows ``LAW_THETA`` to ``LAW_NOMINAL`` of the state and adds its result to the row ``TERM_TORQUE`` or
 ``TERM_SLOPE``. A torque law sets the rows ``LAW_DZ``. The rows are the same for all laws and stages, so the compiler
@@ -75,7 +75,7 @@ def _data_address(array):  # type: ignore[no-untyped-def]
 
 
 @njit(_LANE_LAW, cache=True)
-def no_law(state, t, other, volt, p, p_count, used):  # type: ignore[no-untyped-def]
+def no_law(state, t, other, volt, p, p_count, lanes):  # type: ignore[no-untyped-def]
     """The law in the place of a term that is not there. The kernel never calls it."""
 
 
@@ -86,23 +86,23 @@ def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
     numba caches the function on disk under the values in its closure: the name of the law, and ``law_content``, which
     changes whenever the law's code does.
     """
-    inlined, code = register_jitable(law.py_func), law.py_func.__code__  # type: ignore[attr-defined]
+    inlined, code = register_jitable(forceinline=True)(law.py_func), law.py_func.__code__  # type: ignore[attr-defined]
     law_content = repr((code.co_code, code.co_consts, code.co_names))
 
-    def torque(state, t, other, volt, p, p_count, used):  # type: ignore[no-untyped-def]
+    def torque(state, t, other, volt, p, p_count, lanes):  # type: ignore[no-untyped-def]
         law_content  # noqa: B018
         s, table = carray(_pointer(state), (ROWS, LANES)), _pointer(p)
-        for lane in range(used):
+        for lane in range(lanes):
             added, s[LAW_DZ, lane], s[LAW_DZ + 1, lane] = inlined(
                 t, s[LAW_THETA, lane], s[LAW_OMEGA, lane], other, volt, s[LAW_Z, lane], s[LAW_Z + 1, lane],
                 lane_parameters(table, lane), _nominal(s, lane),
             )  # fmt: skip
             s[TERM_TORQUE, lane] += added
 
-    def slope(state, t, other, volt, p, p_count, used):  # type: ignore[no-untyped-def]
+    def slope(state, t, other, volt, p, p_count, lanes):  # type: ignore[no-untyped-def]
         law_content  # noqa: B018
         s, table = carray(_pointer(state), (ROWS, LANES)), _pointer(p)
-        for lane in range(used):
+        for lane in range(lanes):
             s[TERM_SLOPE, lane] += inlined(s[LAW_THETA, lane], lane_parameters(table, lane), _nominal(s, lane))[1]
 
     lane_law = torque if law.nopython_signatures[0] == TORQUE_LAW else slope  # type: ignore[attr-defined]
@@ -134,8 +134,8 @@ def _terms(s, laws):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)
-def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, terms, used):  # type: ignore[no-untyped-def]
-    """Set ``TERM_TORQUE``, ``TERM_SLOPE`` and the derivatives ``dz_row`` of the hidden states, in all used lanes."""
+def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, terms, lanes):  # type: ignore[no-untyped-def]
+    """Set ``TERM_TORQUE``, ``TERM_SLOPE`` and the derivatives ``dz_row`` of the hidden states, in ``lanes`` lanes."""
     # Unpacked, because an index into the tuple would copy all of its functions at every call.
     (first, second, third, fourth), n, p, count, slopes, m, slopes_p, slopes_count, state, hidden = terms
     s = carray(_pointer(state), (ROWS, LANES))
@@ -145,23 +145,23 @@ def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, terms, 
     of_term = count * LANES * BYTES_PER_FLOAT
     if n > 0:
         _read_hidden_states(state, z_row, hidden)
-        first(state, t, other, volt, p, count, used)
+        first(state, t, other, volt, p, count, lanes)
         _store_derivatives(state, dz_row, hidden)
     if n > 1:
         _read_hidden_states(state, z_row + 2, hidden)
-        second(state, t, other, volt, p + of_term, count, used)
+        second(state, t, other, volt, p + of_term, count, lanes)
         _store_derivatives(state, dz_row + 2, hidden)
     if n > 2:
         _read_hidden_states(state, z_row + 4, hidden)
-        third(state, t, other, volt, p + 2 * of_term, count, used)
+        third(state, t, other, volt, p + 2 * of_term, count, lanes)
         _store_derivatives(state, dz_row + 4, hidden)
     if n > 3:
         _read_hidden_states(state, z_row + 6, hidden)
-        fourth(state, t, other, volt, p + 3 * of_term, count, used)
+        fourth(state, t, other, volt, p + 3 * of_term, count, lanes)
         _store_derivatives(state, dz_row + 6, hidden)
     of_term = slopes_count * LANES * BYTES_PER_FLOAT
     for i in range(m):
-        slopes[i](state, t, other, volt, slopes_p + i * of_term, slopes_count, used)
+        slopes[i](state, t, other, volt, slopes_p + i * of_term, slopes_count, lanes)
 
 
 @njit(forceinline=True)
@@ -228,34 +228,34 @@ def _integrate(start, voltage, other, t, step, laws, width, angle, rate):  # typ
         s[THETA_TH, lane], s[TORQUE_PER_VOLT, lane] = theta_th, torque_per_volt
     s[STAGE_Z : STAGE_Z + 2 * MAX_TERMS_PER_STAGE] = s[Z : Z + 2 * MAX_TERMS_PER_STAGE]
     angle[:, 0], rate[:, 0] = start[:, 0], start[:, 1]
-    terms = _terms(s, laws)
+    terms, law_lanes = _terms(s, laws), 1 if used == 1 else width  # whole vectors where there are several
     for i in range(voltage.shape[0]):
         v0, v1, v2 = voltage[i, 0], voltage[i, 1], voltage[i, 2]
         e0, e1, e2 = laws[7] * v0, laws[7] * v1, laws[7] * v2
         o0, o1, o2 = other[i, 0], other[i, 1], other[i, 2]
         if any_term:
-            _evaluate_terms(t, THETA, OMEGA, Z, DZ1, o0, v0, terms, used)
+            _evaluate_terms(t, THETA, OMEGA, Z, DZ1, o0, v0, terms, law_lanes)
             _set_stage_z(DZ1, half, s, hidden_states, width)
         for lane in range(width):
             s[ALPHA1, lane] = _acceleration(s, lane, THETA, OMEGA, v0, electrostatic, e0)
             s[OMEGA2, lane] = s[OMEGA, lane] + half * s[ALPHA1, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA, lane]
         if any_term:
-            _evaluate_terms(t + half, STAGE_THETA, OMEGA2, STAGE_Z, DZ2, o1, v1, terms, used)
+            _evaluate_terms(t + half, STAGE_THETA, OMEGA2, STAGE_Z, DZ2, o1, v1, terms, law_lanes)
             _set_stage_z(DZ2, half, s, hidden_states, width)
         for lane in range(width):
             s[ALPHA2, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA2, v1, electrostatic, e1)
             s[OMEGA3, lane] = s[OMEGA, lane] + half * s[ALPHA2, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + half * s[OMEGA2, lane]
         if any_term:
-            _evaluate_terms(t + half, STAGE_THETA, OMEGA3, STAGE_Z, DZ3, o1, v1, terms, used)
+            _evaluate_terms(t + half, STAGE_THETA, OMEGA3, STAGE_Z, DZ3, o1, v1, terms, law_lanes)
             _set_stage_z(DZ3, step, s, hidden_states, width)
         for lane in range(width):
             s[ALPHA3, lane] = _acceleration(s, lane, STAGE_THETA, OMEGA3, v1, electrostatic, e1)
             s[OMEGA4, lane] = s[OMEGA, lane] + step * s[ALPHA3, lane]
             s[STAGE_THETA, lane] = s[THETA, lane] + step * s[OMEGA3, lane]
         if any_term:
-            _evaluate_terms(t + step, STAGE_THETA, OMEGA4, STAGE_Z, DZ4, o2, v2, terms, used)
+            _evaluate_terms(t + step, STAGE_THETA, OMEGA4, STAGE_Z, DZ4, o2, v2, terms, law_lanes)
             for k in range(hidden_states):
                 for lane in range(width):
                     rates = s[DZ1 + k, lane] + 2.0 * s[DZ2 + k, lane] + 2.0 * s[DZ3 + k, lane] + s[DZ4 + k, lane]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit
 
 from scanner.integrator.abi import TORQUE_LAW
-from scanner.integrator.exponential import negative_exponential
+from scanner.integrator.elementary import negative_exponential
 from scanner.terms.term import Parameter, Term
 
 

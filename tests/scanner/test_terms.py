@@ -13,7 +13,7 @@ from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.integrator.abi import LANES, Nominal
-from scanner.integrator.exponential import negative_exponential
+from scanner.integrator.elementary import cosine_of_half_turns, negative_exponential
 from scanner.integrator.trajectories import CapacitanceTerm, TorqueTerm, TrajectorySpec, integrate, integrate_batch
 from scanner.stages import Capacitance, Drive, Mechanics, Position
 from scanner.terms import STAGES, NaturalScales, apply_lowpass, catalogue, load_terms, shift_samples
@@ -247,6 +247,11 @@ def test_exponential_of_the_kernel_agrees_with_numpy() -> None:
     np.testing.assert_allclose([negative_exponential(value) for value in (*x, 0.0)], np.exp([*x, 0.0]), rtol=4e-16)
     assert negative_exponential(-1e9) < 1e-300
     assert negative_exponential(-np.inf) < 1e-300
+
+
+def test_cosine_of_half_turns() -> None:
+    x = np.linspace(-2.0, 7.0, 901)
+    np.testing.assert_allclose([cosine_of_half_turns(value) for value in x], np.cos(np.pi * x), atol=1e-11)
 
 
 def test_user_term_changes_the_motion(tmp_path) -> None:  # type: ignore[no-untyped-def]

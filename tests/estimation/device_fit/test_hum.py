@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.blind.generator import Case
+from estimation.device_fit.hum import select_mains_hum
 from estimation.device_fit.mains import Mains
 from tests.support.blind_recordings import search_blind_recording
 
@@ -26,3 +27,4 @@ def test_weak_hum_keeps_three_harmonics_at_the_nominal_frequency(tmp_path: Path)
     assert not search.steps
     assert max(blind.noise.hum) > 0.9 * blind.noise.sd
     assert search.final.model.mains == (Mains(50.0),)
+    assert select_mains_hum(search.likelihood, search.final) is search.final
