@@ -95,7 +95,7 @@ def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
         for lane in range(lanes):
             added, s[LAW_DZ, lane], s[LAW_DZ + 1, lane] = inlined(
                 t, s[LAW_THETA, lane], s[LAW_OMEGA, lane], other, volt, s[LAW_Z, lane], s[LAW_Z + 1, lane],
-                lane_parameters(table, lane), _nominal(s, lane),
+                lane_parameters(table, p_count, lane), _nominal(s, lane),
             )  # fmt: skip
             s[TERM_TORQUE, lane] += added
 
@@ -103,7 +103,9 @@ def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
         law_content  # noqa: B018
         s, table = carray(_pointer(state), (ROWS, LANES)), _pointer(p)
         for lane in range(lanes):
-            s[TERM_SLOPE, lane] += inlined(s[LAW_THETA, lane], lane_parameters(table, lane), _nominal(s, lane))[1]
+            s[TERM_SLOPE, lane] += inlined(
+                s[LAW_THETA, lane], lane_parameters(table, p_count, lane), _nominal(s, lane)
+            )[1]
 
     lane_law = torque if law.nopython_signatures[0] == TORQUE_LAW else slope  # type: ignore[attr-defined]
     return FunctionAddress(njit(_LANE_LAW, cache=True, nogil=True, **_COMPILER_OPTIONS)(lane_law))

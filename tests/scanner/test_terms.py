@@ -210,6 +210,16 @@ def test_every_term_has_no_effect_at_zero_and_a_description() -> None:
         assert set(term.confounders) <= set(catalogue()), effect
 
 
+def test_law_may_count_its_parameters_and_index_them_from_the_end(tmp_path: Path) -> None:
+    path, made = tmp_path / "mine.py", []
+    for law in ("-p[0] * theta**7", "-p[-1] * len(p) * theta**7"):
+        path.write_text(USER_TERM.replace("-p[0] * theta**7", law))
+        torque = TorqueTerm(load_terms(path)["septic-stiffness"].torque, (1e-6,))
+        made.append(integrate(LINEAR, (0.1, 0.0), np.zeros((500, 3)), STEP, torques=[torque])[0])
+    assert USER_TERM.count("-p[0] * theta**7") == 1
+    np.testing.assert_array_equal(*made)
+
+
 def test_changed_law_is_compiled_again(tmp_path: Path) -> None:
     """numba stores compiled laws on disk by their name."""
     for power, effect in ((3, "cubic-stiffness"), (5, "quintic-stiffness"), (3, "cubic-stiffness")):
