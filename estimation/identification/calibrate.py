@@ -256,9 +256,12 @@ class _AxisIdentification:
         if several and self.gain_tolerance:
             for key in ("J", "b", "k"):
                 self.by_torque[key] = float(np.hypot(self.by_torque[key], self.gain_tolerance * self.values[key].value))
-        if self.decays and not several and not any(volt for _, _, volt in self.decays):
+        if self.decays and not several and not self.values["J"].sd:
+            has_bias = any(volt for _, _, volt in self.decays)
+            cause = "the bias has no visible effect, without which " if has_bias else ""
             self.notes.append(
-                f"{self.name}: J is the nominal one; a free decay determines only k/J and b/J, driven motion also J"
+                f"{self.name}: J is the nominal one; {cause}a free decay determines only k/J and b/J, driven motion "
+                "also J"
             )
 
     def _take(self, axis: Axis, fit: Callable[[Axis], dict[str, IdentifiedValue]]) -> None:

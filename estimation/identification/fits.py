@@ -31,6 +31,9 @@ STEPS_PER_CYCLE = 80
 MAX_RINGDOWN_RESIDUAL_RATIO = 0.3
 """Standard deviation of a ringdown's residual, relative to the signal, above which the fit is rejected."""
 
+MIN_INVERSE_INERTIA = 1e-3
+"""Least 1/J of a decay under a bias, relative to the stated one: there the bias has no visible effect."""
+
 SETTLE_TIME_S = 1e-4
 """Time that low-pass sections of usual corner frequencies (40 kHz) need to settle, with a margin."""
 
@@ -132,6 +135,8 @@ def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, 
 def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, IdentifiedValue], Array]:
     """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, under a bias, ``J`` from a free decay, by fitting its trajectory.
 
+    J is left out where the 95 % interval of 1/J contains zero: then the bias changes the decay too little.
+
     Args:
         angle: shape (n,) [rad]. rate: [Hz].
         axis: start of the fit, and the capacitance on which a bias acts.
@@ -158,19 +163,20 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
     scale = np.array([1e-3 * w0, 0.1 * loss0, 0.01 * np.abs(used).max(), 0.01 * w0 * np.abs(used).max(), 0.1])
 
     def trajectory(x: Array) -> Array:
-        w, loss, theta, omega, log_inverse = start + scale * np.append(x, np.zeros(5 - x.size))
-        J = mechanics.J * np.exp(-log_inverse)
+        w, loss, theta, omega, inverse = start + scale * np.append(x, np.zeros(5 - x.size))
+        J = mechanics.J / inverse
         tried = Axis(Mechanics(J, max(loss, 1e-6 * loss0) * J, w * w * J), comb)  # a step of the fit may overshoot
         return integrate(tried, (theta, omega), voltage, step)[0][::steps_a_stride]
 
     around = np.arange(min(used.size, 2 * STEPS_PER_CYCLE))
     line = np.polynomial.polynomial.polyfit(around[:9] * stride / rate, used[:9], 3)
-    start = np.array([w0, loss0, line[0], line[1], 0.0])
+    start = np.array([w0, loss0, line[0], line[1], 1.0])
     free = 5 if comb else 4
-    x = np.zeros(free)
+    x, lowest = np.zeros(free), np.full(free, -np.inf)
+    lowest[4:] = (MIN_INVERSE_INERTIA - start[4]) / scale[4]
     for part in (used.size // 8, used.size // 3, used.size):  # growing windows keep the phase error below half a cycle
         if part > 4 * free:
-            fit = least_squares(lambda x, part=part: trajectory(x)[:part] - used[:part], x, x_scale=1.0, method="trf")
+            fit = least_squares(lambda x, part=part: trajectory(x)[:part] - used[:part], x, bounds=(lowest, np.inf))
             x = fit.x
     residual = used - trajectory(x)
     if residual.std() > MAX_RINGDOWN_RESIDUAL_RATIO * used.std():
@@ -185,9 +191,10 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
         "k_over_J": IdentifiedValue(float(w * w), float(2 * w * sd[0])),
         "b_over_J": IdentifiedValue(float(loss), float(sd[1])),
     }
-    if comb:
-        J = mechanics.J * np.exp(-scale[4] * x[4])
-        values["J"] = IdentifiedValue(float(J), float(J * sd[4]))
+    inverse = start[4] + scale[4] * x[4:]
+    if comb and inverse[0] > Z_95 * sd[4]:
+        J = mechanics.J / float(inverse[0])
+        values["J"] = IdentifiedValue(J, J * float(sd[4] / inverse[0]))
     return values, residual
 
 

@@ -99,6 +99,18 @@ def test_a_ringdown_determines_frequency_and_damping(decay):
     assert draws[0]["J"].sd > 20 * draws[0]["k_over_J"].sd / draws[0]["k_over_J"].value * m.J
 
 
+def test_a_decay_on_which_its_bias_has_no_effect_leaves_the_inertia_as_stated() -> None:
+    device = load("chen2019")
+    axis, time = device.axis("x"), np.arange(40_000) / 5e5
+    angle = 0.15 * np.exp(-60.0 * time) * np.cos(2 * np.pi * axis.resonance * time)
+    noisy = angle + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
+    channels = {"angle_x": (noisy, "rad", 5e5, 0.0), "bias_x": (np.full(time.size, 10.0), "V", 5e5, 0.0)}
+    found = identify([Recording.from_arrays(channels, device)], device)
+    assert "J" not in fit_ringdown(noisy, 5e5, axis, 10.0)[0]
+    assert found.device.axis("x").require_mechanics().J == axis.require_mechanics().J
+    assert any("the bias has no visible effect" in note for note in found.notes)
+
+
 def test_the_capacitance_profile_and_the_channel_delay_are_fitted(decay):
     axis = sensing_axis()
     comb = axis.require_capacitance()
