@@ -12,7 +12,7 @@ from math import comb, log
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
+from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.hum import select_mains_hum
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
@@ -85,22 +85,22 @@ def drop_redundant(likelihood: Likelihood, fit: Fit) -> tuple[Fit, dict[str, Fit
     fit = select_mains_hum(likelihood, fit)
     without = {}
     for candidate in uncertain(fit.model) if len(fit.model.candidates) > 1 else ():
-        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate, abort_above=misfit(fit)))
+        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate))
         if not evidence_gain(likelihood, reduced, fit):
             return drop_redundant(likelihood, reduced)
         without[candidate.key] = reduced
     return fit, without
 
 
-def fit_to_convergence(likelihood: Likelihood, model: Model, x: Array, abort_above: float = np.inf) -> Fit:
+def fit_to_convergence(likelihood: Likelihood, model: Model, x: Array) -> Fit:
     """``fit_model``, with more and smaller steps, and without an early end, where a law is linear in no amplitude."""
     if all(map(is_linear, uncertain(model))):
-        return fit_model(likelihood, model, x, abort_above=abort_above)
+        return fit_model(likelihood, model, x)
     return fit_model(likelihood, model, x, max_iterations=NONLINEAR_ITERATIONS, tolerance=NONLINEAR_TOLERANCE)
 
 
-def refit_without(likelihood: Likelihood, fit: Fit, candidate: Candidate, abort_above: float = np.inf) -> Fit:
-    """The fit refitted with one of its terms taken out; ``abort_above`` as in ``fit_model``."""
+def refit_without(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Fit:
+    """The fit refitted with one of its terms taken out."""
     kept = [other for other in fit.model.candidates if other is not candidate]
     model = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
-    return fit_to_convergence(likelihood, model, model.map_parameters_from(fit.model, fit.x), abort_above)
+    return fit_to_convergence(likelihood, model, model.map_parameters_from(fit.model, fit.x))
