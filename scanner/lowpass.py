@@ -94,20 +94,15 @@ def apply_lowpass(signal: Array, cutoff: float, step: float) -> Array:
     """
     if not np.isfinite(cutoff):
         return signal
-    filtered = np.empty(signal.size)
-    _run_smooth(signal, curvature_share(abs(cutoff), step), *section_coefficients(abs(cutoff), step), filtered)
+    filtered = _below_chord(signal, curvature_share(abs(cutoff), step))
+    run_section(filtered, *section_coefficients(abs(cutoff), step), filtered[0], filtered[0])
     return filtered if cutoff > 0 else 2.0 * signal - filtered
 
 
 @njit(cache=True, nogil=True)
-def _run_smooth(signal, share, e, p, q, out):  # type: ignore[no-untyped-def]
-    """:func:`run_section` from the first value on, of ``signal`` (n,) less ``share`` of its second differences."""
-    u = x = signal[0]
-    last = signal.size - 1
-    for i in range(signal.size):
-        new = signal[i]
-        if 0 < i < last:
-            new -= share * (signal[i + 1] - 2.0 * signal[i] + signal[i - 1])
-        u = e * u + p * x + q * new
-        x = new
-        out[i] = u
+def _below_chord(signal, share):  # type: ignore[no-untyped-def]
+    """A signal of shape (n,) less ``share`` of its second differences, in one pass."""
+    out = signal.copy()
+    for i in range(1, signal.size - 1):
+        out[i] -= share * (signal[i + 1] - 2.0 * signal[i] + signal[i - 1])
+    return out

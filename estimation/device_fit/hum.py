@@ -36,11 +36,12 @@ def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
     Where there is hum, the evidence also chooses between few and many harmonics, and between the nominal and the fitted
     frequency. Hum before a clip level is not linear: there fits choose between the nominal frequencies and none.
     """
-    if not any(_hum_columns(likelihood, fit, mains).size for mains in NOMINAL_MAINS):
+    columns = {mains: _hum_columns(likelihood, fit, mains) for mains in NOMINAL_MAINS}
+    if not any(each.size for each in columns.values()):
         return min(fit_hum_variants(likelihood, fit), key=lambda variant: variant.neg2_log_evidence)
     beside = _beside_hum(fit)
     without = beside.evaluate(np.zeros((beside.residual.size, 0)))[0]
-    lowest, strongest = min((beside.evaluate(_hum_columns(likelihood, fit, m))[0], m) for m in NOMINAL_MAINS)
+    lowest, strongest = min((beside.evaluate(each)[0], mains) for mains, each in columns.items())
     selected = min(_refined_mains(likelihood, fit, beside, strongest))[1:] if lowest < without else ()
     if selected == fit.model.mains:
         return fit

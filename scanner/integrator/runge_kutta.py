@@ -8,6 +8,7 @@ evaluates it in all lanes, because a call takes longer than most laws.
 
 from __future__ import annotations
 
+import linecache
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -83,14 +84,15 @@ def no_law(state, t, other, volt, p, p_count, lanes):  # type: ignore[no-untyped
 def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
     """Return the address of a function that evaluates ``law``, which has a signature of ``abi``, in all lanes.
 
-    numba caches the function on disk under the values in its closure: the name of the law, and ``law_content``, which
-    changes whenever the law's code does.
+    numba caches the function on disk under the values in its closure: the name of the law, and the text of the file
+    that defines it, with the constants and functions that it uses.
     """
-    inlined, code = register_jitable(forceinline=True)(law.py_func), law.py_func.__code__  # type: ignore[attr-defined]
-    law_content = repr((code.co_code, code.co_consts, code.co_names))
+    inlined = register_jitable(forceinline=True)(law.py_func)  # type: ignore[attr-defined]
+    linecache.checkcache(law.py_func.__code__.co_filename)  # type: ignore[attr-defined]
+    law_file = "".join(linecache.getlines(law.py_func.__code__.co_filename))  # type: ignore[attr-defined]
 
     def torque(state, t, other, volt, p, p_count, lanes):  # type: ignore[no-untyped-def]
-        law_content  # noqa: B018
+        law_file  # noqa: B018
         s, table = carray(_pointer(state), (ROWS, LANES)), _pointer(p)
         for lane in range(lanes):
             added, s[LAW_DZ, lane], s[LAW_DZ + 1, lane] = inlined(
@@ -100,7 +102,7 @@ def in_all_lanes(law: Callable[..., Any]) -> FunctionAddress:
             s[TERM_TORQUE, lane] += added
 
     def slope(state, t, other, volt, p, p_count, lanes):  # type: ignore[no-untyped-def]
-        law_content  # noqa: B018
+        law_file  # noqa: B018
         s, table = carray(_pointer(state), (ROWS, LANES)), _pointer(p)
         for lane in range(lanes):
             s[TERM_SLOPE, lane] += inlined(
@@ -146,42 +148,33 @@ def _evaluate_terms(t, theta_row, omega_row, z_row, dz_row, other, volt, terms, 
         s[TERM_TORQUE, lane], s[TERM_SLOPE, lane] = 0.0, 0.0
     of_term = count * LANES * BYTES_PER_FLOAT
     if n > 0:
-        _read_hidden_states(state, z_row, hidden)
-        first(state, t, other, volt, p, count, lanes)
-        _store_derivatives(state, dz_row, hidden)
+        _evaluate_torque(first, state, t, other, volt, p, count, lanes, z_row, dz_row, hidden)
     if n > 1:
-        _read_hidden_states(state, z_row + 2, hidden)
-        second(state, t, other, volt, p + of_term, count, lanes)
-        _store_derivatives(state, dz_row + 2, hidden)
+        _evaluate_torque(second, state, t, other, volt, p + of_term, count, lanes, z_row + 2, dz_row + 2, hidden)
     if n > 2:
-        _read_hidden_states(state, z_row + 4, hidden)
-        third(state, t, other, volt, p + 2 * of_term, count, lanes)
-        _store_derivatives(state, dz_row + 4, hidden)
+        _evaluate_torque(third, state, t, other, volt, p + 2 * of_term, count, lanes, z_row + 4, dz_row + 4, hidden)
     if n > 3:
-        _read_hidden_states(state, z_row + 6, hidden)
-        fourth(state, t, other, volt, p + 3 * of_term, count, lanes)
-        _store_derivatives(state, dz_row + 6, hidden)
+        _evaluate_torque(fourth, state, t, other, volt, p + 3 * of_term, count, lanes, z_row + 6, dz_row + 6, hidden)
     of_term = slopes_count * LANES * BYTES_PER_FLOAT
     for i in range(m):
         slopes[i](state, t, other, volt, slopes_p + i * of_term, slopes_count, lanes)
 
 
 @njit(forceinline=True)
-def _read_hidden_states(state, z_row, hidden):  # type: ignore[no-untyped-def]
-    """Give a law its hidden states, if any law has some."""
+def _evaluate_torque(law, state, t, other, volt, p, count, lanes, z_row, dz_row, hidden):  # type: ignore[no-untyped-def]
+    """Add a torque law; its hidden states, if any law has some, are read from and their derivatives stored in rows."""
     if hidden > 0:
-        s = carray(_pointer(state), (ROWS, LANES))
-        for lane in range(LANES):
-            s[LAW_Z, lane], s[LAW_Z + 1, lane] = s[z_row, lane], s[z_row + 1, lane]
+        _copy_two_rows(state, z_row, LAW_Z)
+    law(state, t, other, volt, p, count, lanes)
+    if hidden > 0:
+        _copy_two_rows(state, LAW_DZ, dz_row)
 
 
 @njit(forceinline=True)
-def _store_derivatives(state, dz_row, hidden):  # type: ignore[no-untyped-def]
-    """Keep the derivatives of a law's hidden states, if any law has some."""
-    if hidden > 0:
-        s = carray(_pointer(state), (ROWS, LANES))
-        for lane in range(LANES):
-            s[dz_row, lane], s[dz_row + 1, lane] = s[LAW_DZ, lane], s[LAW_DZ + 1, lane]
+def _copy_two_rows(state, source, target):  # type: ignore[no-untyped-def]
+    s = carray(_pointer(state), (ROWS, LANES))
+    for lane in range(LANES):
+        s[target, lane], s[target + 1, lane] = s[source, lane], s[source + 1, lane]
 
 
 @njit(forceinline=True, **_COMPILER_OPTIONS)

@@ -221,16 +221,21 @@ def test_law_may_count_its_parameters_and_index_them_from_the_end(tmp_path: Path
 
 
 def test_changed_law_is_compiled_again(tmp_path: Path) -> None:
-    """numba stores compiled laws on disk by their name."""
-    for power, effect in ((3, "cubic-stiffness"), (5, "quintic-stiffness"), (3, "cubic-stiffness")):
-        path = tmp_path / "mine.py"
-        path.write_text(USER_TERM.replace("theta**7", f"theta**{power}"))
-        (mine,) = (term for name, term in load_terms(path).items() if name == "septic-stiffness")
-        made = [
-            integrate(LINEAR, (0.1, 0.0), np.zeros((500, 3)), STEP, torques=[TorqueTerm(term.torque, (1e-6,))])[0]
-            for term in (mine, catalogue()[effect])
-        ]
-        np.testing.assert_allclose(*made, rtol=1e-12, atol=1e-15)
+    """numba stores compiled laws on disk by their name. The change may be in a constant or function of the file."""
+    helper = "POWER = 7\n\n@njit\ndef raised(x):\n    return x**POWER\n\n@njit(TORQUE_LAW)"
+    text = USER_TERM.replace("@njit(TORQUE_LAW)", helper).replace("theta**7", "raised(theta)")
+    for changed, replaced in ((USER_TERM, "theta**{}"), (text, "POWER = {}"), (text, "x**{}")):
+        for power, effect in ((3, "cubic-stiffness"), (5, "quintic-stiffness"), (3, "cubic-stiffness")):
+            path = tmp_path / "mine.py"
+            path.write_text(
+                changed.replace(replaced.format("POWER" if replaced[0] == "x" else 7), replaced.format(power))
+            )
+            (mine,) = (term for name, term in load_terms(path).items() if name == "septic-stiffness")
+            made = [
+                integrate(LINEAR, (0.1, 0.0), np.zeros((500, 3)), STEP, torques=[TorqueTerm(term.torque, (1e-6,))])[0]
+                for term in (mine, catalogue()[effect])
+            ]
+            np.testing.assert_allclose(*made, rtol=1e-12, atol=1e-15)
 
 
 def test_batch_of_motions_equals_the_single_motions() -> None:
