@@ -6,11 +6,8 @@ whitened by the noise that was estimated before. A fifth of the samples is held 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -19,22 +16,8 @@ from estimation.device_fit.data import Run
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener
 from estimation.least_squares import fit_levenberg_marquardt, laplace_neg2_log_evidence
+from estimation.parallel import map_fits, map_parallel
 from scanner.arrays import Array, Mask
-
-T = TypeVar("T")
-R = TypeVar("R")
-
-TRAJECTORY_POOL = ThreadPoolExecutor(
-    len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-)
-"""Threads for independent trajectories, one per processor: compiled code and numpy release the interpreter lock."""
-
-MAX_PARALLEL_FITS = 2
-"""Fits at a time. It is the same number on every machine because the fits already finished decide which later fits are
-aborted: results must not depend on the machine."""
-
-FIT_POOL = ThreadPoolExecutor(MAX_PARALLEL_FITS)
-"""Threads for independent fits. They wait for ``TRAJECTORY_POOL`` and must not run in it."""
 
 TIME_BLOCKS = 20
 """Blocks of equal duration into which a recording is divided for validation: short against a drift, long against a
@@ -203,14 +186,14 @@ class Likelihood:
         for i in set(range(x.size)) - set(additive):
             trials[i] = x.copy()
             trials[i][i] += steps[i]
-        model.prefetch_trajectories(list(trials.values()), stop, TRAJECTORY_POOL.map)
+        model.prefetch_trajectories(list(trials.values()), stop, map_parallel)
 
         def fill(i: int) -> None:
             columns[:, i] = (self.residual(model, trials[i], stop) - residual) / steps[i]
             norm = np.linalg.norm(columns[:, i])
             steps[i] = np.clip(STEP_CHANGE_SIGMA / norm if norm else STEP_WITHOUT_EFFECT, MIN_STEP, MAX_STEP)
 
-        list(TRAJECTORY_POOL.map(fill, trials))
+        map_parallel(fill, trials)
         return columns
 
 
@@ -240,7 +223,7 @@ def fit_model(
     rows = likelihood.fitted(stop)
 
     def residual(trial: Array) -> Array:
-        model.prefetch_trajectories([trial], stop, TRAJECTORY_POOL.map)
+        model.prefetch_trajectories([trial], stop, map_parallel)
         return likelihood.residual(model, trial, stop)
 
     result = fit_levenberg_marquardt(
@@ -271,14 +254,6 @@ def fit_models(
         return fit_model(likelihood, *start, stop, max_iterations, tolerance=tolerance, abort_above=abort_above)
 
     return map_fits(fit, starts)
-
-
-def map_fits(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """``function``, which makes fits one after the other, of each item, ``MAX_PARALLEL_FITS`` at a time, in order.
-
-    A function that calls this one itself would wait for its own thread.
-    """
-    return list(FIT_POOL.map(function, items))
 
 
 def linearise_at(likelihood: Likelihood, model: Model, x: Array, stop: float = 1.0) -> Fit:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from estimation.device_fit.data import Run, prepare_run
-from estimation.device_fit.fit import Fit, map_fits, nominal_values_are_improbable
+from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.further_modes import describe_modes, with_driven_modes
 from estimation.device_fit.open_loop import open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
@@ -15,6 +15,7 @@ from estimation.diagnosis.finding import METRIC, Finding, find_effect
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
 from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
+from estimation.parallel import map_fits
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, map_fits, misfit
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
 from estimation.device_fit.initial import estimate_whiteners
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.discrepancy import is_discrepancy
@@ -25,6 +25,7 @@ from estimation.diagnosis.linear_model import (
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
 from estimation.diagnosis.necessity import need_of_laws
 from estimation.diagnosis.significance import satisfies_sign_constraints
+from estimation.parallel import map_fits
 
 MAX_LINEARISATIONS = 8
 """Fits around which laws are selected, each with the laws selected before."""

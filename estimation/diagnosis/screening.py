@@ -8,9 +8,10 @@ from itertools import product
 
 import numpy as np
 
-from estimation.device_fit.fit import TRAJECTORY_POOL, Fit, Likelihood
+from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
+from estimation.parallel import map_parallel
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.integrator.abi import LANES
@@ -103,7 +104,7 @@ def score_candidate_starts(
     def score(candidate: Candidate) -> list[ScoreTest]:
         return _score_starts(likelihood, base, candidate, profiled, stop)
 
-    return list(TRAJECTORY_POOL.map(score, candidates))
+    return map_parallel(score, candidates)
 
 
 def _score_starts(

@@ -11,7 +11,6 @@ from estimation.device_fit.fit import (
     Likelihood,
     fit_model,
     fit_models,
-    map_fits,
     misfit,
     nominal_values_are_improbable,
 )
@@ -41,6 +40,7 @@ from estimation.diagnosis.necessity import MAX_REMAINDER_RATIO, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import all_candidates, damped_start
 from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
+from estimation.parallel import map_fits
 from scanner.device import Device
 from scanner.terms import Term
 
@@ -284,7 +284,8 @@ def _with_nonlinear_term(
         return selected
     bases = [selected.nominal]
     if uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates)):
-        takes_bulk = misfit(selected.fit) < MAX_REMAINDER_RATIO * misfit(selected.nominal)
+        explained = misfit(selected.nominal) - misfit(selected.fit)
+        takes_bulk = selected.remaining < MAX_REMAINDER_RATIO * explained
         bases = [selected.fit] if takes_bulk else [selected.nominal, selected.fit]
     scored = [
         (base, score)

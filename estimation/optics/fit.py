@@ -9,6 +9,7 @@ import numpy as np
 from estimation.least_squares import fit_levenberg_marquardt
 from estimation.optics.samples import OpticsParameters, ScanSamples, measure_cell_variances, project_samples
 from estimation.optics.scene import CellVariances, SamplingGeometry, SceneFit, SceneSolver, render_intensity
+from estimation.parallel import map_parallel
 from scanner.arrays import Array
 from scanner.device import AXES
 
@@ -94,12 +95,15 @@ class _Residuals:
         Source: Kaufman, "A variable projection method", BIT 15, 49 (1975).
         """
         scene = self.evaluate(x).scene
-        columns = np.zeros((self.scan.intensity.size + 1, x.size))
-        for k, step in enumerate(np.diag(self.steps)):
+        columns, steps = np.zeros((self.scan.intensity.size + 1, x.size)), np.diag(self.steps)
+
+        def fill(k: int) -> None:
             ahead, behind = (
-                render_intensity(self.geometry(x + sign * step), scene, self.scan.run_bounds) for sign in (1.0, -1.0)
+                render_intensity(self.geometry(x + step), scene, self.scan.run_bounds) for step in (steps[k], -steps[k])
             )
             columns[:-1, k] = -self.solver.project_out_scene((ahead - behind) / (2 * self.steps[k]))
+
+        map_parallel(fill, range(x.size))
         return columns / np.sqrt(self.variances.noise)
 
 

@@ -16,6 +16,7 @@ from estimation.optics.samples import (
     project_samples,
 )
 from estimation.optics.scene import CellVariances
+from estimation.parallel import map_parallel
 from scanner.arrays import Array
 from scanner.device import AXES, Device
 from scanner.motion import Motion
@@ -117,7 +118,11 @@ def _starts(scan: ScanSamples, rates: Mapping[str, float]) -> list[OpticsParamet
     for names, step, largest in grids:
         delays = step * np.arange(-np.ceil(largest / step), np.ceil(largest / step) + 1)
         trials += [{**NOMINAL, **dict.fromkeys(names, float(delay))} for delay in delays]
-    noise = [measure_cell_variances(few, project_samples(few, p, MIN_CELLS), MIN_CELLS).noise for p in trials]
+
+    def noise_of(trial: OpticsParameters) -> float:
+        return measure_cell_variances(few, project_samples(few, trial, MIN_CELLS), MIN_CELLS).noise
+
+    noise = map_parallel(noise_of, trials)
     best = int(np.argmin(noise))
     return [NOMINAL, trials[best]] if noise[best] < IMPROVEMENT_RATIO * noise[0] else [NOMINAL]
 
