@@ -29,6 +29,10 @@ error grows with the square of the length."""
 MAX_WINDOW_GROWTH, MIN_WINDOW_GROWTH = 3.0, 1.1
 """Largest and smallest ratio of the lengths of successive windows."""
 
+MAX_CORRECTABLE_RATIO = 0.5
+"""That ratio up to which a fit over a longer window corrects the phase: an error of half a radian, from which
+Gauss-Newton steps converge."""
+
 MAX_SIGNAL = 1e100
 """Signal from which a trajectory has diverged: its square would overflow."""
 
@@ -42,20 +46,25 @@ def residual_ratio(likelihood: Likelihood, fit: Fit, stop: float = 1.0) -> float
     It is taken over parts of the window, each as long as the first window of a fit: late in a decay the phase may be
     lost although the residual is small. A diverging trajectory has an infinite ratio.
     """
+    return float(_residual_ratios(likelihood, fit, stop).max())
+
+
+def _residual_ratios(likelihood: Likelihood, fit: Fit, stop: float) -> Array:
+    """The ratio in each part of a window, shape (parts,), in the channel where it is largest."""
     parts = int(np.clip(round(stop / window_schedule(fit.model)[0]), 1, TIME_BLOCKS))
-    ratios = [0.0]
+    largest = np.zeros(parts)
     for run, whiteners, signals in zip(
         fit.model.runs, likelihood.whiteners, fit.model.outputs(fit.x, stop), strict=True
     ):
         for output, whitener, signal in zip(run.outputs, whiteners, signals, strict=True):
-            if not np.all(np.abs(signal) < MAX_SIGNAL):
-                return np.inf
-            data = output.data[: signal.size]
-            for part, misfit in zip(np.array_split(data, parts), np.array_split(data - signal, parts), strict=True):
-                motion = float(np.var(part)) - whitener.noise_variance
-                if motion > whitener.noise_variance:
-                    ratios.append(np.sqrt(max(float(np.var(misfit)) - whitener.noise_variance, 0.0) / motion))
-    return float(max(ratios))
+            data, noise = output.data[: signal.size], whitener.noise_variance
+            for i, rows in enumerate(np.array_split(np.arange(signal.size), parts)):
+                if not np.all(np.abs(signal[rows]) < MAX_SIGNAL):
+                    largest[i] = np.inf
+                elif (motion := float(np.var(data[rows])) - noise) > noise:
+                    misfit = max(float(np.var(data[rows] - signal[rows])) - noise, 0.0)
+                    largest[i] = max(largest[i], np.sqrt(misfit / motion))
+    return largest
 
 
 def max_residual_ratio(likelihood: Likelihood, first: Fit, stop: float) -> float:
@@ -92,7 +101,7 @@ def fit_anchor(
         with_terms = [*nominal.model.candidates, *terms]
         model = Model(nominal.model.runs, nominal.model.device, with_terms, nominal.model.mains)
         start = model.map_parameters_from(early[reached].model, early[reached].x)
-        fits.append(fit_growing(likelihood, model, start, stops[reached], limit))
+        fits.append(fit_growing(likelihood, model, start, stops[reached], max(limit, MAX_CORRECTABLE_RATIO)))
         if residual_ratio(likelihood, fits[-1]) < limit:
             return fits[-1], fits
     return nominal, fits
@@ -103,30 +112,31 @@ def fit_growing(
     model: Model,
     x: Array,
     reached: float,
-    limit: float = MAX_RESIDUAL_RATIO,
+    limit: float = MAX_CORRECTABLE_RATIO,
     fixed: Sequence[int] = (),
 ) -> Fit:
     """Fit over windows that grow as fast as the motion is followed, from one of the length ``reached`` on.
 
-    Where it is not followed over a slightly longer window either, the whole recording is fitted from there.
+    Each window is as long as the fit over the one before predicts the motion. Where even the fit over such a window
+    loses it, another effect is missing, and the whole recording is fitted from there.
 
     Args:
         x: start, shape (p,).
-        limit: largest residual ratio with which the motion is followed.
+        limit: residual ratio up to which a fit over a longer window corrects the phase.
         fixed: indices of parameters that keep their value.
     """
-    growth, stop = MAX_WINDOW_GROWTH, reached
+    stop = reached
     while True:
         fit = fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=WINDOW_TOLERANCE, fixed=fixed)
-        if stop == reached or residual_ratio(likelihood, fit, stop) < limit:
-            if stop >= 1.0:
-                return fit
-            reached, x = stop, fit.x
-            growth = min(growth * growth, MAX_WINDOW_GROWTH)
-        elif growth < MIN_WINDOW_GROWTH:
-            if stop >= 1.0:
-                return fit
-            return fit_model(likelihood, model, fit.x, 1.0, WINDOW_ITERATIONS, tolerance=WINDOW_TOLERANCE, fixed=fixed)
-        else:
-            growth = np.sqrt(growth)
-        stop = min(1.0, reached * growth)
+        if stop >= 1.0:
+            return fit
+        lost = stop > reached and residual_ratio(likelihood, fit, stop) > limit
+        x, stop = fit.x, 1.0 if lost else _next_window(likelihood, fit, stop, limit)
+
+
+def _next_window(likelihood: Likelihood, fit: Fit, stop: float, limit: float) -> float:
+    """End of the window after that of ``fit`` over ``stop``: with the first part in which that fit loses the motion."""
+    longest = min(1.0, MAX_WINDOW_GROWTH * stop)
+    lost = _residual_ratios(likelihood, fit, longest) > limit
+    predicted = longest * (np.argmax(lost) + 1) / lost.size if lost.any() else longest
+    return float(min(longest, max(predicted, MIN_WINDOW_GROWTH * stop)))
