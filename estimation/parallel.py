@@ -11,8 +11,8 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MAX_PARALLEL_FITS = 2
-"""Fits at a time. It is the same number on every machine because the fits already finished decide which later fits are
-aborted: results must not depend on the machine."""
+"""Fits at a time: one waits where the other's parts do not occupy all processors. Every fit holds a Jacobian of all
+samples, so more fits would take much memory."""
 
 _PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 

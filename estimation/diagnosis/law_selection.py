@@ -23,7 +23,7 @@ from estimation.diagnosis.linear_model import (
     RivalFit,
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
-from estimation.diagnosis.necessity import need_of_laws
+from estimation.diagnosis.necessity import Need, need_of_laws
 from estimation.diagnosis.significance import satisfies_sign_constraints
 from estimation.parallel import map_fits
 
@@ -42,16 +42,14 @@ class Choice(NamedTuple):
         likelihood: under the noise that they leave.
         before, fit: of the nominal device, and of the device with them.
         rivals: other laws in the place of each, by its key.
-        remaining: fall of -2 log evidence by free corrections of all stages beside them.
-        certain: whether they are the answer if no law is found beside them; see :class:`necessity.Need`.
+        need: whether they are the answer beside free corrections.
     """
 
     likelihood: Likelihood
     before: Fit
     fit: Fit
     rivals: dict[str, tuple[RivalFit, ...]]
-    remaining: float
-    certain: bool
+    need: Need
 
 
 class _Selection(NamedTuple):
@@ -96,7 +94,7 @@ def choose_laws(
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     linear_rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
     rivals = {key: _with_fitted_rivals(key, of_law, fit, end.compared) for key, of_law in linear_rivals.items()}
-    return Choice(likelihood, before, fit, rivals, need.remaining, need.certain)
+    return Choice(likelihood, before, fit, rivals, need)
 
 
 def _iterate_selection(

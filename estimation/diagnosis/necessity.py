@@ -36,12 +36,18 @@ class Need(NamedTuple):
     Attributes:
         possible: they may be, as a base beside which another law is sought.
         certain: and they are the answer if no other law is found.
+        takes_bulk: whether they leave little to corrections; see ``MAX_REMAINDER_RATIO``.
         remaining: fall of -2 log evidence by free corrections of all stages beside them.
     """
 
     possible: bool
     certain: bool
+    takes_bulk: bool
     remaining: float
+
+
+NO_LAWS = Need(possible=False, certain=True, takes_bulk=False, remaining=0.0)
+"""Of the nominal device and of a discrepancy term, beside which there are no laws."""
 
 
 def need_of_laws(linear: LinearModel, laws: Sequence[int], explained: float, alone: float) -> Need:
@@ -62,8 +68,9 @@ def need_of_laws(linear: LinearModel, laws: Sequence[int], explained: float, alo
     advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
     springs = [axis for axis, effect in linear.effects(laws) if effect in POLYNOMIAL_SPRINGS]
     series = len(springs) > len(set(springs))
-    bulk = remaining <= MIN_SCORE_GAIN or (remainder < MAX_REMAINDER_RATIO * explained and not series)
+    takes_bulk = remaining <= MIN_SCORE_GAIN or (remainder < MAX_REMAINDER_RATIO * explained and not series)
     possible = explained >= MIN_EXPLAINED_RATIO * remainder and advantage > (
-        -MIN_SCORE_GAIN if bulk else SMALL_LAW_MARGIN
+        -MIN_SCORE_GAIN if takes_bulk else SMALL_LAW_MARGIN
     )
-    return Need(possible, possible and (bulk or advantage > MIN_ADVANTAGE_RATIO * remainder), remaining)
+    certain = possible and (takes_bulk or advantage > MIN_ADVANTAGE_RATIO * remainder)
+    return Need(possible, certain, takes_bulk, remaining)

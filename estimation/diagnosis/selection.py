@@ -22,7 +22,7 @@ from estimation.device_fit.initial import (
     window_schedule,
 )
 from estimation.device_fit.interference import with_interference_line
-from estimation.device_fit.model import Model, uncertain
+from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, fit_growing, residual_ratio
 from estimation.diagnosis.clipping import clipped_readouts
@@ -36,7 +36,7 @@ from estimation.diagnosis.from_stated_values import (
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
-from estimation.diagnosis.necessity import MAX_REMAINDER_RATIO, need_of_laws
+from estimation.diagnosis.necessity import NO_LAWS, Need, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import all_candidates, damped_start
 from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
@@ -112,8 +112,7 @@ class _Selected:
         nominal, fit: without them, and with them.
         without: fits without one of several terms, by its key.
         rivals: of each by its key.
-        remaining: fall of -2 log evidence by free corrections of all stages beside named laws; 0 without them.
-        certain: whether they are the answer; otherwise a discrepancy term is.
+        need: whether they are the answer beside free corrections.
     """
 
     likelihood: Likelihood
@@ -121,8 +120,7 @@ class _Selected:
     fit: Fit
     without: Mapping[str, Fit] = field(default_factory=dict)
     rivals: Mapping[str, tuple[RivalFit, ...]] = field(default_factory=dict)
-    remaining: float = 0.0
-    certain: bool = True
+    need: Need = NO_LAWS
 
 
 def select_terms(
@@ -152,7 +150,7 @@ def select_terms(
     progress(f"{len(pool)} candidates")
     selected = _choose_terms(likelihood, nominal, early, stops, pool, progress)
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
-    return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps, selected.remaining)
+    return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps, selected.need.remaining)
 
 
 def _choose_terms(
@@ -172,7 +170,7 @@ def _choose_terms(
     selected = _choose_laws(anchor, nominal, pool, progress)
     if selected is not None:
         selected = _with_nonlinear_term(selected, nominal, pool, stops[0], progress)
-        if selected.certain:
+        if selected.need.certain:
             return selected
     progress("discrepancy terms")
     of_discrepancy = [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])]
@@ -180,7 +178,7 @@ def _choose_terms(
     if discrepancy is None:
         return _with_nonlinear_term(_Selected(likelihood, nominal, nominal), nominal, pool, stops[0], progress)
     laws = _choose_laws(discrepancy.fit, nominal, pool, progress)
-    return _with_nonlinear_term(laws if laws and laws.certain else discrepancy, nominal, pool, stops[0], progress)
+    return _with_nonlinear_term(laws if laws and laws.need.certain else discrepancy, nominal, pool, stops[0], progress)
 
 
 def _choose_from_stated_values(
@@ -224,7 +222,7 @@ def _choose_from_stated_values(
 
 def _is_answer(selected: _Selected) -> bool:
     """Whether selected laws are the answer and have left the nominal values probable."""
-    return selected.certain and not nominal_values_are_improbable(selected.fit)
+    return selected.need.certain and not nominal_values_are_improbable(selected.fit)
 
 
 def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected | None:
@@ -235,7 +233,7 @@ def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress:
     fit, without = drop_redundant(choice.likelihood, choice.fit)
     if not evidence_gain(choice.likelihood, choice.before, fit):
         return None
-    return _Selected(choice.likelihood, choice.before, fit, without, choice.rivals, choice.remaining, choice.certain)
+    return _Selected(choice.likelihood, choice.before, fit, without, choice.rivals, choice.need)
 
 
 def _choose_discrepancy(
@@ -280,13 +278,11 @@ def _with_nonlinear_term(
         first: end of the first window of a fit over growing windows, as a fraction of the recordings. A mode that grows
             is determined early, while the misfit of the whole recording has several minima.
     """
-    if selected.remaining < 0.0:
+    if selected.need.remaining < 0.0:
         return selected
     bases = [selected.nominal]
-    if uncertain(selected.fit.model) and not any(map(is_discrepancy, selected.fit.model.candidates)):
-        explained = misfit(selected.nominal) - misfit(selected.fit)
-        takes_bulk = selected.remaining < MAX_REMAINDER_RATIO * explained
-        bases = [selected.fit] if takes_bulk else [selected.nominal, selected.fit]
+    if selected.need.possible:
+        bases = [selected.fit] if selected.need.takes_bulk else [selected.nominal, selected.fit]
     scored = [
         (base, score)
         for base in bases
@@ -325,7 +321,7 @@ def _choose_beside_nonlinear_term(
     likelihood = Likelihood(with_law.model.runs, estimate_whiteners(with_law.model, with_law.x))
     before = fit_model(likelihood, nominal.model, nominal.x)
     fit, removed = drop_redundant(likelihood, fit_model(likelihood, with_law.model, with_law.x))
-    return _Selected(likelihood, before, fit, removed, remaining=need.remaining, certain=need.certain)
+    return _Selected(likelihood, before, fit, removed, need=need)
 
 
 def _step(selected: _Selected, candidate: Candidate) -> SelectionStep:
