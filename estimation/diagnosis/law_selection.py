@@ -19,6 +19,7 @@ from estimation.diagnosis.linear_model import (
     MIN_EXCHANGE_GAIN,
     MIN_SCORE_GAIN,
     Effects,
+    Hypothesis,
     LinearModel,
     RivalFit,
 )
@@ -244,22 +245,29 @@ def _exchange_near_rival(
     """The fit with one law exchanged that has a better evidence around itself; None where there is none.
 
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
-    ``MIN_SCORE_GAIN`` are fitted, each once, and compared around their own fits.
+    ``MIN_SCORE_GAIN`` are fitted, each once, the best in the place of every law first, and compared around their own
+    fits. Where corrections gain no more than that beside the laws, they have no part in the comparison: beside a fit
+    that leaves only noise, one that leaves more to corrections is not a better one.
 
     Returns:
         that fit, and all fits that were compared under the same noise.
     """
-    discrepancies = list(filter(is_discrepancy, candidates))
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
-    best, lowest = None, hypothesis.neg2_log_evidence - MIN_EXCHANGE_GAIN
+    alone = linear.without_discrepancy(present)
+    leaves_noise = alone.neg2_log_evidence - hypothesis.neg2_log_evidence <= MIN_SCORE_GAIN
+    discrepancies = [] if leaves_noise else list(filter(is_discrepancy, candidates))
+    best, lowest = None, (alone if leaves_noise else hypothesis).neg2_log_evidence - MIN_EXCHANGE_GAIN
     compared = {linear.effects(present): fit}
-    rests = [tuple(law for law in present if law != removed) for removed in present]
-    others = [rival for rest in rests for rival in linear.beside(rest, hypothesis.scales)]
-    limit = hypothesis.neg2_log_evidence + MIN_SCORE_GAIN
-    near = [one for one in others if one.neg2_log_evidence < limit and linear.effects(one.laws) not in fitted]
+    near: list[tuple[int, Hypothesis]] = []
+    for removed in present:
+        rest = tuple(law for law in present if law != removed)
+        others = sorted(linear.beside(rest, hypothesis.scales), key=lambda one: one.neg2_log_evidence)
+        near += enumerate(one for one in others if linear.effects(one.laws) not in fitted)
     rivals: dict[Effects, tuple[int, ...]] = {}
-    for rival in sorted(near, key=lambda one: one.neg2_log_evidence)[:MAX_ALTERNATIVES]:
-        rivals.setdefault(linear.effects(rival.laws), rival.laws)
+    for _, rival in sorted(near, key=lambda ranked: (ranked[0], ranked[1].neg2_log_evidence)):
+        is_near = rival.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN
+        if is_near and len(rivals) < MAX_ALTERNATIVES:
+            rivals.setdefault(linear.effects(rival.laws), rival.laws)
     fits = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), rivals.values())
     for effects, other in zip(rivals, fits, strict=True):
         fitted[effects] = other

@@ -42,6 +42,11 @@ MIN_SCALE, MAX_SCALE, INITIAL_SCALE = 1e-4, 1.0, 0.1
 SCREENING_FACTORS = (1.0, 0.1, 0.01)
 """Factors on the scales with which laws are ranked: beside a law that takes the bulk, the discrepancy is smaller."""
 
+SCREENING_SCALE = 0.01
+"""Scale of the discrepancy of every stage with which laws are ranked once more. Where wrong laws leave only noise, all
+scales vanish, and a ranking without a discrepancy demands more of sensitivities than they are accurate: a drag beside
+two drifts, of which one was fitted beside a clock error, seemed 300 worse in -2 log evidence and was 30 better."""
+
 SCREENED_LAWS = 4
 """Laws whose score is computed with scales of their own, of every ranking."""
 
@@ -259,8 +264,9 @@ class LinearModel:
         taken = self.effects(laws)
         others = [i for i in range(len(self.laws)) if not self.effects([i]) & taken]
         chosen: set[int] = set()
-        for factor in SCREENING_FACTORS:
-            gains = self._gains(laws, np.maximum(scales * factor**2, MIN_SCALE**2), others)
+        rankings = [np.maximum(scales * factor**2, MIN_SCALE**2) for factor in SCREENING_FACTORS]
+        for of_ranking in [*rankings, np.full_like(scales, SCREENING_SCALE**2)]:
+            gains = self._gains(laws, of_ranking, others)
             chosen |= {others[i] for i in np.argsort(-gains)[:SCREENED_LAWS]}
         return [self.hypothesis((*laws, i), scales, max_scale=MAX_SCALE_BESIDE) for i in sorted(chosen)]
 

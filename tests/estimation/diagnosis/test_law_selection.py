@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from estimation.device_fit.data import prepare_run
-from estimation.device_fit.fit import Likelihood, fit_model
+from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.initial import fit_progressively, flat_whiteners, window_schedule
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
+from estimation.diagnosis import law_selection
 from estimation.diagnosis.diagnose import diagnose
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.law_selection import choose_laws
-from estimation.diagnosis.linear_model import Hypothesis, LinearModel, LinearTerm
+from estimation.diagnosis.linear_model import MAX_SCALE_BESIDE, MIN_SCALE, Hypothesis, LinearModel, LinearTerm
 from estimation.diagnosis.screening import all_candidates
 from scanner.device import Axis, Device
 from scanner.recording import Recording
@@ -120,6 +123,46 @@ def test_rounding_does_not_decide_between_laws_of_nearly_the_same_effect() -> No
     assert exact == pytest.approx(9.0, abs=0.1)  # of the prior
     assert near - exact == pytest.approx(9.0 * SAMPLES, rel=0.2)
     assert selected(model) == {"cubic-damping"}
+
+
+def test_a_law_with_inexact_sensitivities_is_compared_where_the_discrepancy_has_vanished() -> None:
+    size, effects = (
+        200.0,
+        ("quadratic-drag", "cubic-stiffness", "cubic-damping", "drive-droop", "drive-lag", "charging"),
+    )
+    columns = size * np.eye(8, 6)
+    columns[6, 1:] = size  # five laws explain the error of the sensitivity of the first one, along the correction
+    correction, misfit = 25.0 * size * np.eye(8)[:, 6], -0.1 * columns[:, 0]
+    misfit[6] = -0.2 * size
+    terms = [catalogue()[name] for name in effects] + [DISCREPANCY_TERMS["free-mechanics"]]
+    linear = tuple(LinearTerm(Candidate(term, "x", "sense"), np.array([i]), None) for i, term in enumerate(terms))
+    factor = np.linalg.qr(np.column_stack([columns, correction, misfit]), mode="r")
+    model = LinearModel(factor, np.zeros((0, 8)), linear[:6], linear[6:])
+    compared = {hypothesis.laws for hypothesis in model.beside((), np.array([MIN_SCALE**2]))}
+    assert (0,) in compared
+
+
+@pytest.mark.parametrize(("discrepancy", "exchanged"), [(0.0, False), (0.05, True)])
+def test_beside_a_fit_that_leaves_only_noise_corrections_improve_no_rival(
+    discrepancy: float, exchanged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rival is worse than the present law without corrections, and better with them."""
+    linear = linear_model({"cubic-damping": 1.0}, discrepancy)
+    beside = linear.hypothesis((1,), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
+    alone = linear.without_discrepancy((1,)).neg2_log_evidence
+    present, rival = SimpleNamespace(chi2=600.0), SimpleNamespace(chi2=600.0)
+
+    def around_rival(likelihood: Likelihood, fit: Fit, corrections: list[Candidate]) -> SimpleNamespace:
+        score = beside - 50.0 if corrections else alone + 50.0
+        return SimpleNamespace(laws=(), hypothesis=lambda laws, max_scale: SimpleNamespace(neg2_log_evidence=score))
+
+    monkeypatch.setattr(LinearModel, "beside", lambda self, laws, scales: [Hypothesis((0,), scales, beside, 0.0)])
+    monkeypatch.setattr(law_selection, "fit_laws", lambda *arguments: rival)
+    monkeypatch.setattr(law_selection, "satisfies_sign_constraints", lambda fit: True)
+    monkeypatch.setattr(law_selection, "linear_model", around_rival)
+    terms = [term.candidate for term in linear.discrepancies]
+    best, _ = law_selection._exchange_near_rival(linear, None, present, (1,), terms, {})  # type: ignore[arg-type]
+    assert (best is rival) is exchanged
 
 
 @pytest.mark.slow
