@@ -196,7 +196,7 @@ def _advice(result: SelectionResult, step: SelectionStep, distance: Mapping[str,
     for other in confusable.values():
         text = candidate.term.confounders.get(other.term.effect) or other.term.confounders.get(effect)
         parts += [f"{other.term.effect}: {text}"] if text else []
-    return "; ".join(parts) or None
+    return "; ".join(dict.fromkeys(parts)) or None  # a rival on both axes once
 
 
 def _name(candidate: Candidate) -> str:

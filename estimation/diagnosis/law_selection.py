@@ -7,7 +7,7 @@ the fit without it shows that it is needed; then laws are only added to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
@@ -258,16 +258,7 @@ def _exchange_near_rival(
     discrepancies = [] if leaves_noise else list(filter(is_discrepancy, candidates))
     best, lowest = None, (alone if leaves_noise else hypothesis).neg2_log_evidence - MIN_EXCHANGE_GAIN
     compared = {linear.effects(present): fit}
-    near: list[tuple[int, Hypothesis]] = []
-    for removed in present:
-        rest = tuple(law for law in present if law != removed)
-        others = sorted(linear.beside(rest, hypothesis.scales), key=lambda one: one.neg2_log_evidence)
-        near += enumerate(one for one in others if linear.effects(one.laws) not in fitted)
-    rivals: dict[Effects, tuple[int, ...]] = {}
-    for _, rival in sorted(near, key=lambda ranked: (ranked[0], ranked[1].neg2_log_evidence)):
-        is_near = rival.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN
-        if is_near and len(rivals) < MAX_ALTERNATIVES:
-            rivals.setdefault(linear.effects(rival.laws), rival.laws)
+    rivals = _near_rivals(linear, hypothesis, fitted)
     fits = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), rivals.values())
     for effects, other in zip(rivals, fits, strict=True):
         fitted[effects] = other
@@ -280,3 +271,22 @@ def _exchange_near_rival(
         if score < lowest:
             best, lowest = other, score
     return best, compared
+
+
+def _near_rivals(
+    linear: LinearModel, hypothesis: Hypothesis, fitted: Collection[Effects]
+) -> dict[Effects, tuple[int, ...]]:
+    """Laws with one exchanged that are within ``MIN_SCORE_GAIN`` of a hypothesis and have not been fitted.
+
+    The first are the best ones in the place of every law, then the second ones, up to ``MAX_ALTERNATIVES``.
+    """
+    ranked: list[tuple[int, float, tuple[int, ...]]] = []
+    for removed in hypothesis.laws:
+        rest = tuple(law for law in hypothesis.laws if law != removed)
+        best: dict[Effects, Hypothesis] = {}
+        for rival in sorted(linear.beside(rest, hypothesis.scales), key=lambda one: one.neg2_log_evidence):
+            if rival.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN:
+                best.setdefault(linear.effects(rival.laws), rival)
+        new = [rival for effects, rival in best.items() if effects not in fitted]
+        ranked += [(rank, rival.neg2_log_evidence, rival.laws) for rank, rival in enumerate(new)]
+    return {linear.effects(laws): laws for _, _, laws in sorted(ranked)[:MAX_ALTERNATIVES]}

@@ -6,7 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from estimation.diagnosis.finding import find_probabilities
+from estimation.device_fit.parameters import Candidate
+from estimation.diagnosis.finding import _advice, find_probabilities
+from scanner.terms import catalogue
 
 
 def step(effect: str, *rivals: tuple[str, float], gain: float = 100.0) -> SimpleNamespace:
@@ -40,3 +42,14 @@ def test_what_is_certain_without_a_fit_stays_certain_beside_a_remainder() -> Non
     clipped = step("saturation")
     clipped.candidate.term.free_parameters = ()
     assert find_probabilities(clipped, 9900.0) == {"saturation": 1.0}
+
+
+def test_a_rival_on_both_axes_gets_its_advice_once() -> None:
+    terms = catalogue()
+    rivals = [
+        SimpleNamespace(candidate=Candidate(terms["carrier-torque"], axis, "sense"), evidence_gap=0.0) for axis in "xy"
+    ]
+    drift = SimpleNamespace(candidate=Candidate(terms["resonance-drift"], "x", "sense"), rivals=rivals)
+    text = _advice(SimpleNamespace(), drift, {})  # type: ignore[arg-type]
+    assert text is not None
+    assert text.count("carrier-torque") == 1

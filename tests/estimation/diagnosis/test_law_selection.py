@@ -126,10 +126,8 @@ def test_rounding_does_not_decide_between_laws_of_nearly_the_same_effect() -> No
 
 
 def test_a_law_with_inexact_sensitivities_is_compared_where_the_discrepancy_has_vanished() -> None:
-    size, effects = (
-        200.0,
-        ("quadratic-drag", "cubic-stiffness", "cubic-damping", "drive-droop", "drive-lag", "charging"),
-    )
+    effects = ("quadratic-drag", "cubic-stiffness", "cubic-damping", "drive-droop", "drive-lag", "charging")
+    size = 200.0
     columns = size * np.eye(8, 6)
     columns[6, 1:] = size  # five laws explain the error of the sensitivity of the first one, along the correction
     correction, misfit = 25.0 * size * np.eye(8)[:, 6], -0.1 * columns[:, 0]
