@@ -186,7 +186,7 @@ class Likelihood:
         for i in set(range(x.size)) - set(additive):
             trials[i] = x.copy()
             trials[i][i] += steps[i]
-        model.prefetch_trajectories(list(trials.values()), stop, map_parallel)
+        model.prefetch_trajectories(list(trials.values()), stop, parallel=True)
 
         def fill(i: int) -> None:
             columns[:, i] = (self.residual(model, trials[i], stop) - residual) / steps[i]
@@ -223,7 +223,7 @@ def fit_model(
     rows = likelihood.fitted(stop)
 
     def residual(trial: Array) -> Array:
-        model.prefetch_trajectories([trial], stop, map_parallel)
+        model.prefetch_trajectories([trial], stop, parallel=True)
         return likelihood.residual(model, trial, stop)
 
     result = fit_levenberg_marquardt(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from threading import Lock
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from estimation.device_fit.parameters import (
     ParameterSpec,
     nominal_parameters,
 )
+from estimation.parallel import map_parallel
 from scanner.active_terms import ActiveTerm, stated_terms, with_constants
 from scanner.arrays import Array
 from scanner.device import Axis, Device
@@ -267,13 +268,11 @@ class Model:
         angle, rate = (x[self._indices[("start", name, quantity, r)]] for quantity in ("angle", "rate"))
         return scales.amplitude * angle, scales.amplitude * scales.rate * rate
 
-    def prefetch_trajectories(
-        self, xs: Sequence[Array], stop: float, map_function: Callable[..., Iterable[object]] = map
-    ) -> None:
+    def prefetch_trajectories(self, xs: Sequence[Array], stop: float, parallel: bool = False) -> None:
         """Integrate in batches the trajectories that :meth:`outputs` needs at each of ``xs``.
 
         Args:
-            map_function: applies a function to all elements of a list, possibly in parallel.
+            parallel: integrate the batches on all processors. Not within a function that runs in parallel itself.
         """
         groups: dict[tuple[int, str, tuple[object, ...]], dict[_Key, _Motion]] = {}
         for x in xs:
@@ -299,10 +298,11 @@ class Model:
         batches = []
         for (r, name, _), group in groups.items():
             inputs, requests = _truncate(self.runs[r].inputs[name], stop), list(group.items())
-            # at least two parts of a large batch, for a second processor
-            parts = max(-(-len(requests) // LANES), 1 + (len(requests) > LANES // 2))
+            parts = -(-len(requests) // LANES)
+            if parallel and len(requests) > LANES // 2:
+                parts = max(parts, 2)  # for a second processor
             batches += [(inputs, requests[i::parts]) for i in range(parts)]
-        list(map_function(simulate_part, batches))
+        list((map_parallel if parallel else map)(simulate_part, batches))
 
     def _cached_trajectory(self, axis: Axis, added: tuple[ActiveTerm, ...], inputs: DriveInput,
                     start: tuple[float, float], r: int) -> AxisTrajectory:  # fmt: skip

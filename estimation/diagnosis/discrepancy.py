@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
@@ -77,7 +78,7 @@ def apply_play(signal, width):  # type: ignore[no-untyped-def]
     return output
 
 
-@njit(forceinline=True)
+@register_jitable(forceinline=True)
 def _force_of_degree(n, x, y, p):  # type: ignore[no-untyped-def]
     """Terms of total degree ``n`` of the force polynomial; with a constant degree the compiler unrolls the loop."""
     total, power = 0.0, 1.0
@@ -114,7 +115,7 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
     )
 
 
-@njit(forceinline=True)
+@register_jitable(forceinline=True)
 def _cosine_sum(p, first, count, cosine):  # type: ignore[no-untyped-def]
     """sum_j p[first + j - 1] cos(j phase), j = 1 to ``count``, from cos(phase) by Clenshaw's recurrence."""
     newer, older = 0.0, 0.0
@@ -147,7 +148,10 @@ def _profile(theta, p, nominal):  # type: ignore[no-untyped-def]
 
 def cosine_series(phase: Array, coefficients: Sequence[float]) -> Array:
     """sum_j coefficients[j] cos(j phase), of the shape of ``phase`` [rad]."""
-    return np.asarray(_chebyshev(np.cos(phase).ravel(), np.asarray(coefficients, float)).reshape(phase.shape))
+    leading = np.trim_zeros(np.asarray(coefficients, float), "b")
+    if leading.size == 0:
+        return np.zeros(phase.shape)
+    return np.asarray(_chebyshev(np.cos(phase).ravel(), leading).reshape(phase.shape))
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -190,12 +194,18 @@ def _readout(signal: Array, p: Sequence[float], context: SignalContext) -> Array
     hysteresis = sum(
         part * (apply_play(signal, width * size) - signal)
         for part, width in zip(p[memories:], PLAY_HALF_WIDTHS, strict=True)
+        if part
     )
-    x, v = context.theta / amplitude, context.rate / (amplitude * rate)
-    w = v / np.sqrt(x * x + v * v + 1e-6)
-    by_rate = v * (p[7] + p[8] * x) + w * (p[9] + w * w * (p[10] + w * w * p[11]))
+    by_rate = _gain_by_rate(p[7:12], context, rate, amplitude) if any(p[7:12]) else 0.0
     by_signal = u * (gain + u * (p[4] + p[5] * u)) + offset
     return signal * (1.0 + by_rate) + size * by_signal + p[6] * slope + hysteresis
+
+
+def _gain_by_rate(p: Sequence[float], context: SignalContext, rate: float, amplitude: float) -> Array:
+    """Relative change of a readout's gain with rate and direction of the motion, shape (n,)."""
+    x, v = context.theta / amplitude, context.rate / (amplitude * rate)
+    w = v / np.sqrt(x * x + v * v + 1e-6)
+    return np.asarray(v * (p[0] + p[1] * x) + w * (p[2] + w * w * (p[3] + w * w * p[4])))
 
 
 def _timing(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
@@ -205,6 +215,7 @@ def _timing(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
     memory = sum(
         m * (apply_lowpass(r2, cutoff / n, context.step) - r2)
         for m, n in zip(p[5:8], DELAY_MEMORY_PERIODS, strict=True)
+        if m
     )
     delay = cosine_series(np.pi * context.time / p[0], p[8:]) + r2 * (p[3] + p[4] * r2) + memory
     slope = np.gradient(signal, context.step)

@@ -1,6 +1,8 @@
 """Elementary functions for the integrator and the laws that it evaluates.
 
-They call no library function, so the compiler evaluates them in several lanes of the processor's vectors at once.
+They call no library function, so the compiler evaluates them in several lanes of the processor's vectors at once. They
+are no compiled functions of their own (``njit``): those have another identity in every process, and a law that calls
+one is compiled anew in every process.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ import math
 from math import factorial
 
 import numpy as np
-from numba import njit
+from numba.extending import register_jitable
 
 _MIN_EXPONENT = -700.0
 """Exponents below are taken as this: exp(-700) = 1e-304 is negligible against any capacitance and still a normal
@@ -30,7 +32,7 @@ S3, S5, S7, S9, S11, S13, S15 = ((-1.0) ** (n // 2) / factorial(n) for n in rang
 # Taylor coefficients of the sine; the first one left out is below 1e-11 up to a quarter of a turn.
 
 
-@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+@register_jitable(forceinline=True, error_model="numpy", fastmath={"contract"})
 def negative_exponential(x):  # type: ignore[no-untyped-def]
     """Return exp(x) for x <= 0 with a relative error of 3e-16, and 1e-304 below x = -700."""
     x = x if x > _MIN_EXPONENT else _MIN_EXPONENT
@@ -47,7 +49,7 @@ def negative_exponential(x):  # type: ignore[no-untyped-def]
     return p * power.view(np.float64)
 
 
-@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+@register_jitable(forceinline=True, error_model="numpy", fastmath={"contract"})
 def cosine_of_half_turns(x):  # type: ignore[no-untyped-def]
     """Return cos(pi x) with an error of 1e-11, as the sine of the distance from the nearest zero."""
     turns = 0.5 * x + _ROUNDER

@@ -23,12 +23,33 @@ def thrice(x):
 assert (twice(1), thrice(1)) == (2, 3)
 """
 
+LAWS_CODE = """
+from recon.compilation import announce_compilation
+
+announce_compilation()
+
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from scanner.integrator.runge_kutta import in_all_lanes
+from scanner.terms import catalogue
+
+laws = [law for term in [*catalogue().values(), *DISCREPANCY_TERMS.values()] for law in (term.torque, term.capacitance)]
+compiled = [in_all_lanes(law) for law in laws if law]
+assert len(compiled) > 10
+"""
+
+
+def _messages_of_two_runs(script: Path, code: str, **environment: str) -> list[str]:
+    script.write_text(code, encoding="utf-8")
+    whole = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent)} | environment
+    options: dict[str, Any] = {"env": whole, "capture_output": True, "text": True, "check": True}
+    return [subprocess.run([sys.executable, str(script)], **options).stderr for _ in range(2)]
+
 
 def test_compilation_is_announced_once(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(CODE, encoding="utf-8")
-    root = Path(__file__).parent.parent.parent
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(root)}
-    options: dict[str, Any] = {"env": environment, "capture_output": True, "text": True, "check": True}
-    messages = [subprocess.run([sys.executable, str(script)], **options).stderr for _ in range(2)]
+    messages = _messages_of_two_runs(tmp_path / "script.py", CODE, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert messages == ["compiling, once (about a minute)\n", ""]
+
+
+def test_no_law_is_compiled_in_a_second_run(tmp_path: Path) -> None:
+    _, second = _messages_of_two_runs(tmp_path / "script.py", LAWS_CODE)
+    assert second == ""
