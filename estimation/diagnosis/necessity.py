@@ -50,6 +50,15 @@ NO_LAWS = Need(possible=False, certain=True, takes_bulk=False, remaining=0.0)
 """Of the nominal device and of a discrepancy term, beside which there are no laws."""
 
 
+def least_explained(need: Need) -> float:
+    """Fall of the misfit that a further law needs to be the answer beside laws that take the bulk; 0 beside others.
+
+    It has to explain ``MIN_EXPLAINED_RATIO`` of what free corrections still explain beside it. That is at least what
+    they explain without it, less what it explains itself.
+    """
+    return need.remaining * MIN_EXPLAINED_RATIO / (1.0 + MIN_EXPLAINED_RATIO) if need.takes_bulk else 0.0
+
+
 def need_of_laws(linear: LinearModel, laws: Sequence[int], explained: float, alone: float) -> Need:
     """Whether a discrepancy without bound on its scales needs laws beside it.
 

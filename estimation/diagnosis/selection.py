@@ -36,7 +36,7 @@ from estimation.diagnosis.from_stated_values import (
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
-from estimation.diagnosis.necessity import NO_LAWS, Need, need_of_laws
+from estimation.diagnosis.necessity import NO_LAWS, Need, least_explained, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import all_candidates, damped_start
 from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
@@ -162,11 +162,16 @@ def _choose_terms(
     progress: Progress,
 ) -> _Selected:
     """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
-    from_stated_values = _choose_from_stated_values(likelihood, nominal, stops, pool, progress)
-    if from_stated_values is not None:
-        return _with_nonlinear_term(from_stated_values, nominal, pool, stops[0], progress)
-    groups = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
-    anchor, tried = fit_anchor(likelihood, nominal, early, stops, [group for group in groups if group])
+    of_effects = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
+    groups = [group for group in of_effects if group]
+    anchor, tried = fit_anchor(likelihood, nominal, early, stops, groups[:1])
+    if not (tried and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)):
+        from_stated_values = _choose_from_stated_values(likelihood, nominal, stops, pool, progress)
+        if from_stated_values is not None:
+            return _with_nonlinear_term(from_stated_values, nominal, pool, stops[0], progress)
+        if anchor is nominal:
+            anchor, others = fit_anchor(likelihood, nominal, early, stops, groups[1:])
+            tried += others
     selected = _choose_laws(anchor, nominal, pool, progress)
     if selected is not None:
         selected = _with_nonlinear_term(selected, nominal, pool, stops[0], progress)
@@ -289,7 +294,8 @@ def _with_nonlinear_term(
         for score in nonlinear_starts(selected.likelihood, base, pool)[:MAX_NONLINEAR_STARTS]
     ]
     starts = [(s.model, damped_start(selected.likelihood, base, s.model, s.x, s.step)) for base, s in scored]
-    fitted = fit_models(selected.likelihood, starts, abort_above=misfit(selected.fit))
+    most = misfit(selected.fit) - least_explained(selected.need)
+    fitted = fit_models(selected.likelihood, starts, abort_above=most)
     fits = zip((base for base, _ in scored), fitted, strict=True)
     possible = [(base, fit) for base, fit in fits if satisfies_sign_constraints(fit)]
     base, best = min(possible, key=lambda pair: pair[1].neg2_log_evidence, default=(None, None))
@@ -297,6 +303,8 @@ def _with_nonlinear_term(
         return selected
     converged = fit_to_convergence(selected.likelihood, best.model, best.x)
     best = min(converged, fit_growing(selected.likelihood, best.model, converged.x, first), key=misfit)
+    if misfit(best) > most:
+        return selected
     return _choose_beside_nonlinear_term(selected.likelihood, base, best, nominal, pool, progress) or selected
 
 
