@@ -79,13 +79,14 @@ def apply_play(signal, width):  # type: ignore[no-untyped-def]
 
 
 @register_jitable(forceinline=True)
-def _force_of_degree(n, x, y, p):  # type: ignore[no-untyped-def]
-    """Terms of total degree ``n`` of the force polynomial; with a constant degree the compiler unrolls the loop."""
-    total, power = 0.0, 1.0
-    for j in range(n + 1):
-        total = total * x + p[n * (n + 1) // 2 + j] * power
-        power *= y
-    return total
+def _force_polynomial(x, y, p):  # type: ignore[no-untyped-def]
+    """Sum of the terms of ``FORCE_POWERS`` with the coefficients p[3] to p[20], by Horner's scheme."""
+    f0 = x * x * (p[3] + x * (p[6] + x * (p[10] + x * p[15])))
+    f1 = x * (p[4] + x * (p[7] + x * (p[11] + x * p[16])))
+    f2 = p[5] + x * (p[8] + x * (p[12] + x * p[17]))
+    f3 = p[9] + x * (p[13] + x * p[18])
+    f4 = p[14] + x * p[19]
+    return f0 + y * (f1 + y * (f2 + y * (f3 + y * (f4 + y * p[20]))))
 
 
 @njit(TORQUE_LAW, cache=True)
@@ -96,8 +97,7 @@ def _force(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no
     """
     x, y = theta / p[0], omega / (p[0] * p[1])
     cosine = cosine_of_half_turns(t / p[2])
-    total = _force_of_degree(2, x, y, p) + _force_of_degree(3, x, y, p)
-    total += _force_of_degree(4, x, y, p) + _force_of_degree(5, x, y, p)
+    total = _force_polynomial(x, y, p)
     memory = 3 + N_FORCE_POWERS
     stiffness = p[memory] * z0 + p[memory + 1] * z1
     damping = p[memory + 2] * z0 + p[memory + 3] * z1

@@ -15,10 +15,11 @@ from estimation.device_fit.initial import fit_initial_state, fit_progressively, 
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, residual_ratio
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, cosine_series
+from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, FORCE_POWERS, N_FORCE_POWERS, cosine_series
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.screening import ProfiledLinearModel, all_candidates, damped_start, linear_gain
 from scanner.device import Axis, Device
+from scanner.integrator.abi import Nominal
 from scanner.recording import Recording
 from scanner.stages import Mechanics
 from scanner.terms import catalogue
@@ -139,3 +140,20 @@ def test_cosine_series_equals_chebyshev_evaluation(numbers: int) -> None:
     np.testing.assert_allclose(
         cosine_series(turn, sizes), np.cos(np.multiply.outer(turn, range(numbers))) @ sizes, atol=1e-12
     )
+    np.testing.assert_array_equal(cosine_series(turn, [*sizes, 0.0, 0.0]), cosine_series(turn, sizes))
+    np.testing.assert_array_equal(cosine_series(turn, np.zeros(numbers)), np.zeros(turn.shape))
+
+
+@pytest.mark.parametrize("k", range(N_FORCE_POWERS))
+def test_force_polynomial_has_the_stated_powers(k: int) -> None:
+    """Each coefficient multiplies its power of angle and rate, in units of the amplitude and its rate."""
+    amplitude, rate, angle, velocity, stiffness = 0.2, 5.0, 0.13, 0.7, 3.0
+    term = DISCREPANCY_TERMS["free-mechanics"]
+    coefficients = np.zeros(len(term.parameters))
+    coefficients[:3] = amplitude, rate, 1.0
+    coefficients[3 + k] = 1.0
+    nominal = Nominal(1.0, 1.0, stiffness, 1.0, 1.0, 0.0, 0.0)
+    torque, *_ = term.torque(0.0, angle, velocity, 0.0, 0.0, 0.0, 0.0, coefficients, nominal)  # type: ignore[misc]
+    i, j = FORCE_POWERS[k]
+    expected = -stiffness * amplitude * (angle / amplitude) ** i * (velocity / (amplitude * rate)) ** j
+    assert torque == pytest.approx(expected, rel=1e-12)
