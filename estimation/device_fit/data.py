@@ -109,6 +109,11 @@ class Run:
     duration: float
     lines: Mapping[str, Array]
 
+    @property
+    def steps(self) -> int:
+        """Integration steps of all axes."""
+        return sum(len(drive.voltage) for drive in self.inputs.values())
+
 
 def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Run:
     """Prepare a recording for the fit.

@@ -112,6 +112,7 @@ class Likelihood:
 
     Attributes:
         runs: the recordings.
+        steps: integration steps of all axes and recordings.
         whiteners: of each recording, one per channel in order.
         rows, validation_rows: masks over all whitened samples, shape (N,).
         time: of every whitened sample as a fraction of its recording, shape (N,).
@@ -120,6 +121,7 @@ class Likelihood:
 
     def __init__(self, runs: Sequence[Run], whiteners: Sequence[Sequence[Whitener]]):
         self.runs, self.whiteners = tuple(runs), tuple(tuple(row) for row in whiteners)
+        self.steps = sum(run.steps for run in runs)
         flat = [whitener for row in self.whiteners for whitener in row]
         self.time = np.concatenate([whitener.time for whitener in flat])
         self.channel = np.concatenate([np.full(whitener.samples, i) for i, whitener in enumerate(flat)])
@@ -193,7 +195,7 @@ class Likelihood:
             norm = np.linalg.norm(columns[:, i])
             steps[i] = np.clip(STEP_CHANGE_SIGMA / norm if norm else STEP_WITHOUT_EFFECT, MIN_STEP, MAX_STEP)
 
-        map_parallel(fill, trials)
+        map_parallel(fill, trials, model.steps)
         return columns
 
 
@@ -253,7 +255,7 @@ def fit_models(
     def fit(start: tuple[Model, Array]) -> Fit:
         return fit_model(likelihood, *start, stop, max_iterations, tolerance=tolerance, abort_above=abort_above)
 
-    return map_fits(fit, starts)
+    return map_fits(fit, starts, likelihood.steps)
 
 
 def linearise_at(likelihood: Likelihood, model: Model, x: Array, stop: float = 1.0) -> Fit:

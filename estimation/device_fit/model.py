@@ -71,6 +71,7 @@ class Model:
 
     Attributes:
         runs: the recordings.
+        steps: integration steps of all axes and recordings.
         device: the nominal device.
         candidates: added terms.
         mains: whose hum is part of the noise model.
@@ -89,6 +90,7 @@ class Model:
         mains: Sequence[Mains] = NOMINAL_MAINS,
     ):
         self.runs, self.device, self.candidates = tuple(runs), device, tuple(candidates)
+        self.steps = sum(run.steps for run in runs)
         self.mains = tuple(mains)
         self.given = {name: stated_terms(axis) for name, axis in device.axes.items()}
         self.axes = tuple(name for name in device.axes if any(name in run.inputs for run in runs))
@@ -272,7 +274,8 @@ class Model:
         """Integrate in batches the trajectories that :meth:`outputs` needs at each of ``xs``.
 
         Args:
-            parallel: integrate the batches on all processors. Not within a function that runs in parallel itself.
+            parallel: integrate the batches on several processors, if the recordings are long enough. Not within a
+                function that runs in parallel itself.
         """
         groups: dict[tuple[int, str, tuple[object, ...]], dict[_Key, _Motion]] = {}
         for x in xs:
@@ -302,7 +305,7 @@ class Model:
             if parallel and len(requests) > LANES // 2:
                 parts = max(parts, 2)  # for a second processor
             batches += [(inputs, requests[i::parts]) for i in range(parts)]
-        list((map_parallel if parallel else map)(simulate_part, batches))
+        map_parallel(simulate_part, batches, self.steps if parallel else 0)
 
     def _cached_trajectory(self, axis: Axis, added: tuple[ActiveTerm, ...], inputs: DriveInput,
                     start: tuple[float, float], r: int) -> AxisTrajectory:  # fmt: skip

@@ -137,7 +137,9 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
     corrections = find_corrections(result)
     correction = best_correction(corrections) if corrections else None
     corrected = correct_parameters(result.final, corrections) if corrections else None
-    findings = map_fits(lambda step: find_effect(result, step, correction, corrected), result.steps)
+    findings = map_fits(
+        lambda step: find_effect(result, step, correction, corrected), result.steps, result.likelihood.steps
+    )
     findings.sort(key=lambda finding: -(finding.share or 0.0))
     tension = None if findings else _prior_tension_finding(result.final)
     if tension is not None:

@@ -176,7 +176,7 @@ def _fit_options(
     fitted: dict[Effects, Fit],
 ) -> dict[Effects, Fit]:
     """Fits of selected laws, and at first the one around which they were selected, that follow the recording."""
-    of_laws = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), options.values())
+    of_laws = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), options.values(), likelihood.steps)
     fits = dict(zip(options, of_laws, strict=True))
     present = _present_laws(linear)
     if not fitted and present:
@@ -259,7 +259,7 @@ def _exchange_near_rival(
     best, lowest = None, (alone if leaves_noise else hypothesis).neg2_log_evidence - MIN_EXCHANGE_GAIN
     compared = {linear.effects(present): fit}
     rivals = _near_rivals(linear, hypothesis, fitted)
-    fits = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), rivals.values())
+    fits = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), rivals.values(), likelihood.steps)
     for effects, other in zip(rivals, fits, strict=True):
         fitted[effects] = other
         if not satisfies_sign_constraints(other) or other.chi2 > MAX_CHI2_RATIO * fit.chi2:

@@ -104,7 +104,7 @@ def score_candidate_starts(
     def score(candidate: Candidate) -> list[ScoreTest]:
         return _score_starts(likelihood, base, candidate, profiled, stop)
 
-    return map_parallel(score, candidates)
+    return map_parallel(score, candidates, likelihood.steps)
 
 
 def _score_starts(

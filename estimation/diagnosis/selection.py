@@ -203,7 +203,9 @@ def _choose_from_stated_values(
     if not groups[0] or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
         return None
     progress("stated values, with drifting resonances")
-    fits = map_fits(lambda drifts: fit_from_stated_values(likelihood, nominal, drifts, stops[0]), groups)
+    fits = map_fits(
+        lambda drifts: fit_from_stated_values(likelihood, nominal, drifts, stops[0]), groups, likelihood.steps
+    )
     if not any(map(residual_is_noise, fits)):
         progress("stated values, with laws that are linear in no amplitude")
         nonlinear = fit_nonlinear_law(likelihood, nominal, pool, stops)
@@ -254,13 +256,14 @@ def _choose_discrepancy(
     linear = linear_model(likelihood, anchor, list(filter(is_discrepancy, pool)))
     stages = range(len(linear.discrepancies))
     alone = {i: linear.hypothesis((), without=[j for j in stages if j != i]).neg2_log_evidence for i in stages}
-    fits = map_fits(lambda fit: fit_model(likelihood, fit.model, fit.x), fitted)
+    fits = map_fits(lambda fit: fit_model(likelihood, fit.model, fit.x), fitted, likelihood.steps)
     fits += map_fits(
         lambda i: fit_terms(linear, likelihood, anchor, [linear.discrepancies[i]]),
         sorted(stages, key=lambda i: alone[i])[:MAX_DISCREPANCY_FITS],
+        likelihood.steps,
     )
     converged = [fit for fit in fits if fit.chi2 < MAX_CHI2_RATIO * anchor.chi2]
-    reduced = map_fits(lambda fit: prune_by_evidence(likelihood, fit), converged)
+    reduced = map_fits(lambda fit: prune_by_evidence(likelihood, fit), converged, likelihood.steps)
     pruned = [fewer for fewer in reduced if fewer is not None]
     best = min(pruned, key=lambda fit: fit.neg2_log_evidence, default=None)
     if best is None:
