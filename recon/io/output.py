@@ -19,7 +19,7 @@ from recon.imaging.picture import Grid, Picture
 from recon.imaging.sample_motion import SampleMotion
 from scanner.channel import Channel
 from scanner.errors import BadInput
-from scanner.files import check_writable
+from scanner.files import IS_REPLACING, check_writable
 from scanner.hdf5 import new_hdf5
 from scanner.motion import Motion
 
@@ -54,6 +54,7 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
     try:
         yield temporary
+        IS_REPLACING.set()
         if not folder.exists():
             temporary.chmod(0o755)
             temporary.replace(folder)
@@ -72,6 +73,7 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        IS_REPLACING.clear()
 
 
 def write_motion(path: Path, motion: Motion, grid: Grid) -> None:

@@ -9,8 +9,8 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import pytest
 
 from recon.cli import main
 from recon.interrupts import handle_interrupts
+from recon.io.output import replacing_folder
 from scanner import devices
 from scanner.files import replacing
 from scanner.recording import Recording
@@ -233,10 +234,11 @@ def test_an_error_without_an_interrupt_is_raised(monkeypatch: pytest.MonkeyPatch
         main(["info", "a.h5"])
 
 
-def test_an_interrupt_waits_while_a_finished_file_takes_its_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("replaced", [replacing, replacing_folder])
+def test_an_interrupt_waits_while_finished_output_takes_its_place(
+    replaced: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file is there then, so that the command has done its work."""
+    """The output is there then, so that the command has done its work."""
     place = Path.replace
 
     def interrupted(self: Path, target: Path) -> Path:
@@ -245,12 +247,14 @@ def test_an_interrupt_waits_while_a_finished_file_takes_its_place(
 
     with handle_interrupts() as stop:
         monkeypatch.setattr(Path, "replace", interrupted)
-        with replacing(tmp_path / "out.txt") as beside:
-            beside.write_text("done")
+        with replaced(tmp_path / "out") as beside:
+            done = beside / "done.txt" if beside.is_dir() else beside
+            done.write_text("done")
         stop.ended = True
         monkeypatch.undo()
-    assert (tmp_path / "out.txt").read_text() == "done"
+    (written,) = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert written.read_text() == "done"
     assert not stop.came
-    with pytest.raises(KeyboardInterrupt), handle_interrupts(), replacing(tmp_path / "other.txt"):
+    with pytest.raises(KeyboardInterrupt), handle_interrupts(), replaced(tmp_path / "other"):
         os.kill(os.getpid(), signal.SIGINT)
-    assert not (tmp_path / "other.txt").exists()
+    assert not (tmp_path / "other").exists()

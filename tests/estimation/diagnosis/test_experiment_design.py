@@ -97,7 +97,7 @@ class Posterior:
             self, at, 0.0, 0.0, np.zeros(2), self.jacobian(self, at), ~self.validation_rows, self.validation_rows, 0.0
         )  # type: ignore[arg-type]
 
-    def prefetch_trajectories(self, *_: object) -> None:
+    def prefetch_trajectories(self, *_: object, **__: object) -> None:
         """There are none."""
 
 

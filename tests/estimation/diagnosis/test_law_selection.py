@@ -159,7 +159,8 @@ def test_beside_a_fit_that_leaves_only_noise_corrections_improve_no_rival(
     monkeypatch.setattr(law_selection, "satisfies_sign_constraints", lambda fit: True)
     monkeypatch.setattr(law_selection, "linear_model", around_rival)
     terms = [term.candidate for term in linear.discrepancies]
-    best, _ = law_selection._exchange_near_rival(linear, None, present, (1,), terms, {})  # type: ignore[arg-type]
+    likelihood = SimpleNamespace(steps=0)
+    best, _ = law_selection._exchange_near_rival(linear, likelihood, present, (1,), terms, {})  # type: ignore[arg-type]
     assert (best is rival) is exchanged
 
 
