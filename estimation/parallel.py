@@ -16,9 +16,9 @@ MAX_PARALLEL_FITS = 2
 samples, so more fits would take much memory."""
 
 MIN_STEPS_OF_THREADS = 50_000
-"""Integration steps of all axes and recordings from which threads save time. Between the calls of compiled code the
-interpreter runs one thread at a time and hands over slowly. With 3 000 steps a diagnosis takes 1.2 to 1.4 times as long
-in two threads as in one, with 20 000 as long, and 1.2 times the processor time."""
+"""Integration steps of all axes and recordings from which threads are used. Between the calls of compiled code the
+interpreter runs one thread at a time and hands over slowly: with 500 to 4 500 steps a diagnosis took 1.2 to 1.5 times
+as long in two threads as in one, with 20 000 as long with 1.2 times the processor time."""
 
 _PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 

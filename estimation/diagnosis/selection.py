@@ -166,7 +166,8 @@ def _choose_terms(
     groups = [group for group in of_effects if group]
     # Where the first group leaves only noise, it takes a thirtieth of the time of fits from the stated values.
     anchor, tried = fit_anchor(likelihood, nominal, early, stops, groups[:1])
-    if not (tried and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)):
+    explained = anchor is not nominal and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)
+    if not explained:
         from_stated_values = _choose_from_stated_values(likelihood, nominal, stops, pool, progress)
         if from_stated_values is not None:
             return _with_nonlinear_term(from_stated_values, nominal, pool, stops[0], progress)
