@@ -103,15 +103,28 @@ def slice_delays(phase_errors: Sequence[PhaseError], motion: Motion) -> Array:
 
     The delays of both axes are averaged with their information as weights.
     """
+    delay, weight = _axis_delays(phase_errors, motion)
+    return _average(delay, weight, axis=1)
+
+
+def _axis_delays(phase_errors: Sequence[PhaseError], motion: Motion) -> tuple[Array, Array]:
+    """By how many samples the intensity is early in each slice and axis, and the information, each (slices, 2).
+
+    Both are zero where an axis is undetermined.
+    """
     rate = motion.axes["x"].angle.sample_rate
     errors = np.array(
         [[getattr(error, axis) for axis in AXES] for error in phase_errors]
     )  # (slices, axes, (value, sd))
     phase_per_sample = 2 * np.pi * np.array([np.median(motion.axes[axis].frequency) for axis in AXES]) / rate
     weight = (phase_per_sample / np.maximum(errors[..., 1], 1e-9)) ** 2  # without noise a standard error can be 0
-    delay = np.where(weight > 0, errors[..., 0], 0.0) / phase_per_sample
-    total = weight.sum(1)
-    return np.divide((weight * delay).sum(1), total, out=np.full(len(phase_errors), np.nan), where=total > 0)
+    return np.where(weight > 0, errors[..., 0], 0.0) / phase_per_sample, weight
+
+
+def _average(values: Array, weights: Array, axis: int) -> Array:
+    """Weighted average along an axis; NaN where there is no weight."""
+    total = weights.sum(axis)
+    return np.divide((weights * values).sum(axis), total, out=np.full(total.shape, np.nan), where=total > 0)
 
 
 def slices_aligned(phase_errors: Sequence[PhaseError], motion: Motion) -> NDArray[np.bool_]:
@@ -132,18 +145,20 @@ def first_late_slice(phase_errors: Sequence[PhaseError], motion: Motion) -> int 
     """Return the first slice from which on none is aligned while all before it are; None where there is no such slice.
 
     The delay has to change there by as much as a slice may be late: a constant delay near that limit is within it in
-    one slice and beyond it in another. The last slice alone is not accepted, because the location needs a whole slice
-    after it.
+    one slice and beyond it in another. It is compared in the axes that are determined before and after: dropped samples
+    delay both, and the phase error of an axis that is determined only later may have been there from the start. The
+    last slice alone is not accepted, because the location needs a whole slice after it.
     """
     late = ~slices_aligned(phase_errors, motion)
     first = int(np.argmax(late))
     if not (0 < first < len(phase_errors) - 1 and late[first:].all()):
         return None
-    delays = slice_delays(phase_errors, motion)
-    known = np.isfinite(delays[first:])
-    if not known.any():  # later than the registration reaches
+    delay, weight = _axis_delays(phase_errors, motion)
+    if not weight[first:].any():  # later than the registration reaches
         return first
-    change = delays[first:][known].mean() - delays[:first].mean()
+    before, after = (_average(delay[part], weight[part], axis=0) for part in (slice(first), slice(first, None)))
+    in_both = np.minimum(weight[:first].sum(0), weight[first:].sum(0))
+    change = _average(np.nan_to_num(after - before), in_both, axis=0)
     return first if abs(change) > MAX_DELAY_SAMPLES else None
 
 

@@ -1,6 +1,7 @@
 """Recordings with tolerable defects are reconstructed; the defects are reported and the pixels marked."""
 
 import json
+import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -245,6 +246,17 @@ def test_only_a_lasting_sudden_delay_counts_as_dropped_samples(whole: Reconstruc
     assert first_late_slice(slices_of([0.4, 0.6, 0.6, 0.6]), whole.motion) is None  # a constant delay near the limit
     assert first_late_slice(slices_of([2.0, 2.0, 2.0]), whole.motion) is None  # a constant delay
     assert first_late_slice(slices_of([0.0, 0.0, 3.0]), whole.motion) is None  # followed by no complete slice
+
+
+def test_a_constant_phase_error_of_an_axis_that_is_determined_only_later_is_no_loss(whole: Reconstruction) -> None:
+    """At the start of a scan the amplitude of an axis may still grow; there the delay is that of the other axis."""
+    aligned, unknown = PhaseEstimate(0.0, 1e-4), PhaseEstimate(math.nan, math.inf)
+    late = PhaseEstimate(np.radians(3.0), 1e-3)
+    axes = [(unknown, aligned)] * 2 + [(late, aligned)] * 4
+    slices = [PhaseError(float(i), x, y) for i, (x, y) in enumerate(axes)]
+    assert first_late_slice(slices, whole.motion) is None
+    lost = [PhaseError(float(i), aligned if i < 2 else late, unknown) for i in range(6)]
+    assert first_late_slice(lost, whole.motion) == 2
 
 
 @pytest.mark.slow
