@@ -110,11 +110,8 @@ def _iterate_selection(
         linear = linear_model(likelihood, fit, candidates)
         present = _present_laws(linear)
         centres.add(linear.effects(present))
-        if returned:
-            break
-        proposed = _propose_laws(
-            linear, fit, kept=present if needed == linear.effects(present) else (), first=not fitted
-        )
+        kept = present if needed == linear.effects(present) else ()
+        proposed = [present] if returned else _propose_laws(linear, fit, kept, first=not fitted)
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, proposed)))
         options = {linear.effects(laws): laws for laws in proposed if laws}
         if not options:

@@ -24,7 +24,7 @@ from estimation.device_fit.initial import (
 from estimation.device_fit.interference import with_interference_line
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, fit_growing, residual_ratio
+from estimation.diagnosis.anchor import fit_anchor, fit_growing, max_residual_ratio, residual_ratio
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.from_stated_values import (
@@ -168,7 +168,7 @@ def _choose_terms(
     anchor, tried = fit_anchor(likelihood, nominal, early, stops, groups[:1])
     explained = anchor is not nominal and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)
     if not explained:
-        from_stated_values = _choose_from_stated_values(likelihood, nominal, stops, pool, progress)
+        from_stated_values = _choose_from_stated_values(likelihood, nominal, early, stops, pool, progress)
         if from_stated_values is not None:
             return _with_nonlinear_term(from_stated_values, nominal, pool, stops[0], progress)
         if anchor is nominal:
@@ -189,7 +189,12 @@ def _choose_terms(
 
 
 def _choose_from_stated_values(
-    likelihood: Likelihood, nominal: Fit, stops: Sequence[float], pool: Sequence[Candidate], progress: Progress
+    likelihood: Likelihood,
+    nominal: Fit,
+    early: Sequence[Fit],
+    stops: Sequence[float],
+    pool: Sequence[Candidate],
+    progress: Progress,
 ) -> _Selected | None:
     """Named laws around a fit from the stated values, where nominal values have absorbed a misfit.
 
@@ -199,6 +204,7 @@ def _choose_from_stated_values(
     laws are not the answer or leave improbable values too.
 
     Args:
+        early: fits of the nominal device over the windows ``stops``.
         stops: ends of growing windows as fractions of the recordings.
     """
     groups = [[candidate for candidate in pool if candidate.term.effect in effects] for effects in ABSORBED_EFFECTS]
@@ -217,7 +223,7 @@ def _choose_from_stated_values(
                 return selected
     base = min(fits, key=lambda fit: fit.neg2_log_evidence)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, base)
-    follows = residual_ratio(likelihood, base) < MAX_RESIDUAL_RATIO
+    follows = residual_ratio(likelihood, base) < max_residual_ratio(likelihood, early[0], stops[0])
     if not absorbed or (nominal_values_are_improbable(base) and not follows):
         return None
     selected = _choose_laws(base, nominal, pool, progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,6 +195,37 @@ def test_a_law_without_which_the_fit_is_worse_is_kept_although_the_linear_model_
     choice = choose_laws(anchor, early, pool, lambda text: None)
     assert choice is not None
     assert {law.term.effect for law in choice.fit.model.candidates} == set(laws)
+
+
+@pytest.mark.slow
+def test_where_the_selection_alternates_between_two_laws_their_near_rivals_are_compared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Around the spring of third order the linear model prefers that of fifth order, and the reverse."""
+    exchange, compared = law_selection._exchange_near_rival, list[bool]()
+
+    def alternate(linear: LinearModel, *arguments: object, **options: object) -> list[tuple[int, ...]]:
+        laws = {law.candidate.term.effect: i for i, law in enumerate(linear.laws)}
+        cubic_is_present = linear.laws[laws["cubic-stiffness"]].test is None
+        return [(laws["quintic-stiffness" if cubic_is_present else "cubic-stiffness"],)]
+
+    def record(*arguments: Any) -> Any:
+        compared.append(True)
+        return exchange(*arguments)
+
+    size = np.abs(bench_signals(0.0, 0.0)[1]).max()
+    run = prepare_run(bench_recording(k3=0.06 * STIFFNESS / size**2, seed=4), DEVICE)
+    nominal = Model([run], DEVICE)
+    likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
+    early = fit_progressively(likelihood, nominal, stops)[-1]
+    laws = ("cubic-stiffness", "quintic-stiffness", "cubic-damping")
+    pool = all_candidates(DEVICE, nominal, [*(catalogue()[name] for name in laws), *DISCREPANCY_TERMS.values()])
+    monkeypatch.setattr(law_selection, "_propose_laws", alternate)
+    monkeypatch.setattr(law_selection, "_exchange_near_rival", record)
+    choice = choose_laws(early, early, pool, lambda text: None)
+    assert compared
+    assert choice is not None
+    assert [law.term.effect for law in choice.fit.model.candidates] == ["cubic-stiffness"]
 
 
 @pytest.mark.slow
