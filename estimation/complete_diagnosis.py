@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from estimation.device_fit.data import output_channels
 from estimation.device_fit.fit import fit_model
@@ -85,10 +87,24 @@ def _diagnose_pictures(
     follow_signs: FollowSigns,
     progress: Progress,
 ) -> Diagnosis:
-    """The diagnosis with what the pictures show of the readout and the optics."""
-    findings, stated = _diagnose_readout(pictures, nominal, diagnosis, measure_reference, progress)
+    """The diagnosis with what the pictures show of the readout and the optics.
+
+    A lag of the drive fits a sense signal as well as one of the readout, but shifts the mirror with it. Where the
+    pictures show phase errors with the readout laws of ``diagnosis`` and none without, they refute these laws, and the
+    recordings are diagnosed again without them.
+    """
+    refuted = set[str]()
+    while True:
+        known = _sensed_laws(diagnosis, nominal)
+        stated = nominal.with_terms(known)
+        findings, stated = _diagnose_readout(pictures, stated, diagnosis, measure_reference, progress)
+        laws = {effect for of_axis in known.values() for effect in of_axis}
+        if not (findings and laws and _pictures_agree(pictures, nominal, measure_reference)):
+            break
+        refuted |= laws
+        diagnosis = _diagnose_motion(recordings, nominal, progress, refuted)
     if findings:
-        again = _diagnose_motion(recordings, stated, progress)
+        again = _diagnose_motion(recordings, _without_laws(stated, known), progress, refuted)
         open_loop = {
             name: {**loops, "nominal": diagnosis.open_loop.get(name, loops)["nominal"]}
             for name, loops in again.open_loop.items()
@@ -100,8 +116,10 @@ def _diagnose_pictures(
     return diagnosis
 
 
-def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress: Progress) -> Diagnosis:
-    """The diagnosis without pictures.
+def _diagnose_motion(
+    recordings: Sequence[Recording], nominal: Device, progress: Progress, refuted: Collection[str] = ()
+) -> Diagnosis:
+    """The diagnosis without pictures, and without the effects that they have refuted.
 
     It is empty if the recordings have pictures, and the device states no mechanics, sync edges alone show the motion,
     or the drive that keeps it up is missing.
@@ -134,7 +152,7 @@ def _diagnose_motion(recordings: Sequence[Recording], nominal: Device, progress:
             raise BadInput("is no free decay as another recording is", file=recordings[0].path, hint=hint)
         progress("amplitude of a free decay")
         return diagnose_decays([decay for of_one in decays for decay in of_one], nominal)
-    return diagnose(recordings, nominal, progress)
+    return diagnose(recordings, nominal, progress, refuted)
 
 
 def _without_motion(nominal: Device, reason: str) -> Diagnosis:
@@ -142,17 +160,9 @@ def _without_motion(nominal: Device, reason: str) -> Diagnosis:
     return Diagnosis("consistent", (), None, nominal, None, untested=f"drive and mechanics, because {reason}")
 
 
-def _diagnose_readout(
-    pictures: Sequence[Recording],
-    nominal: Device,
-    diagnosis: Diagnosis,
-    measure_reference: MeasureReference,
-    progress: Progress,
-) -> tuple[tuple[Finding, ...], Device]:
-    """Findings of the readout that the pictures show in addition to ``diagnosis``, and the nominal device with them."""
-    from estimation.optics.readout_selection import diagnose_readout
-
-    known = {
+def _sensed_laws(diagnosis: Diagnosis, nominal: Device) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """The laws of a diagnosis that change the phase of the sensed motion, by axis and effect, with their values."""
+    return {
         name: {
             effect: values
             for effect, values in axis.terms.items()
@@ -162,19 +172,50 @@ def _diagnose_readout(
         }
         for name, axis in diagnosis.device.axes.items()
     }
-    device, findings, sense_evidence = nominal.with_terms(known), tuple[Finding, ...](), _sense_evidence(diagnosis)
+
+
+def _without_laws(device: Device, laws: Mapping[str, Collection[str]]) -> Device:
+    """A device without some of its laws, given by axis."""
+    axes = {
+        name: replace(axis, terms={effect: axis.terms[effect] for effect in axis.terms if effect not in laws[name]})
+        for name, axis in device.axes.items()
+    }
+    return replace(device, axes=axes)
+
+
+def _diagnose_readout(
+    pictures: Sequence[Recording],
+    device: Device,
+    diagnosis: Diagnosis,
+    measure_reference: MeasureReference,
+    progress: Progress,
+) -> tuple[tuple[Finding, ...], Device]:
+    """Findings of the readout that the pictures show in addition to what a device states, and the device with them.
+
+    Args:
+        diagnosis: whose evidence compares laws that the picture does not tell apart.
+    """
+    from estimation.optics.readout_selection import diagnose_readout
+
+    findings, sense_evidence = tuple[Finding, ...](), _sense_evidence(diagnosis)
     for recording in pictures:
-        if not any(f"angle_{axis}" in recording for axis in nominal.axes):
+        if not any(f"angle_{axis}" in recording for axis in device.axes):
             progress(f"readout of {recording.name} against its picture")
             reference = measure_reference(recording, device)
             if reference is not None:
                 found, device = diagnose_readout(reference, sense_evidence)
                 findings = (*findings, *found)
-    axes = {
-        name: replace(axis, terms={effect: axis.terms[effect] for effect in axis.terms if effect not in known[name]})
-        for name, axis in device.axes.items()
-    }
-    return findings, replace(device, axes=axes)
+    return findings, device
+
+
+def _pictures_agree(pictures: Sequence[Recording], device: Device, measure_reference: MeasureReference) -> bool:
+    """Whether every picture determines the phase errors of both axes with a device, and none demands an effect."""
+    from estimation.optics.readout_selection import diagnose_readout
+
+    references = [measure_reference(recording, device) for recording in pictures]
+    return all(
+        each is not None and np.all(np.isfinite(each.sd)) and not diagnose_readout(each)[0] for each in references
+    )
 
 
 def _sense_evidence(diagnosis: Diagnosis) -> Callable[[Device], float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -81,7 +81,10 @@ class Diagnosis:
 
 
 def diagnose(
-    recordings: Sequence[Recording], device: Device | None = None, progress: Progress = lambda text: None
+    recordings: Sequence[Recording],
+    device: Device | None = None,
+    progress: Progress = lambda text: None,
+    excluded: Collection[str] = (),
 ) -> Diagnosis:
     """Diagnose which effects on drive, mechanics, readout and timing the nominal device omits.
 
@@ -89,6 +92,7 @@ def diagnose(
         recordings: of one device; all are fitted together.
         device: the nominal one; None takes that of the first recording.
         progress: called with one line of text at every step.
+        excluded: effects that are no candidates.
 
     Raises:
         BadInput: no device, or a recording that cannot be compared with it.
@@ -96,7 +100,7 @@ def diagnose(
     nominal = nominal_device(recordings, device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
     extended = with_driven_modes(runs, nominal)
-    diagnosis = _diagnose_runs(runs, extended, progress)
+    diagnosis = _diagnose_runs(runs, extended, progress, excluded)
     if extended is nominal:
         return diagnosis
     nominal_loops = {name: loop.to_json() for name, loop in open_loop(runs, nominal).items()}
@@ -105,9 +109,9 @@ def diagnose(
     return replace(diagnosis, verdict="mismatch", open_loop=loops, further_modes=modes)
 
 
-def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress) -> Diagnosis:
+def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress, excluded: Collection[str]) -> Diagnosis:
     """The diagnosis of prepared recordings. Where every selected law is rejected, the others are selected from."""
-    terms: Mapping[str, Term] = catalogue()
+    terms: Mapping[str, Term] = {effect: term for effect, term in catalogue().items() if effect not in excluded}
     while True:
         result = select_terms(runs, device, terms, progress)
         diagnosis = build_diagnosis(result)
