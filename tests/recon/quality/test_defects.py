@@ -250,8 +250,8 @@ def test_only_a_lasting_sudden_delay_counts_as_dropped_samples(whole: Reconstruc
 
 def test_a_constant_phase_error_of_an_axis_that_is_determined_only_later_is_no_loss(whole: Reconstruction) -> None:
     """At the start of a scan the amplitude of an axis may still grow; there the delay is that of the other axis."""
-    aligned, unknown = PhaseEstimate(0.0, 1e-4), PhaseEstimate(math.nan, math.inf)
-    late = PhaseEstimate(np.radians(3.0), 1e-3)
+    aligned, unknown = PhaseEstimate(0.0, 1e-3), PhaseEstimate(math.nan, math.inf)
+    late = PhaseEstimate(np.radians(3.0), 1e-4)
     axes = [(unknown, aligned)] * 2 + [(late, aligned)] * 4
     slices = [PhaseError(float(i), x, y) for i, (x, y) in enumerate(axes)]
     assert first_late_slice(slices, whole.motion) is None
