@@ -257,7 +257,7 @@ def _repair_dropped_samples(
         f"from about {when:.4g} s on the forward and backward half-periods disagree: the phase drifted away, samples "
         "of the intensity were lost, or the specimen changed"
     )
-    return replace(result, notes=[*result.notes, doubt])
+    return replace(result, limits=[*result.limits, doubt])
 
 
 def _unlocated(estimated: EstimatedMotion) -> SampleRanges:

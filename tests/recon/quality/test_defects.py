@@ -223,8 +223,8 @@ def test_a_specimen_that_changed_is_not_reported_as_dropped_samples(whole: Recon
     light[40_000:] = np.random.default_rng(0).permutation(light[40_000:])
     result = reconstruct_scan(damaged(intensity=light))
     assert result.defects == []
-    assert any("forward and backward half-periods disagree" in note for note in result.notes)
-    assert not any("forward and backward half-periods disagree" in note for note in whole.notes)
+    assert any("forward and backward half-periods disagree" in limit for limit in result.limits)
+    assert not any("forward and backward half-periods disagree" in limit for limit in whole.limits)
 
 
 def test_only_a_lasting_sudden_delay_counts_as_dropped_samples(whole: Reconstruction) -> None:
