@@ -94,15 +94,11 @@ def _diagnose_pictures(
     recordings are diagnosed again without them.
     """
     refuted = set[str]()
-    while True:
-        known = _sensed_laws(diagnosis, nominal)
-        stated = nominal.with_terms(known)
-        findings, stated = _diagnose_readout(pictures, stated, diagnosis, measure_reference, progress)
-        laws = {effect for of_axis in known.values() for effect in of_axis}
-        if not (findings and laws and _pictures_agree(pictures, nominal, measure_reference)):
-            break
-        refuted |= laws
+    while _pictures_refute(pictures, nominal, known := _sensed_laws(diagnosis, nominal), measure_reference):
+        refuted |= {effect for laws in known.values() for effect in laws}
         diagnosis = _diagnose_motion(recordings, nominal, progress, refuted)
+    stated = nominal.with_terms(known)
+    findings, stated = _diagnose_readout(pictures, stated, diagnosis, measure_reference, progress)
     if findings:
         again = _diagnose_motion(recordings, _without_laws(stated, known), progress, refuted)
         open_loop = {
@@ -208,14 +204,24 @@ def _diagnose_readout(
     return findings, device
 
 
-def _pictures_agree(pictures: Sequence[Recording], device: Device, measure_reference: MeasureReference) -> bool:
-    """Whether every picture determines the phase errors of both axes with a device, and none demands an effect."""
-    from estimation.optics.readout_selection import diagnose_readout
+def _pictures_refute(
+    pictures: Sequence[Recording],
+    nominal: Device,
+    laws: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    measure_reference: MeasureReference,
+) -> bool:
+    """Whether a picture shows phase errors with laws of the readout, and all pictures determine that there are none
+    without."""
+    from estimation.optics.readout_selection import demands_an_effect
 
-    references = [measure_reference(recording, device) for recording in pictures]
-    return all(
-        each is not None and np.all(np.isfinite(each.sd)) and not diagnose_readout(each)[0] for each in references
-    )
+    if not any(laws.values()):
+        return False
+    compared = [each for each in pictures if not any(f"angle_{axis}" in each for axis in nominal.axes)]
+    with_laws = [measure_reference(recording, nominal.with_terms(laws)) for recording in compared]
+    if not any(each is not None and demands_an_effect(each) for each in with_laws):
+        return False
+    without = [measure_reference(recording, nominal) for recording in compared]
+    return all(each is not None and np.all(np.isfinite(each.sd)) and not demands_an_effect(each) for each in without)
 
 
 def _sense_evidence(diagnosis: Diagnosis) -> Callable[[Device], float]:

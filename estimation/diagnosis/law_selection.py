@@ -161,7 +161,7 @@ def _propose_laws(linear: LinearModel, fit: Fit, kept: tuple[int, ...], first: b
     if not first:
         return [linear.select(present, max_moves=1, kept=kept).laws]
     has_discrepancy = any(map(is_discrepancy, fit.model.candidates))
-    alone = linear.strongest(MAX_ALTERNATIVES) if has_discrepancy else [(law,) for law in present]
+    alone = linear.strongest(MAX_ALTERNATIVES if has_discrepancy else len(present))
     return [linear.select().laws, linear.strongest_together(), *alone]
 
 

@@ -125,13 +125,10 @@ def diagnose_readout(
         Findings in order of evidence, and the improved device, with their terms and calibrated corner frequencies;
         without a finding the device is unchanged.
     """
-    value = np.where(np.isfinite(reference.sd), np.nan_to_num(reference.value), 0.0)
-    picture_sd = np.minimum(reference.sd, UNDETERMINED_SD_RAD)
-    covariance = np.diag(picture_sd**2 + estimator_variance(reference.motion))
-    if value @ np.linalg.solve(covariance, value) < DETECTION_THRESHOLD:  # no effect can gain more
+    data = _measured(reference)
+    if data.value @ np.linalg.solve(data.covariance, data.value) < DETECTION_THRESHOLD:  # no effect can gain more
         return (), reference.device
     scales = {axis: natural_scales(reference, axis) for axis in AXES}
-    data = _Data(value, covariance, calibrations_of(reference))
     candidates = [_linearise(reference, each, scales, data) for each in candidate_terms(reference, scales)]
     candidates += effects_beside_the_readout(scales)
     selected = _select(data, candidates)
@@ -143,6 +140,22 @@ def diagnose_readout(
         data = replace(data, sense={key: sense_evidence(device) for key, device in sized.items()})
         selected = min(near.values(), key=data.neg2_log_evidence)
     return _report(reference, data, selected, candidates, scales)
+
+
+def demands_an_effect(reference: ReferencePhase) -> bool:
+    """Whether phase errors exceed what their uncertainty and the tolerance of the corner frequencies explain."""
+    data = _measured(reference)
+    calibrations = np.hstack([np.zeros((2, 0)), *(each.slope for each in data.calibrations)])
+    total = data.covariance + calibrations @ calibrations.T
+    return bool(data.value @ np.linalg.solve(total, data.value) > DETECTION_THRESHOLD)
+
+
+def _measured(reference: ReferencePhase) -> _Data:
+    """The phase errors with their covariance; those that the picture does not determine are zero."""
+    value = np.where(np.isfinite(reference.sd), np.nan_to_num(reference.value), 0.0)
+    picture_sd = np.minimum(reference.sd, UNDETERMINED_SD_RAD)
+    covariance = np.diag(picture_sd**2 + estimator_variance(reference.motion))
+    return _Data(value, covariance, calibrations_of(reference))
 
 
 def _near_exchanges(

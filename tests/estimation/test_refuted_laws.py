@@ -40,7 +40,10 @@ def diagnosed(
         return SimpleNamespace(device=device, sd=np.full(2, 1e-4 if has_delay(device) else nominal_sd))
 
     def readout(reference: SimpleNamespace, evidence: object = None) -> tuple[tuple[str, ...], Device]:
-        return ("finding",) if contradicted[has_delay(reference.device)] else (), reference.device
+        return ("finding",) if demands(reference) else (), reference.device
+
+    def demands(reference: SimpleNamespace) -> bool:
+        return contradicted[has_delay(reference.device)]
 
     def has_delay(device: Device) -> bool:
         return "channel-delay" in device.axes["x"].terms
@@ -48,6 +51,7 @@ def diagnosed(
     monkeypatch.setattr(complete_diagnosis, "_diagnose_motion", motion)
     monkeypatch.setattr(complete_diagnosis, "add_optics", lambda diagnosis, recording, follow_signs: diagnosis)
     monkeypatch.setattr(readout_selection, "diagnose_readout", readout)
+    monkeypatch.setattr(readout_selection, "demands_an_effect", demands)
     return diagnose_with_optics([recording], measure_reference=reference), excluded  # type: ignore[arg-type]
 
 
