@@ -160,8 +160,12 @@ def _propose_laws(linear: LinearModel, fit: Fit, kept: tuple[int, ...], first: b
     present = _present_laws(linear)
     if not first:
         return [linear.select(present, max_moves=1, kept=kept).laws]
-    has_discrepancy = any(map(is_discrepancy, fit.model.candidates))
-    alone = linear.strongest(MAX_ALTERNATIVES if has_discrepancy else len(present))
+    if any(map(is_discrepancy, fit.model.candidates)):
+        alone = linear.strongest(MAX_ALTERNATIVES)
+    elif len({axis for axis, _ in linear.effects(present)}) > 1:  # each alone leaves the other axis as it is
+        alone = linear.strongest(len(present))
+    else:
+        alone = [(law,) for law in present]
     return [linear.select().laws, linear.strongest_together(), *alone]
 
 
