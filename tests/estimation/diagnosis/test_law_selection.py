@@ -197,6 +197,27 @@ def test_a_law_without_which_the_fit_is_worse_is_kept_although_the_linear_model_
     assert {law.term.effect for law in choice.fit.model.candidates} == set(laws)
 
 
+@pytest.mark.parametrize(("axes", "alone"), [("xx", {(0,), (1,)}), ("xy", {(1,), (2,)})])
+def test_the_best_single_laws_are_fitted_where_the_present_ones_belong_to_two_axes(
+    axes: str, alone: set[tuple[int, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A law of one axis leaves the other as it is; laws that the fit does not contain may act on both."""
+    effects = [("x", "cubic-stiffness"), (axes[1], "resonance-drift"), ("x", "clock-skew")]
+    laws = [
+        LinearTerm(Candidate(catalogue()[effect], axis, "sense"), np.array([i]), None)
+        for i, (axis, effect) in enumerate(effects)
+    ]
+    linear = LinearModel(np.eye(4), np.zeros((0, 4)), tuple(laws), ())
+    nothing = SimpleNamespace(laws=())
+    monkeypatch.setattr(law_selection, "_present_laws", lambda linear: (0, 1))
+    monkeypatch.setattr(LinearModel, "select", lambda self: nothing)
+    monkeypatch.setattr(LinearModel, "strongest_together", lambda self: ())
+    monkeypatch.setattr(LinearModel, "strongest", lambda self, number: [(2,), (1,), (0,)][:number])
+    fit = SimpleNamespace(model=SimpleNamespace(candidates=()))
+    proposed = law_selection._propose_laws(linear, fit, (), first=True)  # type: ignore[arg-type]
+    assert set(proposed) - {()} == alone
+
+
 @pytest.mark.slow
 def test_where_the_selection_alternates_between_two_laws_their_near_rivals_are_compared(
     monkeypatch: pytest.MonkeyPatch,

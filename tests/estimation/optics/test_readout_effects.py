@@ -10,7 +10,7 @@ import pytest
 
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.estimate import estimate
-from estimation.optics.readout_selection import diagnose_readout
+from estimation.optics.readout_selection import demands_an_effect, diagnose_readout
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.targets import make_target
 from recon.evaluation import evaluate_axis, truth_from_simulation
@@ -46,6 +46,16 @@ def phase_rms_deg(recording: Recording, device: Device) -> float:
     """Phase error of x against the truth, from the sense signal alone [deg]."""
     truth = truth_from_simulation(imaging()[1])
     return float(np.degrees(evaluate_axis(estimate(recording, device).axes["x"], *truth.angles["x"]).phase_rmse))
+
+
+@pytest.mark.parametrize(("delay_s", "demanded"), [(0.0, False), (1e-6, True)])
+def test_a_delay_that_the_recording_lacks_leaves_phase_errors(delay_s: float, demanded: bool) -> None:
+    recording = imaging()[0]
+    assert recording.device is not None
+    device = recording.device.with_terms({"x": {"channel-delay": {"delay": delay_s}}} if delay_s else {})
+    reference = measure_reference_phase(recording, device)
+    assert reference is not None
+    assert demands_an_effect(reference) is demanded
 
 
 @pytest.mark.parametrize(
