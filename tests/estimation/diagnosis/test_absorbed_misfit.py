@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.blind.generator import Case
 from estimation.device_fit.fit import nominal_values_are_improbable
+from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
 from tests.support.blind_recordings import search_blind_recording
 
 RIVALS = ("drive-droop", "coulomb-friction", "inertia-scale", "cubic-stiffness", "quadratic-drag")
@@ -46,3 +47,29 @@ def test_a_clock_is_found_where_drifting_resonances_alone_do_not_follow_the_moti
     terms = ("filter-lag", "drive-lag", "charging", "damping-drift", "clock-skew", "resonance-drift")
     _, search = search_blind_recording(case, tmp_path, terms)
     assert {step.candidate.key for step in search.steps} == {"x.resonance-drift", "y.resonance-drift", "x.clock-skew"}
+
+
+@pytest.mark.slow
+def test_a_lag_of_the_drive_is_found_beside_drifts_in_slow_noise(tmp_path: Path) -> None:
+    """In 1/f noise a fit that follows the motion leaves a tenth of the signal, as the first window alone does.
+
+    A delay of the readout fits the signal as well, and is a rival.
+    """
+    case = Case("blind-003", "one", "imaging", ("drive-lag", "resonance-drift"), "flicker", 2089980223)
+    terms = ("channel-delay", "readout-lag", "drive-lag", "damping-drift", "resonance-drift")
+    _, search = search_blind_recording(case, tmp_path, terms)
+    found = {step.candidate.key: step for step in search.steps}
+    (late,) = found.keys() - {"x.resonance-drift", "y.resonance-drift"}
+    assert len(found) == 3
+    near = {rival.candidate.key for rival in found[late].rivals if rival.evidence_gap < UNIQUE_NAME_THRESHOLD}
+    assert {"x.drive-lag", "x.channel-delay"} <= {late, *near}
+    assert not nominal_values_are_improbable(search.final)
+
+
+@pytest.mark.slow
+def test_a_clock_alone_is_found_where_drifts_of_both_axes_follow_what_it_does(tmp_path: Path) -> None:
+    """The clock of x runs 53 ppm slow. From the four drifts that imitate it, no addition or exchange leads to it."""
+    case = Case("blind-003", "one", "imaging", ("clock-skew",), "coloured", 2054680291)
+    terms = ("charging", "drive-lag", "cubic-stiffness", "damping-drift", "clock-skew", "resonance-drift")
+    _, search = search_blind_recording(case, tmp_path, terms)
+    assert [step.candidate.key for step in search.steps] == ["x.clock-skew"]
