@@ -81,7 +81,9 @@ class Film:
             return np.asarray(pages[index].asarray()).reshape(size)
         count = math.prod(size)
         file.filehandle.seek(self.offset + index * count * self.dtype.itemsize)
-        return np.frombuffer(file.filehandle.read(count * self.dtype.itemsize), self.dtype).reshape(size)
+        stored = self.dtype.newbyteorder(file.byteorder)
+        plane = np.frombuffer(file.filehandle.read(count * stored.itemsize), stored).reshape(size)
+        return plane.astype(self.dtype, copy=False)
 
 
 def open_film(path: Path) -> Film:

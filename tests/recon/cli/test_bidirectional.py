@@ -44,6 +44,15 @@ def frames() -> np.ndarray:
     return film(SHIFTS)
 
 
+@pytest.mark.parametrize("dtype", ["<u2", ">u2", ">f4"])
+def test_the_byte_order_of_a_film_does_not_change_its_pixels(dtype: str, tmp_path: Path) -> None:
+    pixels = np.random.default_rng(772042).integers(0, 4000, (3, 16, 24)).astype(dtype)
+    tifffile.imwrite(tmp_path / "film.tif", pixels, photometric="minisblack", byteorder=dtype[0])
+    stored = open_film(tmp_path / "film.tif")
+    assert stored.offset is not None
+    np.testing.assert_array_equal(np.concatenate(list(stored.read(range(3)))), pixels)
+
+
 @pytest.mark.slow
 def test_phase_of_every_frame_and_the_lag_are_found(frames: np.ndarray, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "film.tif", frames, imagej=True, metadata={"axes": "TYX", "finterval": 0.03})
