@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.report.conclusions import conclude_bidirectional
 
     film = open_film(args.film)
-    with replacing_folder(args.output) as folder:
+    with replacing_folder(args.output, args.film) as folder:
         result = correct_film(film, folder / "corrected.tif", means=args.values == "means")
         result.write_phases(folder / "phase.csv")
         summary = result.summary()

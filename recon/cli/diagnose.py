@@ -94,7 +94,7 @@ def diagnose_files(
             bar.set_description_str("report")
             page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
         content = diagnosis.to_json()
-        with replacing_folder(output) as folder:
+        with replacing_folder(output, device, *paths) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
             (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
             (folder / "device.toml").write_text(diagnosis.device.to_toml(), encoding="utf-8")

@@ -69,7 +69,7 @@ def identify_files(
         "axes": _axes_summary(identification),
         "notes": list(identification.notes),
     }
-    with replacing_folder(output) as folder:
+    with replacing_folder(output, device, *paths) as folder:
         (folder / "device.toml").write_text(identification.device.to_toml(), encoding="utf-8")
         write_json(folder / "summary.json", summary)
         page = identification_report(summary, nominal, [path.name for path in paths])

@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     summary: dict[str, Any] = finite(cloud.summary())
     summary["conclusion"] = conclude_point_cloud(summary, points)
     summary |= {"file": points, "recording": str(args.recording), "output": str(args.output)}
-    with replacing_folder(args.output) as folder:
+    with replacing_folder(args.output, args.device, args.recording) as folder:
         write_points(folder / points, cloud, args.format)
         write_json(folder / "summary.json", summary)
         (folder / "report.html").write_text(point_cloud_report(cloud, summary), encoding="utf-8")

@@ -70,7 +70,7 @@ def predict_file(
                 for name, prediction in predictions.items()
             },
         }
-        with replacing_folder(output) as folder:
+        with replacing_folder(output, device, path) as folder:
             predicted.write(folder / "predicted.h5")
             write_json(folder / "summary.json", summary)
     return summary | {"output": str(output)}

@@ -227,7 +227,7 @@ def reconstruct_file(
     from recon.z_slices import find_z_slices
 
     growing = live is not None
-    with open_any(path, mapping, growing) as recording, replacing_folder(output) as folder:
+    with open_any(path, mapping, growing) as recording, replacing_folder(output, options.device, path) as folder:
         if options.wants_stack:  # what prevents a stack is found before the motion is estimated
             reason = "--frames without a number and --z-step cut the scan by it"
             find_z_slices(recording.require("position_z", reason), recording.require("intensity"), options.z_step)

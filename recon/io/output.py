@@ -19,7 +19,7 @@ from recon.imaging.picture import Grid, Picture
 from recon.imaging.sample_motion import SampleMotion
 from scanner.channel import Channel
 from scanner.errors import BadInput
-from scanner.files import IS_REPLACING, check_writable
+from scanner.files import IS_REPLACING, check_no_input, check_writable
 from scanner.hdf5 import new_hdf5
 from scanner.motion import Motion
 
@@ -41,19 +41,24 @@ def check_folder(folder: Path) -> None:
 
 
 @contextmanager
-def replacing_folder(folder: Path) -> Iterator[Path]:
+def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
     """A temporary folder to write into; its files replace those of ``folder`` when the block ends without an error.
 
     If the block fails, ``folder`` is unchanged. Old files are deleted before the first new file is moved, so that a
     process killed in between leaves no mixture of old and new files.
 
+    Args:
+        inputs: files that the command reads, which no new file may replace; what is no path is ignored.
+
     Raises:
-        BadInput: as :func:`check_folder`.
+        BadInput: as :func:`check_folder`, or a new file has the place of an input.
     """
     check_folder(folder)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
     try:
         yield temporary
+        for path in temporary.iterdir():
+            check_no_input(folder / path.name, *(Path(each) for each in inputs if isinstance(each, str | Path)))
         IS_REPLACING.set()
         if not folder.exists():
             temporary.chmod(0o755)

@@ -14,7 +14,7 @@ from recon.frame_axis import FrameAxis
 from recon.frames import write_scan_frames
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
-from recon.io.output import write_frames, write_tiff
+from recon.io.output import replacing_folder, write_frames, write_tiff
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
 from scanner import devices
@@ -144,3 +144,21 @@ def test_the_command_writes_pixel_sizes_and_frames(tmp_path: Path, capsys: pytes
     width, height, unit = size_of(tmp_path / "out" / "image.tif")
     assert unit == "um"
     assert width == height == pytest.approx(690 * 0.36 / 400, rel=1e-6)
+
+
+def test_no_new_file_replaces_an_input(tmp_path: Path) -> None:
+    device, other = tmp_path / "device.toml", tmp_path / "scan.h5"
+    for path in (device, other):
+        path.write_text("recorded", encoding="utf-8")
+    with (
+        pytest.raises(BadInput, match=r"device\.toml: is read by this command and would be overwritten"),
+        replacing_folder(tmp_path, "chen2020", device, other) as folder,
+    ):
+        (folder / "device.toml").write_text("found", encoding="utf-8")
+    assert {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()} == {
+        "device.toml": "recorded",
+        "scan.h5": "recorded",
+    }
+    with replacing_folder(tmp_path, device, other) as folder:
+        (folder / "report.html").write_text("found", encoding="utf-8")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == "found"
