@@ -272,8 +272,8 @@ def enumerate_figures(
         frame_rate: pictures per second [Hz].
     """
     most = frame_rate * (1.0 + MAX_RATE_EXCESS)
-    for n_x in range(math.ceil(x[0] / most), math.floor(x[1] / frame_rate) + 1):
-        for n_y in range(math.ceil(y[0] / most), math.floor(y[1] / frame_rate) + 1):
+    for n_x in range(max(1, math.ceil(x[0] / most)), math.floor(x[1] / frame_rate) + 1):
+        for n_y in range(max(1, math.ceil(y[0] / most)), math.floor(y[1] / frame_rate) + 1):
             slowest = max(frame_rate, x[0] / n_x, y[0] / n_y)
             if math.gcd(n_x, n_y) == 1 and slowest <= min(most, x[1] / n_x, y[1] / n_y):
                 yield (n_x, n_y), slowest

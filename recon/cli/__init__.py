@@ -13,6 +13,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
@@ -68,6 +69,9 @@ def main(arguments: Sequence[str] | None = None, announce: bool = False) -> int:
     """
     # The matrices are small: threads inside BLAS slow them down, on a busy machine several times.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a console without a character of the text shows a question mark
+            stream.reconfigure(errors="replace")
     words = list(sys.argv[1:] if arguments is None else arguments)
     announce = announce or arguments is None
     with handle_interrupts() as stop:

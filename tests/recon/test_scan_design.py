@@ -100,6 +100,12 @@ def test_figures_lie_in_both_bands_and_repeat_at_the_frame_rate(x: float, y: flo
             assert low * (1 - 1e-12) <= n * frame_rate <= high * (1 + 1e-12)
 
 
+def test_bands_of_a_scanner_without_a_resonance_begin_at_rest() -> None:
+    figures = dict(enumerate_figures((0.0, 40.0), (0.0, 30.0), 10.0))
+    assert (3, 2) in figures
+    assert all(n_x >= 1 and n_y >= 1 for n_x, n_y in figures)
+
+
 def test_bands_shrink_with_the_margin_and_a_message_states_the_largest_amplitude() -> None:
     band = SustainedBand("x", np.array([100.0, 101.0, 103.0]), np.array([0.1, 0.2, 0.0]), 2)
     assert band.motion_frequencies_reaching(0.15, 0.0) == pytest.approx((50.25, 50.75))

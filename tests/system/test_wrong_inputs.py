@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
+from dataclasses import replace
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import h5py
@@ -278,3 +281,19 @@ def test_numbers_of_frames_are_positive(arguments: dict) -> None:
     result = lissajous.reconstruct(arrays(), device=Device.from_toml(DEVICE), pixels=(20, 20))
     with pytest.raises(BadInput, match="give a positive number"):
         lissajous.frames(result, **arguments)
+
+
+def test_a_target_is_not_scanned_by_a_device_of_one_axis(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    device = Device.from_toml(DEVICE + MECHANICS)
+    one = replace(device, axes={"x": device.axes["x"]})
+    (tmp_path / "one.toml").write_text(one.to_toml(), encoding="utf-8")
+    refused(["simulate", "--device", str(tmp_path / "one.toml")], tmp_path, "one.toml: states only the axis x", capsys)
+
+
+def test_a_console_that_lacks_a_character_shows_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = BytesIO()
+    monkeypatch.setattr(sys, "stdout", TextIOWrapper(written, encoding="cp1252"))
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    print("b/J = 10⁻² 1/s", flush=True)
+    assert "b/J = 10?² 1/s" in written.getvalue().decode("cp1252")
