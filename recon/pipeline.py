@@ -257,7 +257,9 @@ def _repair_dropped_samples(
         f"from about {when:.4g} s on the forward and backward half-periods disagree: the phase drifted away, samples "
         "of the intensity were lost, or the specimen changed"
     )
-    return replace(result, limits=[*result.limits, doubt])
+    if result.limits:  # they state why the picture does not show the scene; this follows from them
+        return replace(result, notes=[*result.notes, doubt])
+    return replace(result, limits=[doubt])
 
 
 def _unlocated(estimated: EstimatedMotion) -> SampleRanges:
