@@ -36,7 +36,11 @@ def require_format(name: str) -> None:
 
 
 def write_points(path: Path, cloud: PointCloud, name: str) -> None:
-    """Write a point cloud as ``pcd`` or ``las``."""
+    """Write a point cloud as ``pcd`` or ``las``.
+
+    Raises:
+        BadInput: a point is too far away for LAS.
+    """
     {"pcd": _write_pcd, "las": _write_las}[name](path, cloud)
 
 
@@ -55,6 +59,10 @@ def _write_pcd(path: Path, cloud: PointCloud) -> None:
 def _write_las(path: Path, cloud: PointCloud) -> None:
     import laspy
 
+    farthest = float(np.abs(cloud.position).max(initial=0.0))
+    if farthest > LAS_SCALE_M * np.iinfo(np.int32).max:
+        what = f"a point lies {farthest:.4g} m away, more than LAS can hold in steps of {LAS_SCALE_M:g} m"
+        raise BadInput(what, channel="range", hint="remove ranges without a return, or write --format pcd")
     header = laspy.LasHeader(point_format=6, version="1.4")  # 6 has a time for each point
     header.scales, header.offsets = np.full(3, LAS_SCALE_M), np.zeros(3)
     header.generating_software = "lissajous"

@@ -25,6 +25,7 @@ def read_wav(path: Path) -> Contents:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", wavfile.WavFileWarning)  # chunks that hold no samples
+            warnings.filterwarnings("error", "Reached EOF", wavfile.WavFileWarning)
             try:
                 rate, samples = wavfile.read(path, mmap=True)
             except ValueError as error:
@@ -36,6 +37,8 @@ def read_wav(path: Path) -> Contents:
     except Exception as error:  # a damaged file can make the parser raise anything
         what = f"is not a whole WAV file: {error or type(error).__name__}"
         raise BadInput(what, file=path, hint="copy it again") from None
+    if not samples.size:
+        raise BadInput("holds no samples", file=path, hint="record it again")
     table = samples.reshape(len(samples), -1)
     note = f"{table.dtype}, in counts" if table.dtype.kind in "iu" else "1 is full scale"
     clock = float(rate) if rate > 0 else None

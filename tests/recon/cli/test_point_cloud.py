@@ -5,12 +5,14 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from phantoms.lidar import add_ranges, measure_wall
 from recon.cli import main
+from recon.io.point_files import write_points
 from recon.point_cloud import make_point_cloud
 from recon.reconstruction import Options
 from scanner import devices
@@ -96,6 +98,13 @@ def test_points_of_a_wall_lie_on_it(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert np.std(z - 5.0) > 0.9 * 0.01 * cosine
     sd = np.sqrt(cloud.pc_data["cov_zz"])
     assert np.mean(np.abs(z - 5.0) < 1.96 * sd) == pytest.approx(0.95, abs=0.02)
+
+
+def test_a_range_without_return_that_las_cannot_hold_is_refused(tmp_path: Path) -> None:
+    far = SimpleNamespace(position=np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 2.0**32 / 1000.0]]))
+    with pytest.raises(BadInput, match=r"4.295e\+06 m away.*remove ranges without a return"):
+        write_points(tmp_path / "points.las", far, "las")  # type: ignore[arg-type]
+    assert not (tmp_path / "points.las").exists()
 
 
 @pytest.mark.slow

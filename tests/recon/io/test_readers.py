@@ -199,6 +199,14 @@ def test_wav_files_are_read(tmp_path: Path, kind: str, channels: int) -> None:
     np.testing.assert_array_equal(variables[f"CH{channels}"].raw[:], values[:, -1])
 
 
+@pytest.mark.parametrize(("size", "words"), [(44, "holds no samples"), (5044, "is not a whole WAV file: Reached EOF")])
+def test_wav_files_that_end_early_are_refused(size: int, words: str, tmp_path: Path) -> None:
+    wavfile.write(tmp_path / "whole.wav", 48000, np.zeros(0 if size == 44 else 5000, np.int16))
+    (tmp_path / "a.wav").write_bytes((tmp_path / "whole.wav").read_bytes()[:size])
+    with pytest.raises(BadInput, match=f"a.wav: {words}"):
+        read(tmp_path / "a.wav")
+
+
 def test_wav_files_of_24_bits_are_read(tmp_path: Path) -> None:
     with wave.open(str(tmp_path / "a.wav"), "wb") as file:
         file.setparams((1, 3, 8000, 0, "NONE", ""))
