@@ -297,3 +297,16 @@ def test_a_console_that_lacks_a_character_shows_another(monkeypatch: pytest.Monk
         main(["--version"])
     print("b/J = 10⁻² 1/s", flush=True)
     assert "b/J = 10?² 1/s" in written.getvalue().decode("cp1252")
+
+
+def test_a_sensor_that_is_sampled_too_slowly_for_its_drive_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    def undersampled(file: h5py.File) -> None:
+        """One sample of x in every 240: 2.08 in a period of 2000 Hz."""
+        values("sense_x", lambda v: v[::240])(file)
+        file["channels/sense_x"].attrs["sample_rate"] = RATE / 240
+
+    write(tmp_path / "slow.h5", DEVICE + MECHANICS, undersampled)
+    words = "slow.h5: sense_x: is sampled at 4167 Hz, too slowly for a motion at 2000 Hz; record at"
+    refused(["reconstruct", str(tmp_path / "slow.h5"), "--estimator", "sensor"], tmp_path, words, capsys)
