@@ -93,23 +93,31 @@ def _diagnose_pictures(
     pictures show phase errors with the readout laws of ``diagnosis`` and none without, they refute these laws, and the
     recordings are diagnosed again without them.
     """
-    refuted = set[str]()
+    refuted = list[tuple[str, str]]()
     while _pictures_refute(pictures, nominal, known := _sensed_laws(diagnosis, nominal), measure_reference):
-        refuted |= {effect for laws in known.values() for effect in laws}
-        diagnosis = _diagnose_motion(recordings, nominal, progress, refuted)
+        refuted += [(axis, effect) for axis, laws in known.items() for effect in laws]
+        diagnosis = _diagnose_motion(recordings, nominal, progress, [effect for _, effect in refuted])
     stated = nominal.with_terms(known)
     findings, stated = _diagnose_readout(pictures, stated, diagnosis, measure_reference, progress)
     if findings:
-        again = _diagnose_motion(recordings, _without_laws(stated, known), progress, refuted)
+        without = _without_laws(stated, known)
+        again = _diagnose_motion(recordings, without, progress, [effect for _, effect in refuted])
         open_loop = {
             name: {**loops, "nominal": diagnosis.open_loop.get(name, loops)["nominal"]}
             for name, loops in again.open_loop.items()
         }
         diagnosis = replace(again, verdict="mismatch", findings=(*findings, *again.findings), open_loop=open_loop)
+    diagnosis = replace(diagnosis, findings=tuple(_with_refuted(each, refuted) for each in diagnosis.findings))
     for recording in pictures:
         progress(f"optics of {recording.name}")
         diagnosis = add_optics(diagnosis, recording, follow_signs)
     return diagnosis
+
+
+def _with_refuted(finding: Finding, refuted: Sequence[tuple[str, str]]) -> Finding:
+    """A finding that states which laws of its axis, given by axis and effect, the picture refutes."""
+    effects = ", ".join(effect for axis, effect in refuted if axis == finding.axis)
+    return replace(finding, where=f"{finding.where}; the picture refutes {effects}") if effects else finding
 
 
 def _diagnose_motion(

@@ -9,6 +9,7 @@ import pytest
 from estimation import complete_diagnosis
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
+from estimation.diagnosis.finding import Finding
 from estimation.optics import readout_selection
 from scanner.device import Device
 from scanner.recording import Recording
@@ -16,6 +17,10 @@ from tests.support.two_axis_scan import FIELD, RATE_HZ, READOUTS, light, sensors
 
 DELAY = {"x": {"channel-delay": {"delay": 1e-6}}}
 LAG = {"x": {"drive-lag": {"f_c": 2e5}}}
+
+
+def finding_of(axis: str) -> Finding:
+    return Finding(axis, "drive", "drive-lag", "", (), f"drive of {axis}", 0.9, (), {}, "sense", "")
 
 
 def diagnosed(
@@ -34,7 +39,8 @@ def diagnosed(
 
     def motion(recordings: object, nominal: Device, progress: object, refuted: Collection[str] = ()) -> Diagnosis:
         excluded.append(set(refuted))
-        return Diagnosis("mismatch", (), None, nominal.with_terms(LAG if refuted else DELAY), None)
+        findings = tuple(map(finding_of, "xy")) if refuted else ()
+        return Diagnosis("mismatch", findings, None, nominal.with_terms(LAG if refuted else DELAY), None)
 
     def reference(recording: Recording, device: Device) -> SimpleNamespace:
         return SimpleNamespace(device=device, sd=np.full(2, 1e-4 if has_delay(device) else nominal_sd))
@@ -61,7 +67,10 @@ def test_a_delay_with_which_the_picture_shows_phase_errors_and_without_none_is_r
     diagnosis, excluded = diagnosed(monkeypatch, contradicted=(False, True))
     assert set(diagnosis.device.axes["x"].terms) == {"drive-lag"}
     assert excluded == [set(), {"channel-delay"}]
-    assert diagnosis.findings == ()
+    assert [each.where for each in diagnosis.findings] == [
+        "drive of x; the picture refutes channel-delay",
+        "drive of y",
+    ]
 
 
 def test_a_delay_that_the_picture_confirms_stays(monkeypatch: pytest.MonkeyPatch) -> None:
