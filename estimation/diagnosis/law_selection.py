@@ -110,6 +110,8 @@ def _iterate_selection(
         linear = linear_model(likelihood, fit, candidates)
         present = _present_laws(linear)
         centres.add(linear.effects(present))
+        if returned and not _leave_noise(linear, present):
+            break  # several laws take parts of what no law describes
         kept = present if needed == linear.effects(present) else ()
         proposed = [present] if returned else _propose_laws(linear, fit, kept, first=not fitted)
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, proposed)))
@@ -148,6 +150,12 @@ def _iterate_selection(
 def _present_laws(linear: LinearModel) -> tuple[int, ...]:
     """Laws of the fit around which a model is linear."""
     return tuple(i for i, law in enumerate(linear.laws) if law.test is None)
+
+
+def _leave_noise(linear: LinearModel, laws: tuple[int, ...]) -> bool:
+    """Whether corrections beside laws gain no more than a law has to."""
+    beside = linear.hypothesis(laws, max_scale=MAX_SCALE_BESIDE)
+    return linear.without_discrepancy(laws).neg2_log_evidence - beside.neg2_log_evidence <= MIN_SCORE_GAIN
 
 
 def _propose_laws(linear: LinearModel, fit: Fit, kept: tuple[int, ...], first: bool) -> list[tuple[int, ...]]:
@@ -255,7 +263,7 @@ def _exchange_near_rival(
     """
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     alone = linear.without_discrepancy(present)
-    leaves_noise = alone.neg2_log_evidence - hypothesis.neg2_log_evidence <= MIN_SCORE_GAIN
+    leaves_noise = _leave_noise(linear, present)
     discrepancies = [] if leaves_noise else list(filter(is_discrepancy, candidates))
     best, lowest = None, (alone if leaves_noise else hypothesis).neg2_log_evidence - MIN_EXCHANGE_GAIN
     compared = {linear.effects(present): fit}
