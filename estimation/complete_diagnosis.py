@@ -31,6 +31,12 @@ if TYPE_CHECKING:
 SENSED_STAGES = ("capacitance", "readout", "timing")
 """Stages whose terms change the phase of the motion that is estimated from the sense signal."""
 
+Law = tuple[str, str]
+"""A law that a device states: axis and effect."""
+
+Terms = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""Laws with their values: axis -> effect -> parameter -> value."""
+
 DETECTORS = {"sensor": "angle", "edges": "sync"}
 """Channels by which an estimator measures the motion of an axis directly."""
 
@@ -89,18 +95,21 @@ def _diagnose_pictures(
 ) -> Diagnosis:
     """The diagnosis with what the pictures show of the readout and the optics.
 
-    A lag of the drive fits a sense signal as well as one of the readout, but shifts the mirror with it. Where the
-    pictures show phase errors with the readout laws of ``diagnosis`` and none without, they refute these laws, and the
-    recordings are diagnosed again without them.
+    A lag of the drive fits a sense signal as well as one of the readout, but shifts the mirror with it. Laws of the
+    readout that the pictures refute are left out, and the recordings are diagnosed again.
     """
-    refuted = list[tuple[str, str]]()
-    while _pictures_refute(pictures, nominal, known := _sensed_laws(diagnosis, nominal), measure_reference):
-        refuted += [(axis, effect) for axis, laws in known.items() for effect in laws]
+    refuted = list[Law]()
+    while True:
+        known = _sensed_laws(diagnosis, nominal)
+        more = [law for law in _refuted_laws(pictures, nominal, known, measure_reference) if law not in refuted]
+        if not more:
+            break
+        refuted += more
         diagnosis = _diagnose_motion(recordings, nominal, progress, [effect for _, effect in refuted])
     stated = nominal.with_terms(known)
     findings, stated = _diagnose_readout(pictures, stated, diagnosis, measure_reference, progress)
     if findings:
-        without = _without_laws(stated, known)
+        without = _without_laws(stated, _names(known))
         again = _diagnose_motion(recordings, without, progress, [effect for _, effect in refuted])
         open_loop = {
             name: {**loops, "nominal": diagnosis.open_loop.get(name, loops)["nominal"]}
@@ -114,8 +123,8 @@ def _diagnose_pictures(
     return diagnosis
 
 
-def _with_refuted(finding: Finding, refuted: Sequence[tuple[str, str]]) -> Finding:
-    """A finding that states which laws of its axis, given by axis and effect, the picture refutes."""
+def _with_refuted(finding: Finding, refuted: Sequence[Law]) -> Finding:
+    """A finding that states which laws of its axis the picture refutes."""
     effects = ", ".join(effect for axis, effect in refuted if axis == finding.axis)
     return replace(finding, where=f"{finding.where}; the picture refutes {effects}") if effects else finding
 
@@ -164,7 +173,7 @@ def _without_motion(nominal: Device, reason: str) -> Diagnosis:
     return Diagnosis("consistent", (), None, nominal, None, untested=f"drive and mechanics, because {reason}")
 
 
-def _sensed_laws(diagnosis: Diagnosis, nominal: Device) -> dict[str, dict[str, Mapping[str, Any]]]:
+def _sensed_laws(diagnosis: Diagnosis, nominal: Device) -> Terms:
     """The laws of a diagnosis that change the phase of the sensed motion, by axis and effect, with their values."""
     return {
         name: {
@@ -178,10 +187,14 @@ def _sensed_laws(diagnosis: Diagnosis, nominal: Device) -> dict[str, dict[str, M
     }
 
 
-def _without_laws(device: Device, laws: Mapping[str, Collection[str]]) -> Device:
-    """A device without some of its laws, given by axis."""
+def _names(terms: Terms) -> list[Law]:
+    return [(axis, effect) for axis, effects in terms.items() for effect in effects]
+
+
+def _without_laws(device: Device, laws: Collection[Law]) -> Device:
+    """A device without some of its laws."""
     axes = {
-        name: replace(axis, terms={effect: axis.terms[effect] for effect in axis.terms if effect not in laws[name]})
+        name: replace(axis, terms={effect: each for effect, each in axis.terms.items() if (name, effect) not in laws})
         for name, axis in device.axes.items()
     }
     return replace(device, axes=axes)
@@ -212,24 +225,26 @@ def _diagnose_readout(
     return findings, device
 
 
-def _pictures_refute(
-    pictures: Sequence[Recording],
-    nominal: Device,
-    laws: Mapping[str, Mapping[str, Mapping[str, Any]]],
-    measure_reference: MeasureReference,
-) -> bool:
-    """Whether a picture shows phase errors with laws of the readout, and all pictures determine that there are none
-    without."""
+def _refuted_laws(
+    pictures: Sequence[Recording], nominal: Device, known: Terms, measure_reference: MeasureReference
+) -> list[Law]:
+    """Laws of the readout with which a picture shows phase errors, while all pictures determine that there are none
+    without: a single law where leaving it out suffices, else all."""
     from estimation.optics.readout_selection import demands_an_effect
 
-    if not any(laws.values()):
-        return False
+    laws, stated = _names(known), nominal.with_terms(known)
     compared = [each for each in pictures if not any(f"angle_{axis}" in each for axis in nominal.axes)]
-    with_laws = [measure_reference(recording, nominal.with_terms(laws)) for recording in compared]
+    if not (laws and compared):
+        return []
+    with_laws = [measure_reference(recording, stated) for recording in compared]
     if not any(each is not None and demands_an_effect(each) for each in with_laws):
-        return False
-    without = [measure_reference(recording, nominal) for recording in compared]
-    return all(each is not None and np.all(np.isfinite(each.sd)) and not demands_an_effect(each) for each in without)
+        return []
+    for refuted in [*([law] for law in laws), laws]:
+        without = [measure_reference(recording, _without_laws(stated, refuted)) for recording in compared]
+        determined = [each for each in without if each is not None and np.all(np.isfinite(each.sd))]
+        if len(determined) == len(compared) and not any(map(demands_an_effect, determined)):
+            return refuted
+    return []
 
 
 def _sense_evidence(diagnosis: Diagnosis) -> Callable[[Device], float]:

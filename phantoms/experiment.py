@@ -14,7 +14,6 @@ from phantoms.waveforms import Sine, Waveform
 from scanner import devices
 from scanner.device import AXES, Device
 from scanner.drift import Drift, exponential
-from scanner.errors import DeviceInvalid
 from scanner.recording import Recording
 
 IMAGING_DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
@@ -73,11 +72,9 @@ def simulate_experiment(
         DeviceInvalid: the device has no field of view, a single axis, or lacks a value that the simulation needs.
         BadInput: the target is neither a known name nor a picture file, or its pixels are too coarse for the spot.
     """
-    device = experiment.device
-    if len(device.axes) < len(AXES):
-        what, hint = f"states only the axis {', '.join(device.axes)}", "state both axes: a target is scanned by two"
-        raise DeviceInvalid(what, file=device.source, hint=hint)
-    view = device.require_scan()
+    for name in AXES:
+        experiment.device.axis(name)
+    view = experiment.device.require_scan()
     height_um = experiment.field_um * view.half_angle_y / view.half_angle_x
     light = blur_by_spot(make_target(experiment.target), experiment.spot_um, experiment.field_um, height_um)
     plan = Plan(

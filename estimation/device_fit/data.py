@@ -206,9 +206,20 @@ def _check_rate(
     driving = [drive for name in axes for drive in drives[name] if float(np.ptp(drive.read())) > 0.0]
     if max([channel.sample_rate, *(drive.sample_rate for drive in driving)]) >= MIN_SAMPLES_PER_PERIOD * fastest:
         return
-    what = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for a resonance at {fastest:.4g} Hz"
-    hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * fastest:.4g} Hz or more, or correct J and k of the device"
-    raise BadInput(what, file=recording.path, channel=channel.name, hint=hint)
+    raise sampled_too_slowly(channel, "a resonance", fastest, remedy=", or correct J and k of the device")
+
+
+def sampled_too_slowly(channel: Channel, what: str, frequency: float, order: int = 1, remedy: str = "") -> BadInput:
+    """The error of a channel with fewer than ``MIN_SAMPLES_PER_PERIOD`` samples in a period of what it should show.
+
+    Args:
+        what: that moves at ``frequency`` [Hz].
+        order: harmonic of it that the channel shows.
+        remedy: what helps beside a higher rate.
+    """
+    rate = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for {what} at {frequency:.4g} Hz"
+    hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * order * frequency:.4g} Hz or more{remedy}"
+    return BadInput(rate, file=channel.file, channel=channel.name, hint=hint)
 
 
 def _drive_channels(recording: Recording, axis: Axis) -> list[Channel]:

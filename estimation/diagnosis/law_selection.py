@@ -110,7 +110,9 @@ def _iterate_selection(
         linear = linear_model(likelihood, fit, candidates)
         present = _present_laws(linear)
         centres.add(linear.effects(present))
-        if returned and not _leave_noise(linear, present):
+        if returned and not _leaves_noise(
+            linear.without_discrepancy(present), linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
+        ):
             break  # several laws take parts of what no law describes
         kept = present if needed == linear.effects(present) else ()
         proposed = [present] if returned else _propose_laws(linear, fit, kept, first=not fitted)
@@ -152,10 +154,9 @@ def _present_laws(linear: LinearModel) -> tuple[int, ...]:
     return tuple(i for i, law in enumerate(linear.laws) if law.test is None)
 
 
-def _leave_noise(linear: LinearModel, laws: tuple[int, ...]) -> bool:
-    """Whether corrections beside laws gain no more than a law has to."""
-    beside = linear.hypothesis(laws, max_scale=MAX_SCALE_BESIDE)
-    return linear.without_discrepancy(laws).neg2_log_evidence - beside.neg2_log_evidence <= MIN_SCORE_GAIN
+def _leaves_noise(alone: Hypothesis, beside: Hypothesis) -> bool:
+    """Whether corrections gain no more than a law has to: ``beside`` laws that are also compared ``alone``."""
+    return alone.neg2_log_evidence - beside.neg2_log_evidence <= MIN_SCORE_GAIN
 
 
 def _propose_laws(linear: LinearModel, fit: Fit, kept: tuple[int, ...], first: bool) -> list[tuple[int, ...]]:
@@ -263,7 +264,7 @@ def _exchange_near_rival(
     """
     hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
     alone = linear.without_discrepancy(present)
-    leaves_noise = _leave_noise(linear, present)
+    leaves_noise = _leaves_noise(alone, hypothesis)
     discrepancies = [] if leaves_noise else list(filter(is_discrepancy, candidates))
     best, lowest = None, (alone if leaves_noise else hypothesis).neg2_log_evidence - MIN_EXCHANGE_GAIN
     compared = {linear.effects(present): fit}

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD
+from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
 from estimation.initial import fit_initial_motion
 from estimation.lock_in_channels import lock_in_angle
@@ -94,9 +94,7 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     angle = (channel.read() - zero) / scale
     reference = reference_of_any_waveform(recording, device, name, channel)
     if reference.kind in ("drive", "half-drive") and channel.sample_rate < MIN_SAMPLES_PER_PERIOD * reference.frequency:
-        what = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for a motion at {reference.frequency:.4g} Hz"
-        hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * reference.frequency:.4g} Hz or more"
-        raise BadInput(what, file=recording.path, channel=channel.name, hint=hint)
+        raise sampled_too_slowly(channel, "a motion", reference.frequency)
     return axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
 
 

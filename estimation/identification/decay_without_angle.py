@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD
+from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S, IdentifiedValue
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -49,9 +49,7 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
     readout, resonance = axis.require_readout(), axis.resonance
     order = 1 if isinstance(readout, MotionSensor) else 2
     if channel.sample_rate < MIN_SAMPLES_PER_PERIOD * order * resonance:
-        what = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for a resonance at {resonance:.4g} Hz"
-        hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * order * resonance:.4g} Hz or more, or correct J and k"
-        raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
+        raise sampled_too_slowly(channel, "a resonance", resonance, order, ", or correct J and k of the device")
     cycles = channel.size / channel.sample_rate * resonance
     if cycles < 0.5 * MIN_CYCLES:  # of the nominal resonance; that of the signal is known later
         hint = f"record {MIN_CYCLES:g} cycles or more"

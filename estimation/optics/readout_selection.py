@@ -66,10 +66,12 @@ HELDOUT_METRIC = (
 
 @dataclass(frozen=True)
 class _Posterior:
-    """Sizes of each effect, their standard deviations, and -2 log evidence (infinite if a sign is impossible)."""
+    """Sizes of each effect, their standard deviations, what the priors leave of the phase errors (chi-square), and
+    -2 log evidence (infinite if a sign is impossible)."""
 
     sizes: list[Array]
     sds: list[Array]
+    chi2: float
     neg2_log_evidence: float
 
 
@@ -97,11 +99,12 @@ class _Data:
         total = self.covariance + slope @ slope.T
         mean = slope.T @ np.linalg.solve(total, residual)
         covariance = np.eye(slope.shape[1]) - slope.T @ np.linalg.solve(total, slope)
-        neg2 = float(residual @ np.linalg.solve(total, residual) + np.linalg.slogdet(total)[1])
+        chi2 = float(residual @ np.linalg.solve(total, residual))
+        neg2 = chi2 + float(np.linalg.slogdet(total)[1])
         ends = np.cumsum([effect.anchor.size for effect in everything], dtype=int)
         sizes, sds = (np.split(each, ends)[: ends.size] for each in (mean, np.sqrt(np.diag(covariance))))
         impossible = any(effect.has_wrong_sign(size) for effect, size in zip(everything, sizes, strict=True))
-        return _Posterior(sizes, sds, math.inf if impossible else neg2)
+        return _Posterior(sizes, sds, chi2, math.inf if impossible else neg2)
 
     def neg2_log_evidence(self, effects: Sequence[ReadoutEffect]) -> float:
         """-2 log evidence of the calibrations and ``effects``, up to a constant.
@@ -125,9 +128,9 @@ def diagnose_readout(
         Findings in order of evidence, and the improved device, with their terms and calibrated corner frequencies;
         without a finding the device is unchanged.
     """
-    data = _measured(reference)
-    if data.value @ np.linalg.solve(data.covariance, data.value) < DETECTION_THRESHOLD:  # no effect can gain more
+    if not demands_an_effect(reference):
         return (), reference.device
+    data = _measured(reference)
     scales = {axis: natural_scales(reference, axis) for axis in AXES}
     candidates = [_linearise(reference, each, scales, data) for each in candidate_terms(reference, scales)]
     candidates += effects_beside_the_readout(scales)
@@ -143,11 +146,11 @@ def diagnose_readout(
 
 
 def demands_an_effect(reference: ReferencePhase) -> bool:
-    """Whether phase errors exceed what their uncertainty and the tolerance of the corner frequencies explain."""
-    data = _measured(reference)
-    calibrations = np.hstack([np.zeros((2, 0)), *(each.slope for each in data.calibrations)])
-    total = data.covariance + calibrations @ calibrations.T
-    return bool(data.value @ np.linalg.solve(total, data.value) > DETECTION_THRESHOLD)
+    """Whether phase errors exceed what their uncertainty and the tolerance of the corner frequencies explain.
+
+    No effect can gain more evidence than the chi-square that these leave.
+    """
+    return _measured(reference).posterior([]).chi2 > DETECTION_THRESHOLD
 
 
 def _measured(reference: ReferencePhase) -> _Data:

@@ -15,6 +15,7 @@ from scanner.device import Device
 from scanner.recording import Recording
 from tests.support.two_axis_scan import FIELD, RATE_HZ, READOUTS, light, sensors
 
+GAIN_DRIFT = {"y": {"gain-drift": {"g": 0.1}}}
 DELAY = {"x": {"channel-delay": {"delay": 1e-6}}}
 LAG = {"x": {"drive-lag": {"f_c": 2e5}}}
 
@@ -23,14 +24,18 @@ def finding_of(axis: str) -> Finding:
     return Finding(axis, "drive", "drive-lag", "", (), f"drive of {axis}", 0.9, (), {}, "sense", "")
 
 
+FOUND = finding_of("y")
+
+
 def diagnosed(
-    monkeypatch: pytest.MonkeyPatch, contradicted: Sequence[bool], nominal_sd: float = 1e-4
+    monkeypatch: pytest.MonkeyPatch, contradicted: Sequence[bool], nominal_sd: float = 1e-4, heeded: bool = True
 ) -> tuple[Diagnosis, list[set[str]]]:
     """The diagnosis of a scan whose sense signal suggests a delay, or else a lag of the drive; and what was excluded.
 
     Args:
         contradicted: whether the picture shows phase errors without the delay, and with it.
         nominal_sd: of the phase error without the delay [rad].
+        heeded: whether the diagnosis of the motion leaves out what is excluded.
     """
     channels = {**sensors(772041), "intensity": (light(772041), "V", RATE_HZ)}
     recording = Recording.from_arrays(channels, Device.from_toml(READOUTS + FIELD))
@@ -40,13 +45,14 @@ def diagnosed(
     def motion(recordings: object, nominal: Device, progress: object, refuted: Collection[str] = ()) -> Diagnosis:
         excluded.append(set(refuted))
         findings = tuple(map(finding_of, "xy")) if refuted else ()
-        return Diagnosis("mismatch", findings, None, nominal.with_terms(LAG if refuted else DELAY), None)
+        laws = LAG if refuted and heeded else DELAY
+        return Diagnosis("mismatch", findings, None, nominal.with_terms({**laws, **GAIN_DRIFT}), None)
 
     def reference(recording: Recording, device: Device) -> SimpleNamespace:
         return SimpleNamespace(device=device, sd=np.full(2, 1e-4 if has_delay(device) else nominal_sd))
 
-    def readout(reference: SimpleNamespace, evidence: object = None) -> tuple[tuple[str, ...], Device]:
-        return ("finding",) if demands(reference) else (), reference.device
+    def readout(reference: SimpleNamespace, evidence: object = None) -> tuple[tuple[Finding, ...], Device]:
+        return (FOUND,) if demands(reference) else (), reference.device
 
     def demands(reference: SimpleNamespace) -> bool:
         return contradicted[has_delay(reference.device)]
@@ -79,6 +85,11 @@ def test_a_delay_that_the_picture_confirms_stays(monkeypatch: pytest.MonkeyPatch
     assert excluded == [set()]
 
 
+def test_a_diagnosis_that_keeps_a_refuted_law_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, excluded = diagnosed(monkeypatch, contradicted=(False, True), heeded=False)
+    assert excluded == [set(), {"channel-delay"}, {"channel-delay"}]  # and once more, with what the picture shows
+
+
 @pytest.mark.parametrize(("contradicted", "nominal_sd"), [((True, True), 1e-4), ((False, True), np.inf)])
 def test_a_delay_is_not_replaced_where_the_picture_does_not_fit_without_it(
     contradicted: Sequence[bool], nominal_sd: float, monkeypatch: pytest.MonkeyPatch
@@ -86,4 +97,4 @@ def test_a_delay_is_not_replaced_where_the_picture_does_not_fit_without_it(
     """What the picture shows in addition is then a finding of its own."""
     diagnosis, excluded = diagnosed(monkeypatch, contradicted, nominal_sd)
     assert excluded == [set(), set()]  # once more, with what the picture shows stated
-    assert diagnosis.findings == ("finding",)
+    assert diagnosis.findings == (FOUND,)

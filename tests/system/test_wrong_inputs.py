@@ -287,7 +287,8 @@ def test_a_target_is_not_scanned_by_a_device_of_one_axis(tmp_path: Path, capsys:
     device = Device.from_toml(DEVICE + MECHANICS)
     one = replace(device, axes={"x": device.axes["x"]})
     (tmp_path / "one.toml").write_text(one.to_toml(), encoding="utf-8")
-    refused(["simulate", "--device", str(tmp_path / "one.toml")], tmp_path, "one.toml: states only the axis x", capsys)
+    words = "one.toml: y: is missing and needed here"
+    refused(["simulate", "--device", str(tmp_path / "one.toml")], tmp_path, words, capsys)
 
 
 def test_a_console_that_lacks_a_character_shows_another(monkeypatch: pytest.MonkeyPatch) -> None:
