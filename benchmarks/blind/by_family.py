@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import beta
 
 from benchmarks.blind.outcome import Outcome
-from benchmarks.blind.table import clear, findings, intervals_hit
+from benchmarks.blind.table import clear, findings, intervals_hit, same_axis
 
 WORSE = 1.02
 """Ratio of open-loop errors above which the improved device counts as worse. Noise alone makes about 1 %."""
@@ -26,8 +26,7 @@ def right_names(effect: dict[str, Any]) -> set[str]:
 def is_true(outcome: Outcome, finding: dict[str, Any]) -> bool:
     """Whether a finding names an effect of the key, in its axis."""
     return any(
-        finding["effect"] in right_names(effect) and effect.get("axis", "x") == finding.get("axis", "x")
-        for effect in outcome.key["effects"]
+        finding["effect"] in right_names(effect) and same_axis(effect, finding) for effect in outcome.key["effects"]
     )
 
 
@@ -35,10 +34,7 @@ def first_answer(outcome: Outcome) -> dict[str, Any] | None:
     """The first finding about the concealed effect: those that name another effect of the key are passed over."""
     others = outcome.key["effects"][1:]
     for finding in findings(outcome):
-        if not any(
-            finding["effect"] in right_names(other) and other.get("axis", "x") == finding.get("axis", "x")
-            for other in others
-        ):
+        if not any(finding["effect"] in right_names(other) and same_axis(other, finding) for other in others):
             return finding
     return None
 

@@ -58,6 +58,11 @@ def findings(outcome: Outcome) -> list[dict[str, Any]]:
     return outcome.diagnosis["findings"] if outcome.diagnosis and outcome.diagnosis["verdict"] == "mismatch" else []
 
 
+def same_axis(effect: dict[str, Any], finding: dict[str, Any]) -> bool:
+    """Whether a finding concerns the axis of an effect of the key."""
+    return bool(effect.get("axis", "x") == finding.get("axis", "x"))
+
+
 def first_name(outcome: Outcome) -> str:
     """The first finding's effect, else the verdict, or ``failed``."""
     if outcome.diagnosis is None:
@@ -120,7 +125,8 @@ def intervals_hit(outcome: Outcome) -> list[bool]:
     """For every parameter of a rightly named effect, whether its 95 % interval contains the truth."""
     answers = []
     for effect in outcome.key["effects"]:
-        named = next((finding for finding in findings(outcome) if finding["effect"] == effect["effect"]), None)
+        same = [each for each in findings(outcome) if each["effect"] == effect["effect"] and same_axis(effect, each)]
+        named = next(iter(same), None)
         stated = {p["name"]: p["ci95"] for p in named["parameters"]} if named else {}
         for name, truth in effect["parameters"].items():
             interval = stated.get(name) or stated.get(ALSO_CALLED.get(name, name))
