@@ -5,6 +5,10 @@ J theta'' + b theta' + k theta = torque becomes ((i w + D)^2 + (i w + D) b/J + k
 k/J, b/J and 1/J and holds in a transient, so that a sweep need not be slow against the decay time. All its coefficients
 are constant, so that it also holds between averages of Z and T under one window, however fast the drive is swept: with
 the rate of a swept reference in place of w, the average of a product would be taken for the product of the averages.
+
+Under a drive of one frequency, a drift of k/J by a thousandth changes Z as much as a transient does, and would be taken
+for an inertia that is wrong by a quarter. There only the part of the equation at a right angle to Z is used, the
+balance of power, which holds for any k/J; k/J is its average over the record.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ import numpy as np
 from estimation.identification.fits import DrivenRecord, IdentifiedValue, drive_torque, values_from_ratios
 from estimation.least_squares import fit_linear
 from estimation.reference import PhaseReference
-from scanner.arrays import Array, Complex
+from scanner.arrays import Array, Complex, Mask
 from scanner.device import Axis
 
 WINDOW_CYCLES = 8.0
@@ -76,10 +80,15 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
     """
     equations = [_equations(axis, record) for record in records]
     columns, target = (np.concatenate([getattr(each, part) for each in equations]) for part in ("columns", "target"))
-    if len(target) < HOPS_PER_WINDOW or not columns.any(axis=0).all():
+    if len(target) < HOPS_PER_WINDOW or not columns[:, 1:].any(axis=0).all():
         return {}
-    ratios, _ = fit_linear(*(np.concatenate([part.real, part.imag]) for part in (columns, target)))
-    covariance = _covariance(equations, ratios)
+    known = np.asarray(columns.any(axis=0))  # not k/J, where every record is a balance of power
+    ratios = np.zeros(3)
+    ratios[known], _ = fit_linear(*(np.concatenate([part.real, part.imag]) for part in (columns[:, known], target)))
+    change = np.eye(3)[:, known]  # of all coefficients with the known ones
+    if not known[0]:
+        ratios[0], change[0] = _mean_stiffness(equations, ratios[1:])
+    covariance = change @ _covariance(equations, ratios, known) @ change.T
     stiffness, _, inverse = ratios
     if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
@@ -91,15 +100,28 @@ class _Equations:
     """Equations of motion of one record between windowed averages.
 
     Attributes:
-        columns: of k/J, b/J and 1/J, shape (points, 3). target: right-hand side, shape (points,).
+        motion: columns of k/J, b/J and 1/J, shape (points, 3), and acceleration: the right-hand side, shape (points,),
+            both relative to the direction of Z in a balance of power.
         windows: of the angle, its velocity and its acceleration, each of shape (window,).
         hop: samples between two points.
+        balance: whether only the balance of power is used, the imaginary part.
     """
 
-    columns: Complex
-    target: Complex
+    motion: Complex
+    acceleration: Complex
     windows: tuple[Complex, ...]
     hop: int
+    balance: bool
+
+    @property
+    def columns(self) -> Complex:
+        """The columns that are used: without a real part in a balance of power, and so without k/J."""
+        return np.asarray(1j * self.motion.imag, np.complex128) if self.balance else self.motion
+
+    @property
+    def target(self) -> Complex:
+        """The right-hand side that is used."""
+        return np.asarray(1j * self.acceleration.imag, np.complex128) if self.balance else self.acceleration
 
 
 def _equations(axis: Axis, record: SweptRecord) -> _Equations:
@@ -116,8 +138,28 @@ def _equations(axis: Axis, record: SweptRecord) -> _Equations:
         np.asarray(each, np.complex128) for each in (hann, 1j * w * hann + first, second + 2j * w * first - w**2 * hann)
     )
     z, velocity, acceleration = (_averaged(angle, window, hop) for window in windows)
-    columns = np.stack([z, velocity, -_averaged(torque, hann, hop)], axis=1)
-    return _Equations(columns, -acceleration, windows, hop)
+    motion = np.stack([z, velocity, -_averaged(torque, hann, hop)], axis=1)
+    balance = _one_frequency(record)
+    if balance:
+        direction = z.conj() / np.maximum(np.abs(z), np.finfo(float).tiny)
+        motion, acceleration = direction[:, None] * motion, direction * acceleration
+        motion[:, 0] = np.abs(z)
+    return _Equations(motion, -acceleration, windows, hop, balance)
+
+
+def _one_frequency(record: SweptRecord) -> bool:
+    """Whether the phase of the reference stays within half a turn of that of a constant frequency."""
+    psi = record.reference.phase(record.time)
+    return bool(np.ptp(psi - np.linspace(psi[0], psi[-1], psi.size)) < np.pi)
+
+
+def _mean_stiffness(equations: Sequence[_Equations], others: Array) -> tuple[float, Array]:
+    """k/J as an average with the weight |Z|^2, and its derivatives by b/J and 1/J, shape (2,)."""
+    motion, target = (
+        np.concatenate([getattr(each, part).real for each in equations]) for part in ("motion", "acceleration")
+    )
+    mean = motion[:, 0] @ np.column_stack([target, motion[:, 1:]]) / (motion[:, 0] @ motion[:, 0])
+    return float(mean[0] - mean[1:] @ others), -mean[1:]
 
 
 def _strongest_frequency(record: SweptRecord, hop: int) -> float:
@@ -129,18 +171,19 @@ def _strongest_frequency(record: SweptRecord, hop: int) -> float:
     return float(np.average(rate, weights=power**2))
 
 
-def _covariance(equations: Sequence[_Equations], ratios: Array) -> Array:
-    """Covariance of the coefficients, shape (3, 3).
+def _covariance(equations: Sequence[_Equations], ratios: Array, known: Mask) -> Array:
+    """Covariance of the p ``known`` coefficients, shape (p, p).
 
     The residual is the noise of the angle, filtered by the equation of motion, which is least at the resonance, where
     the motion is: residuals of overlapping windows compensate each other there. The noise is taken as white within the
     windows' band; then the filter determines the correlation of the residuals, and only the noise's variance, one for
     each record, is estimated from them.
     """
-    size = np.sqrt(np.mean(np.abs(np.concatenate([each.columns for each in equations])) ** 2, axis=0))
-    scaled = [each.columns / size for each in equations]
-    inverse = np.linalg.inv(sum(((columns.conj().T @ columns).real for columns in scaled), np.zeros((3, 3))))
-    spread = np.zeros((3, 3))
+    used = [each.columns[:, known] for each in equations]
+    size = np.sqrt(np.mean(np.abs(np.concatenate(used)) ** 2, axis=0))
+    scaled = [columns / size for columns in used]
+    spread = np.zeros((size.size, size.size))
+    inverse = np.linalg.inv(sum(((columns.conj().T @ columns).real for columns in scaled), spread))
     for each, columns in zip(equations, scaled, strict=True):
         correlation = _residual_correlation(each, ratios)
         correlated = _smoothed(columns, correlation, "same")
@@ -163,12 +206,13 @@ def _residual_variance(
     """
     weights = np.hanning(HOPS_PER_WINDOW + 2)[1:-1]
     residual = _smoothed((equations.target - equations.columns @ ratios)[:, None], weights, "valid")
+    parts = 0.5 if equations.balance else 1.0  # of the power of complex noise
     narrow = _smoothed(columns, weights, "valid")
     correlated = _smoothed(_smoothed(columns, correlation, "same"), weights, "valid")
     power = float(np.sum(np.convolve(weights, weights) * correlation[1:-1]).real)
     absorbed = np.trace(inverse @ (correlated.conj().T @ narrow).real)
     absorbed -= np.trace(inverse @ (narrow.conj().T @ narrow).real @ inverse @ between)
-    return float(np.sum(np.abs(residual) ** 2) / (len(residual) * power - absorbed))
+    return float(np.sum(np.abs(residual) ** 2) / (parts * len(residual) * power - absorbed))
 
 
 def _smoothed(values: Complex, weights: Complex | Array, mode: str) -> Complex:
