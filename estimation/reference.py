@@ -44,6 +44,10 @@ SLOW_LINE_SHARE = 0.5
 """Share of a signal's variance from which one line is its main oscillation. The fundamental of a sawtooth has 0.61,
 that of an Archimedean spiral 0.75; each line of a step above 2 / duration has less than 0.1."""
 
+MIN_SAMPLES_PER_PERIOD = 2.5
+"""Smallest number of samples of a channel per period of the resonance: 2 by the sampling theorem, and a quarter more
+for the transition band of the decimation filter."""
+
 
 @dataclass(frozen=True)
 class PhaseReference:
@@ -140,7 +144,7 @@ def tone_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, win
 def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
     """Frequency of the strongest line in (low, high) over the first ``window`` seconds (at most 2^18 samples) [Hz].
 
-    A few periods of ``low`` are searched first, which is fast.
+    A few periods of ``low`` are searched first, which is fast, unless samples are missing there (NaN).
 
     Raises:
         BadInput: no line exceeds the noise there.
@@ -158,10 +162,24 @@ def _spectral_frequency(channel: Channel, low: float, high: float, window: float
     few = round(min(most, SHORT_SPECTRUM_PERIODS * channel.sample_rate / low)) if low > 0.0 else most
     few = 1 << (max(few, 1).bit_length() - 1)
     for n in (few, most):
-        found = _strongest(channel.read(0, n), channel.sample_rate, low, high)
-        if found is not None:
+        values = channel.read(0, n)
+        found = _strongest(values, channel.sample_rate, low, high)
+        if found is not None and (n == most or np.isfinite(values).all()):
             return found
     return None
+
+
+def sampled_too_slowly(channel: Channel, what: str, frequency: float, order: int = 1, remedy: str = "") -> BadInput:
+    """The error of a channel with fewer than ``MIN_SAMPLES_PER_PERIOD`` samples in a period of what it should show.
+
+    Args:
+        what: that moves at ``frequency`` [Hz].
+        order: harmonic of it that the channel shows.
+        remedy: what helps beside a higher rate.
+    """
+    rate = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for {what} at {frequency:.4g} Hz"
+    hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * order * frequency:.4g} Hz or more{remedy}"
+    return BadInput(rate, file=channel.file, channel=channel.name, hint=hint)
 
 
 def _no_oscillation(channel: Channel) -> BadInput:

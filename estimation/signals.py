@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.reference import (
+    MIN_SAMPLES_PER_PERIOD,
     PhaseReference,
     absolute_reference,
     drive_reference,
     has_slow_oscillation,
+    sampled_too_slowly,
     tone_frequency,
 )
 from scanner.arrays import Array
@@ -130,7 +132,8 @@ def phase_reference(
         frequency: of the reference in an earlier segment of the same scan [Hz]; searched for where None.
 
     Raises:
-        BadInput: neither the drive nor the signal holds an oscillation.
+        BadInput: neither the drive nor the signal holds an oscillation, or a drive near the resonance is sampled too
+            slowly to show it.
     """
     stated = device.axis(axis)
     if f"drive_{axis}" in recording:
@@ -143,6 +146,8 @@ def phase_reference(
                 and frequency is None
                 and all(has_slow_oscillation(signal, 2.0 * low) for signal in (drive, sense) if signal is not None)
             )
+            if low and not quasistatic and drive.sample_rate < MIN_SAMPLES_PER_PERIOD * stated.resonance:
+                raise sampled_too_slowly(drive, "a drive of the resonance", stated.resonance)
             return drive_reference(drive, "drive", 0.0 if quasistatic else low, frequency)
         reference = drive_reference(drive, "half-drive", low, frequency and 2.0 * frequency)
         if stated.mechanics and not 0.75 < reference.frequency / stated.resonance < 1.33:

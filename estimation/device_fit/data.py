@@ -10,6 +10,7 @@ import numpy as np
 
 from estimation.device_fit.drive_lines import drive_lines, is_steady, strongest_line
 from estimation.device_fit.resampling import decimate, fast_transform_length, resample_drive
+from estimation.reference import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
 from scanner.device import Axis, Device
@@ -34,10 +35,6 @@ waveform."""
 BAND_HARMONICS = 16
 """Highest frequency that is compared, in multiples of the motion's frequency. Harmonics of a Gaussian capacitance
 decrease quickly; a wider band would only add noise and computing time."""
-
-MIN_SAMPLES_PER_PERIOD = 2.5
-"""Smallest number of samples of a channel per period of the resonance: 2 by the sampling theorem, and a quarter more
-for the transition band of the decimation filter."""
 
 FILTER_EDGE_SAMPLES = 16
 """Samples at either end of a decimated channel that are not compared: the decimation filter extends over 16 decimated
@@ -207,19 +204,6 @@ def _check_rate(
     if max([channel.sample_rate, *(drive.sample_rate for drive in driving)]) >= MIN_SAMPLES_PER_PERIOD * fastest:
         return
     raise sampled_too_slowly(channel, "a resonance", fastest, remedy=", or correct J and k of the device")
-
-
-def sampled_too_slowly(channel: Channel, what: str, frequency: float, order: int = 1, remedy: str = "") -> BadInput:
-    """The error of a channel with fewer than ``MIN_SAMPLES_PER_PERIOD`` samples in a period of what it should show.
-
-    Args:
-        what: that moves at ``frequency`` [Hz].
-        order: harmonic of it that the channel shows.
-        remedy: what helps beside a higher rate.
-    """
-    rate = f"is sampled at {channel.sample_rate:.4g} Hz, too slowly for {what} at {frequency:.4g} Hz"
-    hint = f"record at {2.0 * MIN_SAMPLES_PER_PERIOD * order * frequency:.4g} Hz or more{remedy}"
-    return BadInput(rate, file=channel.file, channel=channel.name, hint=hint)
 
 
 def _drive_channels(recording: Recording, axis: Axis) -> list[Channel]:

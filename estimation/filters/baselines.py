@@ -6,11 +6,17 @@ from contextlib import suppress
 
 import numpy as np
 
-from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
 from estimation.initial import fit_initial_motion
 from estimation.lock_in_channels import lock_in_angle
-from estimation.reference import PhaseReference, absolute_reference, block_reference, tone_frequency
+from estimation.reference import (
+    MIN_SAMPLES_PER_PERIOD,
+    PhaseReference,
+    absolute_reference,
+    block_reference,
+    sampled_too_slowly,
+    tone_frequency,
+)
 from estimation.short_tone import fit_short_tone
 from estimation.signals import (
     NOISE_SAMPLES,

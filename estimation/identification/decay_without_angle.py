@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S, IdentifiedValue
+from estimation.reference import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Axis

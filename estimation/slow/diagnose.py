@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.device_fit.data import MIN_SAMPLES_PER_PERIOD
 from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE
 from estimation.least_squares import Z_95
 from estimation.lock_in_channels import lock_in_amplitude
+from estimation.reference import MIN_SAMPLES_PER_PERIOD
 from estimation.slow.decay import LAWS, Law
 from estimation.slow.selection import (
     UNKNOWN_LAW_ERRORS,

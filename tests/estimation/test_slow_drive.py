@@ -56,6 +56,16 @@ def test_a_slow_drive_on_which_the_axis_resonates_is_no_slow_motion() -> None:
     assert reference.frequency == pytest.approx(RESONANCE_HZ, rel=1e-3)
 
 
+def test_a_resonant_drive_sampled_too_slowly_is_refused() -> None:
+    """Its line in the recording is another one."""
+    resonance = stage().axis("x").resonance
+    rate = 1.6 * resonance
+    turn = 2 * np.pi * resonance * np.arange(2000) / rate
+    sampled = Recording.from_arrays({"drive_x": (np.sin(turn), "V", rate)})
+    with pytest.raises(BadInput, match="too slowly for a drive of the resonance at"):
+        phase_reference(sampled, stage(), "x")
+
+
 def test_a_step_of_the_drive_is_no_oscillation() -> None:
     step = recording(np.where(TIME > 2.0, 10.0, 0.0), 0.0 * TIME)
     assert not has_slow_oscillation(step["drive_x"], RESONANCE_HZ)

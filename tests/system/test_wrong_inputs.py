@@ -311,3 +311,19 @@ def test_a_sensor_that_is_sampled_too_slowly_for_its_drive_is_refused(
     write(tmp_path / "slow.h5", DEVICE + MECHANICS, undersampled)
     words = "slow.h5: sense_x: is sampled at 4167 Hz, too slowly for a motion at 2000 Hz; record at"
     refused(["reconstruct", str(tmp_path / "slow.h5"), "--estimator", "sensor"], tmp_path, words, capsys)
+
+
+@pytest.mark.parametrize("step", [1, 320])
+def test_a_sensor_shows_its_own_motion_where_its_drive_does_not(step: int, tmp_path: Path) -> None:
+    """Drives without their beginning, and with 1.6 samples in a period: the amplitude was 0.001 of the true one."""
+
+    def poor_drive(file: h5py.File) -> None:
+        voltage = file["channels/drive_x"][::step]
+        voltage[50 : 1000 // step] = np.nan
+        del file["channels/drive_x"]
+        drive = file.create_dataset("channels/drive_x", data=voltage)
+        drive.attrs.update({"unit": "V", "sample_rate": RATE / step})
+
+    write(tmp_path / "drive.h5", DEVICE + MECHANICS, poor_drive)
+    result = lissajous.reconstruct(tmp_path / "drive.h5", estimator="sensor", pixels=(20, 20))
+    assert float(np.median(result.motion.axes["x"].amplitude)) == pytest.approx(0.1, rel=0.02)
