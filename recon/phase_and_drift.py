@@ -59,10 +59,14 @@ def wants_readout_phase(motion: Motion, options: Options) -> bool:
 
 
 def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
-    """Return the phase errors that forward and backward half-periods show in slices of the scan."""
+    """Return the phase errors that forward and backward half-periods show in slices of the scan.
+
+    Their standard errors allow for a shift that all slices have in common.
+    """
     intensity, position_z = estimated.prepared.intensity, estimated.prepared.position_z
     segments = registration_segments(estimated.motion, intensity, position_z)
-    return measure_motion_phase_errors(estimated.beam, intensity, estimated.grid, segments)
+    errors = measure_motion_phase_errors(estimated.beam, intensity, estimated.grid, segments)
+    return [error.with_common_shift() for error in errors]
 
 
 def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:

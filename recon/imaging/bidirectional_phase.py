@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from recon.imaging.bidirectional_equations import BLOCKS_PER_SLICE, normal_equations
 from recon.imaging.bidirectional_search import SEARCH_RESOLUTION_RAD, RegistrationSamples, search_phase_errors
+from recon.imaging.common_shift import common_shift_factor
 from recon.imaging.picture import Grid
 from recon.imaging.slow_gain import SlowGain, estimate_slow_gain
 from scanner.arrays import Array
@@ -87,6 +88,7 @@ class PhaseError:
         x, y: value and standard error of each axis [rad].
         parts: the same of short parts of the slice; None where they were not measured.
         gain: slow gain of all slices that share the picture; None where it was not measured.
+        shift_factor: of x and y, on the standard errors, for a shift that all these slices have in common.
     """
 
     time: float
@@ -94,6 +96,15 @@ class PhaseError:
     y: PhaseEstimate
     parts: PhaseErrorParts | None = None
     gain: SlowGain | None = None
+    shift_factor: tuple[float, float] = (1.0, 1.0)
+
+    def with_common_shift(self) -> PhaseError:
+        """The phase error with standard errors that allow for the shift."""
+        x, y = (
+            each._replace(sd=each.sd * factor) for each, factor in zip((self.x, self.y), self.shift_factor, strict=True)
+        )
+        parts = self.parts and self.parts._replace(sd=self.parts.sd * self.shift_factor)
+        return replace(self, x=x, y=y, parts=parts, shift_factor=(1.0, 1.0))
 
 
 class _Fit(NamedTuple):
@@ -161,7 +172,7 @@ def measure_phase_errors(
         np.arange(n) * (slices * BLOCKS_PER_SLICE) // max(n, 1),
     ]
     finite = np.all([np.isfinite(column) for column in columns], axis=0)
-    value, sd, parts, gain = _estimate_phase_errors(
+    value, sd, parts, gain, factor = _estimate_phase_errors(
         RegistrationSamples(*(column[finite] for column in columns)), grid, slices
     )
     length = n / slices / rate
@@ -173,6 +184,7 @@ def measure_phase_errors(
             PhaseEstimate(float(value[s, 1]), float(sd[s, 1])),
             PhaseErrorParts(s * length + within, parts[s, ..., 0], parts[s, ..., 1]),
             gain,
+            (float(factor[s, 0]), float(factor[s, 1])),
         )
         for s in range(slices)
     ]
@@ -236,26 +248,26 @@ def quadrature(theta: Array, amplitude: float | Array) -> Array:
 
 def _estimate_phase_errors(
     samples: RegistrationSamples, grid: Grid, slices: int
-) -> tuple[Array, Array, Array, SlowGain | None]:
-    """Phase errors, standard errors and parts as in ``_Fit``, each at the cell size with the least standard error, and
-    the slow gain."""
+) -> tuple[Array, Array, Array, SlowGain | None, Array]:
+    """Phase errors, standard errors and parts as in ``_Fit``, each at the cell size with the least standard error, the
+    slow gain, and the factors for a common shift, shape (slices, 2)."""
     part = samples.block // BLOCKS_PER_SLICE
     if np.bincount(part, minlength=slices).min() < 4 * BLOCKS_PER_SLICE:
-        return np.full((slices, 2), np.nan), np.full((slices, 2), np.inf), _undetermined_parts(slices), None
+        nothing = np.full((slices, 2), np.nan), np.full((slices, 2), np.inf)
+        return *nothing, _undetermined_parts(slices), None, np.ones((slices, 2))
+    inside = (2.0 * np.abs(samples.x) < grid.width) & (2.0 * np.abs(samples.y) < grid.height)
     finest = max(
         min(1.0, grid.width / MIN_CELLS_ACROSS),
-        math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size),
+        math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / max(int(np.count_nonzero(inside)), 1)),
     )
-    gain = _slow_gain(samples, grid, finest, slices)
+    gain = _slow_gain(samples.select(inside), grid, finest, slices)
     samples = samples._replace(intensity=samples.intensity / gain.at(_slice_time(samples)))
-    start = np.array(
-        [search_phase_errors(RegistrationSamples(*(column[part == s] for column in samples))) for s in range(slices)]
-    )
+    start = np.array([search_phase_errors(samples.select(part == s)) for s in range(slices)])
     clear = np.isfinite(start)
     start = np.where(clear, start, 0.0)
     groups = _blocks_of_a_period(samples.dx, slices), _blocks_of_a_period(samples.dy, slices)
     best, limit = start, np.full_like(start, SEARCH_RESOLUTION_RAD)
-    best_parts = _undetermined_parts(slices)
+    best_parts, factor, coarser = _undetermined_parts(slices), np.ones_like(start), None
     for cell in (4 * finest, 2 * finest, finest):  # noisy pictures need large cells, fine detail small ones
         fit = _fit_cells(samples, best, grid, cell, groups)
         clear &= fit.clear  # noise that hides coarse detail also hides fine detail
@@ -265,8 +277,10 @@ def _estimate_phase_errors(
         )  # further away is another minimum
         best, limit = np.where(better, fit.value, best), np.where(better, fit.sd, limit)
         best_parts = np.where(better[:, None, :, None], fit.parts, best_parts)
+        factor = np.where(better, common_shift_factor(coarser, (fit.value, fit.sd)) if coarser else 1.0, factor)
+        coarser = fit.value, fit.sd
     determined = limit < SEARCH_RESOLUTION_RAD
-    return np.where(determined, best, np.nan), np.where(determined, limit, np.inf), best_parts, gain
+    return np.where(determined, best, np.nan), np.where(determined, limit, np.inf), best_parts, gain, factor
 
 
 def _slow_gain(samples: RegistrationSamples, grid: Grid, cell: float, slices: int) -> SlowGain:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.arrays import Array
+from scanner.arrays import Array, Mask
 
 SEARCH_REACH_RAD = math.radians(15.0)
 """Largest phase error that is searched. There the pictures of both directions still share two thirds of the field."""
@@ -43,6 +43,10 @@ class RegistrationSamples(NamedTuple):
     dy: Array
     intensity: Array
     block: NDArray[np.int64]
+
+    def select(self, used: Mask) -> RegistrationSamples:
+        """The samples of a mask, shape (n,)."""
+        return RegistrationSamples(*(column[used] for column in self))  # type: ignore[arg-type]
 
 
 def search_phase_errors(samples: RegistrationSamples) -> Array:

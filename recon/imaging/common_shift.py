@@ -1,0 +1,36 @@
+"""A shift of the measured phase that all slices of a scan have in common, seen by comparing cells of two sizes.
+
+Fine cells do not average out a pattern that the samples repeat from line to line, coarse ones lose detail. Both shift
+all slices alike, which the scatter of blocks of time does not show.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scanner.arrays import Array
+
+MIN_COMMON_SLICES = 3
+"""Slices from which a shift that all have in common is told from the noise of each, whose variance is estimated too."""
+
+
+def common_shift_factor(coarse: tuple[Array, Array], fine: tuple[Array, Array]) -> Array:
+    """Factor on the standard errors in fine cells that allows for what coarse ones show in all slices.
+
+    Without a common shift the square of the difference of the means is on average the difference of their variances
+    (Hausman 1978, "Specification tests in econometrics"). What exceeds it is added to the variance of the mean.
+
+    Args:
+        coarse, fine: values and standard errors in each slice, of shape (slices, axes) [rad]; inf where undetermined.
+
+    Returns:
+        Shape (axes,), at least 1.
+    """
+    both = np.isfinite(coarse[1]) & np.isfinite(fine[1])
+    means, variances = [], []
+    for value, sd in (coarse, fine):
+        weight = np.where(both, sd, np.inf) ** -2.0
+        variances.append(1.0 / np.maximum(weight.sum(axis=0), np.finfo(float).tiny))
+        means.append((weight * value).sum(axis=0) * variances[-1])
+    shift = np.maximum((means[0] - means[1]) ** 2 - np.abs(variances[0] - variances[1]), 0.0)
+    return np.where(both.sum(axis=0) >= MIN_COMMON_SLICES, np.sqrt(1.0 + shift / variances[1]), 1.0)
