@@ -56,7 +56,8 @@ def scan(seed: int) -> dict[tuple[str, float], Array]:
         light = sample_scene(blurred, *angles, grid.half_angle_x, grid.half_angle_y)
         for photons in PHOTONS:
             intensity = detect(light, rate, Detector(photons_per_sample=photons, bits=12), rng)
-            errors = measure_phase_errors(*angles, intensity, rate, grid, *amplitudes, slices=SLICES)
+            measured = measure_phase_errors(*angles, intensity, rate, grid, *amplitudes, slices=SLICES)
+            errors = [error.with_common_shift() for error in measured]
             value, sd = np.array([[error.x, error.y] for error in errors]).transpose(2, 0, 1)
             weight = np.where(np.isfinite(value), sd**-2.0, 0.0)
             mean = (weight * np.nan_to_num(value)).sum(axis=0) / weight.sum(axis=0)

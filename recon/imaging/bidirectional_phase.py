@@ -258,7 +258,7 @@ def _estimate_phase_errors(
     inside = (2.0 * np.abs(samples.x) < grid.width) & (2.0 * np.abs(samples.y) < grid.height)
     finest = max(
         min(1.0, grid.width / MIN_CELLS_ACROSS),
-        math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / max(int(np.count_nonzero(inside)), 1)),
+        math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size),
     )
     gain = _slow_gain(samples.select(inside), grid, finest, slices)
     samples = samples._replace(intensity=samples.intensity / gain.at(_slice_time(samples)))
