@@ -22,7 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mapping", type=Path, help="TOML: which variable is which channel, unit, rate, device")
     parser.add_argument(
         "--channel", action="append", default=[], metavar="NAME=VARIABLE",
-        help="for each channel, in place of a mapping; intensity=CH3,CH4 makes detectors of two variables",
+        help="for each channel, in place of a mapping; intensity=CH3,CH4 makes detectors of two variables; a "
+        "variable whose name has a comma stands in double quotes",
     )  # fmt: skip
     for option, text in (("unit", "unit"), ("rate", "sample rate [Hz]"), ("start", "time of the first sample [s]")):
         parser.add_argument(
@@ -65,6 +66,7 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
     Raises:
         BadInput: no channel, one without a variable, or a value that is none.
     """
+    from recon.io.readers.text_table import split_fields
     from scanner.errors import BadInput
 
     hint = "as --channel sense_x=CH2 --unit V --rate 5e6, or write a --mapping"
@@ -73,7 +75,8 @@ def plan_of(args: argparse.Namespace) -> dict[str, Any]:
         name, given, variable = (part.strip() for part in text.partition("="))
         if not (name and given and variable) or name in channels:
             raise BadInput(f"{text!r} is not NAME=VARIABLE, or repeats a channel", channel="--channel", hint=hint)
-        channels[name] = {"variable": variable.split(",") if "," in variable else variable}
+        variables = split_fields(variable, ",")
+        channels[name] = {"variable": variables if len(variables) > 1 else variables[0]}
     if not channels:
         raise BadInput("no option assigns variables to channels", file=args.file, hint=f"assign them, {hint}")
     for option, (key, kind) in OPTIONS.items():

@@ -24,7 +24,16 @@ from recon.io.readers.contents import (
     unique_names,
 )
 from recon.io.readers.reader import Reader
-from recon.io.readers.text_table import is_numeric, parse_number, parse_number_blocks, read_lines, split_fields
+from recon.io.readers.text_table import (
+    DECIMAL_COMMA_HINT,
+    ONE_MARK_HINT,
+    count_filled,
+    is_numeric,
+    parse_number,
+    parse_number_blocks,
+    read_lines,
+    split_fields,
+)
 from scanner.arrays import Array
 from scanner.errors import BadInput
 
@@ -35,6 +44,10 @@ MAX_XML_HEADER_BYTES = 1 << 16
 ROHDE_SCHWARZ_UNITS = {"eRS_UNIT_LEVEL_V": "V", "eRS_UNIT_LEVEL_A": "A"}
 """Units as Rohde & Schwarz names them."""
 _PROPERTY = re.compile(r'<Prop [^>]*?\bName="(\w+)"[^>]*? Value="([^"]*)"')
+NO_TABLE_HINT = "name its format in the mapping, or make every column numbers, without marks between thousands"
+"""What to do about a text without a row of numbers."""
+_NUMBER_LIKE = re.compile(r"[+-]?\d[\d.,]*([eE][+-]?\d+)?")
+"""Digits with marks anywhere, as ``1,234.5``."""
 NAMES_OF_SECONDS = ("s", "sec", "second", "seconds")
 """Spellings of the unit of a column of times."""
 
@@ -91,13 +104,16 @@ def read_csv(path: Path) -> Contents:
         first = next((at for at, line in enumerate(head) if is_numeric(line, *_marks(line))), None)
         if first is None:
             what = f"holds no table of numbers{_describe_other_field(head)}"
-            raise BadInput(what, file=path, hint="name its format in the mapping, or make every column numbers")
-        separator, decimal = _marks(head[first])
+            raise BadInput(what, file=path, hint=NO_TABLE_HINT)
+        separator = _marks(head[first])[0]
+        decimal = "," if separator in "\t;" and any("," in line for line in head[first:]) else "."
         head = [_single_blanks(line, separator) for line in head]
         above = [split_fields(line.lstrip("#"), separator) for line in head[:first]]
         layout = _layout(path, above, head[first], separator)
     rows = (_single_blanks(line, separator) for line in islice(read_lines(path), layout.first, None))
-    table = map_blocks(parse_number_blocks(rows, path, separator, layout.columns, layout.first + 1, decimal), path)
+    width = max(layout.columns) + 1
+    blocks = parse_number_blocks(rows, path, separator, layout.columns, layout.first + 1, decimal, width)
+    table = map_blocks(blocks, path)
     return Contents(layout.kind, _variables(layout, table), layout.about)
 
 
@@ -141,7 +157,7 @@ def _describe_other_field(lines: Sequence[str]) -> str:
     """Words on the first line that holds a number: its field that is none, as a time of day; empty without one."""
     for number, line in enumerate(lines, 1):
         separator, decimal = _marks(line)
-        parts = [part.strip() for part in line.split(separator)]
+        parts = split_fields(line, separator)
         known = [parse_number(part, decimal) is not None for part in parts]
         if any(part and good for part, good in zip(parts, known, strict=True)) and not all(known):
             return f": in line {number} {parts[known.index(False)][:40]!r} is no number"
@@ -159,7 +175,8 @@ def _fields(line: str) -> list[str]:
 
 def _layout(path: Path, head: list[list[str]], row: str, separator: str) -> Layout:
     """The layout that the lines above the numbers state; the manufacturer is recognised by its keys."""
-    width = len(row.rstrip().rstrip(separator).split(separator))
+    cells = split_fields(row, separator)
+    width = max(count_filled(cells), min(len(cells), count_filled(head[-1]) if head else 0))
     keys = {line[0].lower(): line[1:] for line in head if line}
     if not head:
         return _rohde_schwarz(path, width)
@@ -171,19 +188,22 @@ def _layout(path: Path, head: list[list[str]], row: str, separator: str) -> Layo
         return Layout("Keysight InfiniiVision CSV", _padded(head[0], width), units, range(width), len(head), times)
     if "sample interval" in keys and "horizontal units" in keys:
         return _tektronix_above(head, keys, width)
-    _check_decimal_commas(path, head[-1], row, separator, width)
+    _check_marks(path, head, row, separator, width)
     names, units = name_columns(head, width)
     clock = find_time_column(names, units)
     scale = 1.0 if clock is None else TIME_UNITS[units[clock].lower()]
     return Layout("CSV", names, units, range(width), len(head), clock=clock, clock_scale=scale)
 
 
-def _check_decimal_commas(path: Path, names: list[str], row: str, separator: str, width: int) -> None:
-    """Raise BadInput if numbers with decimal commas seem to be separated by commas too."""
+def _check_marks(path: Path, head: list[list[str]], row: str, separator: str, width: int) -> None:
+    """Raise BadInput if the line above the first row is a row too, or commas are decimal marks and separators."""
+    names = head[-1]
+    odd = [field for field in names if "," in field or field.count(".") > 1]
+    if odd and all(_NUMBER_LIKE.fullmatch(field) for field in names if field):
+        raise BadInput(f"line {len(head)}: {odd[0][:40]!r} is no number", file=path, hint=ONE_MARK_HINT)
     if separator == "," and "." not in row and len(names) < width <= 2 * len(names):
         what = f"its lines have {width} numbers without a point, and its heading {len(names)} names"
-        hint = "if commas are decimal marks, export it with points, or with semicolons or tabs between the columns"
-        raise BadInput(what, file=path, hint=hint)
+        raise BadInput(what, file=path, hint=DECIMAL_COMMA_HINT)
 
 
 def _padded(fields: Sequence[str], width: int) -> list[str]:

@@ -133,3 +133,11 @@ def test_the_suggested_mapping_works_after_editing(tmp_path: Path) -> None:
         assert isinstance(recording.device, Device)
         assert recording.device.require_scan().half_angle_x == 0.1
         assert recording.device.extra == {}
+
+
+def test_a_variable_whose_name_has_a_comma_is_named_in_quotes(tmp_path: Path) -> None:
+    path, out = tmp_path / "scope.csv", tmp_path / "scan.h5"
+    path.write_text('Time (s),"CH1, signal (V)",CH2 (V)\n0,1,2\n1e-5,3,4\n2e-5,5,6\n')
+    assert main(["convert", str(path), "--channel", 'sense_x="CH1, signal"', "-o", str(out)]) == 0
+    with Recording.open(out) as recording:
+        np.testing.assert_array_equal(recording["sense_x"].read(), [1.0, 3.0, 5.0])

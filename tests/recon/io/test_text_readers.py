@@ -134,3 +134,35 @@ def test_decimal_commas_between_columns_with_commas_are_named(tmp_path: Path) ->
     path.write_text("Time (s),CH1 (V)\n0,00,1,25\n0,01,1,50\n0,02,1,75\n")
     with pytest.raises(BadInput, match="4 numbers without a point, and its heading 2 names; if commas are decimal"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("t,v\n0,0\n1e-5,0,0627\n2e-5,0,1253\n", "line 3 has 3 fields, and the table 2 columns; if commas are decimal"),
+        ('t,v\n0,1\n1,"1,234.5"\n', "line 3: '1,234.5' is no number; write numbers with a decimal point"),
+        ('t,v\n0,"1,234.5"\n1,999.5\n', "line 2: '1,234.5' is no number"),
+        ("t;v\n0;999,5\n1;1.000,5\n", "line 3: '1.000,5' is no number"),
+        ("t;v\n0;1,5\n1;2.5\n", "line 3: '2.5' is no number"),
+    ],
+)
+def test_numbers_with_ambiguous_marks_are_refused(tmp_path: Path, content: str, words: str) -> None:
+    with pytest.raises(BadInput, match=words):
+        read(write_text(tmp_path / "export.csv", content))
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ('t,"CH1, signal (V)",CH2 (V)\n0,1,2\n1,3,4\n', {"t": [0, 1], "CH1, signal": [1, 3], "CH2": [2, 4]}),
+        ("t;v\n0;0\n1;0,5\n", {"t": [0, 1], "v": [0, 0.5]}),
+        ("t,v,w\n0,1,\n1,2,3\n", {"t": [0, 1], "v": [1, 2], "w": [np.nan, 3]}),
+    ],
+)
+def test_quoted_headings_and_a_first_row_without_marks_are_read(
+    tmp_path: Path, content: str, expected: dict[str, list[float]]
+) -> None:
+    variables = read(write_text(tmp_path / "export.csv", content)).variables
+    assert list(variables) == list(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(variables[name].raw[0:2], values)
