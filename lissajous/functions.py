@@ -188,7 +188,7 @@ def diagnose(
         progress: called with a line of text at every step.
 
     Raises:
-        BadInput: no device, or a recording that cannot be compared with it.
+        BadInput: no device, no recording, or one that cannot be compared with it.
     """
     from estimation.complete_diagnosis import diagnose_with_optics
     from recon.reference_phase import measure_reference_phase
@@ -213,7 +213,7 @@ def identify(
         mapping: needed where the recordings are an instrument's files.
 
     Raises:
-        BadInput: no device is stated, or no recording shows anything of it.
+        BadInput: no device is stated, no recording is given, or none shows anything of it.
     """
     from estimation.identification.calibrate import identify as identify_device
 
@@ -262,8 +262,6 @@ def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: Ma
 
 def _recording_of_arrays(arrays: Arrays, sample_rate: float | None) -> Recording:
     """A recording of arrays; bare ones are in the unit of their channel at ``sample_rate`` [Hz]."""
-    import numpy as np
-
     from scanner.channel import CHANNEL_UNITS
 
     channels = {}
@@ -274,7 +272,7 @@ def _recording_of_arrays(arrays: Arrays, sample_rate: float | None) -> Recording
             hint = "give sample_rate=, or (values, unit, sample rate)"
             raise BadInput("is an array without a sample rate", channel=name, hint=hint)
         else:
-            channels[name] = (np.asarray(values), CHANNEL_UNITS.get(name, ""), sample_rate)
+            channels[name] = (values, CHANNEL_UNITS.get(name, ""), sample_rate)
     return Recording.from_arrays(channels)
 
 
@@ -283,4 +281,12 @@ def _as_mapping(mapping: MappingSource) -> Path | Mapping[str, Any]:
 
 
 def _as_list(recordings: RecordingSource | Sequence[RecordingSource]) -> list[RecordingSource]:
-    return [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
+    """The recordings as a list.
+
+    Raises:
+        BadInput: there are none.
+    """
+    listed = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
+    if not listed:
+        raise BadInput("holds none", channel="recordings", hint="give a recording, the path of one, or several of them")
+    return listed

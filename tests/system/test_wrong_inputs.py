@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
@@ -255,11 +256,20 @@ def arrays() -> dict[str, tuple]:
     return {name: (values, "V", RATE) for name, values in signals().items() if name in names}
 
 
-def test_masked_samples_are_missing_samples() -> None:
+@pytest.mark.parametrize("bare", [False, True])
+def test_masked_samples_are_missing_samples(bare: bool) -> None:
     light = signals()["intensity"]
     masked = {**arrays(), "intensity": (np.ma.masked_less(light, 100.0), "V", RATE)}
-    result = lissajous.reconstruct(masked, device=Device.from_toml(DEVICE), pixels=(20, 20))
+    given = {name: channel[0] for name, channel in masked.items()} if bare else masked
+    rate = RATE if bare else None
+    result = lissajous.reconstruct(given, device=Device.from_toml(DEVICE), pixels=(20, 20), sample_rate=rate)
     assert result.picture.coverage.sum() == np.sum(light >= 100.0)
+
+
+@pytest.mark.parametrize("function", [lissajous.identify, lissajous.diagnose])
+def test_no_recordings_are_refused(function: Callable) -> None:
+    with pytest.raises(BadInput, match="recordings: holds none; give a recording, the path of one"):
+        function([], "imaging")
 
 
 @pytest.mark.parametrize(
