@@ -35,6 +35,13 @@ MAX_RATE_EXCESS = 0.1
 MAX_EVALUATED_FIGURES = 12
 """Figures whose fill is computed, those nearest to the frame rate. It bounds the cost, a second for each."""
 
+MAX_PICTURE_SAMPLES = 5e7
+"""Most samples of one picture, which take 4 GB of memory: 10 s at 5 MHz."""
+
+MAX_WINDINGS = 20_000
+"""Most cycles of an axis in one picture. It bounds the pairs that are compared to some millions, a few seconds, and
+the beam's path over 400 pixels to the samples of ``MAX_PICTURE_SAMPLES``."""
+
 PHASES = ("best", "worst")
 """Phases between the axes at which a figure is evaluated: of the finest and of the coarsest mesh."""
 
@@ -82,6 +89,9 @@ class ScanRequirements:
             raise BadInput(f"a fill of {self.fill:g}", hint="give a fraction above 0 and at most 1")
         if not (math.isfinite(self.frame_rate) and self.frame_rate > 0.0):
             raise BadInput(f"a frame rate of {self.frame_rate:g} Hz", hint="give a positive one")
+        if self.sample_rate is not None and not 2.0 <= self.sample_rate / self.frame_rate <= MAX_PICTURE_SAMPLES:
+            what = f"{self.sample_rate:g} samples a second at {self.frame_rate:g} pictures a second"
+            raise BadInput(what, hint=f"give a picture 2 to {MAX_PICTURE_SAMPLES:.0e} samples")
         if not 0.0 <= self.stiffness_margin < 0.1:
             raise BadInput(f"a margin of {self.stiffness_margin:g}", hint="give a fraction below 0.1")
 
@@ -192,6 +202,8 @@ class LissajousFigure:
 class ScanCandidate:
     """A figure with its drive and its performance, by ``PHASES`` where it depends on the phase between the axes.
 
+    "best" is the phase at which one picture visits more pixels.
+
     Attributes:
         figure: the motions.
         drive: frequencies of the drives of x and y [Hz].
@@ -199,6 +211,7 @@ class ScanCandidate:
         fill: fraction of the pixels that one picture visits.
         gap: diameter of the largest disc that holds no visited pixel, see ``largest_gap`` [px].
         time: after which the required fill is reached [s]; None if one picture does not reach it.
+        phases: the phase of ``figure`` with that fill; the samples of the coarser mesh may visit more pixels.
     """
 
     figure: LissajousFigure
@@ -207,6 +220,7 @@ class ScanCandidate:
     fill: Mapping[str, float]
     gap: Mapping[str, float]
     time: Mapping[str, float | None]
+    phases: Mapping[str, str]
 
     def fill_reached(self, fill: float) -> str:
         """Return when the fill is reached: "at any phase", "at the best phase" or "no"."""
@@ -270,7 +284,13 @@ def enumerate_figures(
     Args:
         x, y: lowest and highest frequency of the motions [Hz].
         frame_rate: pictures per second [Hz].
+
+    Raises:
+        BadInput: a picture would take more than ``MAX_WINDINGS`` cycles.
     """
+    if max(x[1], y[1]) > MAX_WINDINGS * frame_rate:
+        what = f"a picture at {frame_rate:g} Hz takes {max(x[1], y[1]) / frame_rate:.3g} cycles"
+        raise BadInput(what, hint=f"give a frame rate of {max(x[1], y[1]) / MAX_WINDINGS:.2g} Hz or more")
     most = frame_rate * (1.0 + MAX_RATE_EXCESS)
     for n_x in range(max(1, math.ceil(x[0] / most)), math.floor(x[1] / frame_rate) + 1):
         for n_y in range(max(1, math.ceil(y[0] / most)), math.floor(y[1] / frame_rate) + 1):
@@ -293,7 +313,7 @@ def design(
         volts: amplitude and offset of both drives [V].
 
     Raises:
-        BadInput: a drive does not sustain the field, or no figure repeats at the frame rate.
+        BadInput: a drive does not sustain the field, no figure repeats at the frame rate, or none visits a pixel.
     """
     grid = requirements.grid
     bands = {name: find_sustained_band(device.axis(name), *volts) for name in ("x", "y")}
@@ -312,7 +332,10 @@ def design(
     nearest = sorted(figures, key=lambda figure: (figure.frame_rate, figure.mesh_diameter(grid)))[
         :MAX_EVALUATED_FIGURES
     ]
-    candidates = [_evaluate_figure(figure, bands, requirements) for figure in nearest]
+    evaluated = (_evaluate_figure(figure, bands, requirements) for figure in nearest)
+    candidates = [candidate for candidate in evaluated if candidate.fill["worst"] > 0.0]
+    if not candidates:
+        raise BadInput("the scan visits no pixel", hint="give a larger field, or more samples a second")
     order = ("at any phase", "at the best phase", "no")
     candidates.sort(key=lambda c: (order.index(c.fill_reached(requirements.fill)), c.figure.frame_rate, c.gap["worst"]))
     return bands, candidates
@@ -322,12 +345,14 @@ def _evaluate_figure(
     figure: LissajousFigure, bands: Mapping[str, SustainedBand], requirements: ScanRequirements
 ) -> ScanCandidate:
     rate = requirements.sample_rate or figure.path_rate(requirements.grid)
-    fill, gap, time = {}, {}, {}
+    results = []
     for phase in PHASES:
         x, y = figure.angles(rate, phase)
         visited = map_samples(x, y, x, requirements.grid).coverage > 0
-        fill[phase], gap[phase] = float(visited.mean()), largest_gap(visited)
-        time[phase] = time_for_fill(x, y, rate, requirements.grid, requirements.fill)
+        reached = time_for_fill(x, y, rate, requirements.grid, requirements.fill)
+        results.append((float(visited.mean()), largest_gap(visited), reached, phase))
+    results.sort(key=lambda result: -result[0])
+    fill, gap, time, phases = (dict(zip(PHASES, values, strict=True)) for values in zip(*results, strict=True))
     n_x, n_y = figure.windings
     drive = bands["x"].drive_per_motion * n_x * figure.frame_rate, bands["y"].drive_per_motion * n_y * figure.frame_rate
-    return ScanCandidate(figure, drive, figure.mesh_diameter(requirements.grid), fill, gap, time)
+    return ScanCandidate(figure, drive, figure.mesh_diameter(requirements.grid), fill, gap, time, phases)

@@ -56,7 +56,7 @@ def design_report(
     )
     coverage = []
     for phase in PHASES:
-        x, y = best.figure.angles(_rate(best, requirements), phase)
+        x, y = best.figure.angles(_rate(best, requirements), best.phases[phase])
         picture = map_samples(x, y, x, grid)
         shown = coverage_figure(picture.coverage, scale_bar(grid))
         caption = f"windings {_name(best)} at the {phase} phase between the axes: {shown.caption}"
@@ -73,7 +73,8 @@ def design_report(
 
 PAIRS_TEXT = (
     "Motions at n_x and n_y times the frame rate, without a common divisor, repeat as one figure. Its mesh is finest "
-    "at the best phase between the axes and twice as coarse at the worst. A drifting resonance passes through both. "
+    "at one phase between the axes and twice as coarse at another. The best phase is that of the two at which more "
+    "pixels are visited, mostly that of the finest mesh. A drifting resonance passes through both. "
     "Gap: diameter of the largest disc that contains no visited pixel."
 )
 TIME_TEXT = "During one picture of each of the first pairs. Solid: best phase between the axes; dashed: worst phase."
@@ -116,7 +117,7 @@ def _against_time(candidates: Sequence[ScanCandidate], requirements: ScanRequire
     for candidate, colour in zip(candidates, COLOURS, strict=False):
         for phase, line in zip(PHASES, ("-", "--"), strict=True):
             rate = _rate(candidate, requirements)
-            x, y = candidate.figure.angles(rate, phase)
+            x, y = candidate.figure.angles(rate, candidate.phases[phase])
             time, fill = fill_against_time(x, y, rate, requirements.grid)
             few = slice(None, None, max(1, time.size // 400))
             label = _name(candidate) if phase == "best" else None

@@ -21,6 +21,7 @@ from recon.scan_design import (
     LissajousFigure,
     ScanRequirements,
     SustainedBand,
+    design,
     enumerate_figures,
     find_sustained_band,
 )
@@ -167,6 +168,9 @@ def test_the_simulation_of_the_first_pair_has_the_designed_amplitude_and_fill(
         (["--device", "nothing"], "there are"),
         (["--device", "chen2019", "--half-angles", "0.1,0.1"], "add the table [y]"),
         (["--volts", "5,5"], "nothing oscillates"),
+        (["--half-angles", "1e-12,0.1"], "the scan visits no pixel"),
+        (["--frame-rate", "0.001", "--beam-path"], "a picture at 0.001 Hz takes 1.39e+07 cycles; give a frame rate of"),
+        (["--rate", "1"], "1 samples a second at 15 pictures a second; give a picture 2 to 5e+07 samples"),
     ],
 )
 def test_impossible_designs_are_refused_in_one_line(
@@ -177,6 +181,13 @@ def test_impossible_designs_are_refused_in_one_line(
     assert words in captured.err
     assert captured.err.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_the_fill_at_the_worst_phase_is_below_that_at_the_best() -> None:
+    requirements = ScanRequirements(Grid(200, 200, 0.18, 0.16), 30.0, 1.0, 1e6)
+    _, candidates = design(devices.load("imaging"), requirements, (30.0, 30.0))
+    assert all(candidate.fill["worst"] <= candidate.fill["best"] for candidate in candidates)
+    assert {"best", "worst"} == {candidate.phases["worst"] for candidate in candidates}
 
 
 def test_an_infinite_frame_rate_is_refused() -> None:
