@@ -13,11 +13,17 @@ from phantoms.targets import make_target
 from phantoms.waveforms import Sine, Waveform
 from scanner import devices
 from scanner.device import AXES, Device
+from scanner.device_toml import FINITE, NOT_NEGATIVE, POSITIVE, check_values, checked_number
 from scanner.drift import Drift, exponential
+from scanner.errors import BadInput
 from scanner.recording import Recording
 
 IMAGING_DRIVES = {"x": Sine(27680.0, 30.0, 30.0), "y": Sine(6540.0, 30.0, 30.0)}
 """Drives of the named device ``imaging``, with the frequencies of the papers."""
+
+MAX_SPOT_FIELDS = 0.25
+"""Largest standard deviation of the beam's spot over the field's width or height. Within two standard deviations to
+either side such a spot covers the whole field, and its convolution takes half a minute."""
 
 SETTLING_TIME_CONSTANTS, MIN_SETTLING_S = 4.0, 0.05
 """Time constants of the slowest decay, and least time [s], after which the amplitude is 98 % of its final value."""
@@ -44,14 +50,20 @@ class Experiment:
     device: Device = field(default_factory=lambda: devices.load("imaging"))
     target: str = "immunohistochemistry"
     drives: Mapping[str, Waveform] = field(default_factory=lambda: IMAGING_DRIVES)
-    duration: float = 0.06
-    sample_rate: float = 5e6
+    duration: float = field(default=0.06, metadata=POSITIVE)
+    sample_rate: float = field(default=5e6, metadata=POSITIVE)
     drift: Mapping[str, float] = field(default_factory=lambda: {"x": -0.002, "y": -0.002})
-    drift_tau: float = 0.025
-    field_um: float = 250.0
-    spot_um: float = 0.4
+    drift_tau: float = field(default=0.025, metadata=POSITIVE)
+    field_um: float = field(default=250.0, metadata=POSITIVE)
+    spot_um: float = field(default=0.4, metadata=NOT_NEGATIVE)
     detector: Detector = field(default_factory=lambda: Detector(photons_per_sample=1000.0, bits=12))
     angles: bool = False
+
+    def __post_init__(self) -> None:
+        check_values(self)
+        for change in self.drift.values():
+            if checked_number(change, FINITE["must"], "drift") <= -1.0:
+                raise BadInput(f"is {change:g}", channel="drift", hint="give a relative change above -1")
 
 
 def simulate_experiment(
@@ -70,12 +82,17 @@ def simulate_experiment(
 
     Raises:
         DeviceInvalid: the device has no field of view, a single axis, or lacks a value that the simulation needs.
-        BadInput: the target is neither a known name nor a picture file, or its pixels are too coarse for the spot.
+        BadInput: the target is neither a known name nor a picture file, its pixels are too coarse for the spot, or the
+            spot is too wide for the field.
     """
     for name in AXES:
         experiment.device.axis(name)
     view = experiment.device.require_scan()
     height_um = experiment.field_um * view.half_angle_y / view.half_angle_x
+    if experiment.spot_um > MAX_SPOT_FIELDS * min(experiment.field_um, height_um):
+        what = f"a beam spot with a standard deviation of {experiment.spot_um:g} um is too wide for a field of "
+        what += f"{experiment.field_um:g} x {height_um:.4g} um"
+        raise BadInput(what, hint=f"give {MAX_SPOT_FIELDS:g} of the field or less")
     light = blur_by_spot(make_target(experiment.target), experiment.spot_um, experiment.field_um, height_um)
     plan = Plan(
         drives=experiment.drives,

@@ -6,6 +6,7 @@ at the nodes of every step, drifts, noise and the converter. It shares no code w
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -52,6 +53,9 @@ angle near it; the scanners of the papers have amplitudes of 0.1 to 0.2 rad."""
 
 DRIFT_STEP_S = 2e-6
 """Spacing of the table of a drift [s]: far below the time constant of any drift, and small enough for memory."""
+
+MAX_SAMPLES = 1e8
+"""Most samples that are simulated: with 150 bytes each, as measured, they take 15 GB of memory."""
 
 SETTLE_TIME_CONSTANTS = 20.0
 """Time constants after which the transient of a low-pass section is negligible: exp(-20) = 2e-9."""
@@ -143,7 +147,11 @@ _DRIFT = Term(
 def simulate_motion(
     axes: Mapping[str, Axis], plan: Plan, start: Mapping[str, InitialState], edges: Sequence[float]
 ) -> Iterator[dict[str, AxisTrajectory]]:
-    """Yield the motion of all axes with their terms, from one of ``edges`` [s] to the next."""
+    """Yield the motion of all axes with their terms, from one of ``edges`` [s] to the next.
+
+    Raises:
+        BadInput: the motion grows without limit.
+    """
     terms = {name: stated_terms(axis) for name, axis in axes.items()}
     coupled = any(each.term.coupled for added in terms.values() for each in added)
     state = {name: (each.angle, each.rate) for name, each in start.items()}
@@ -164,6 +172,10 @@ def simulate_motion(
         drives = {name: drive_inputs(axis, plan, t0, t1) for name, axis in axes.items()}
         paths = simulate_coupled(drives, state, coupled, simulate_one)
         state = {name: (float(path.angle[-1]), float(path.rate[-1])) for name, path in paths.items()}
+        for name, reached in state.items():
+            if not np.isfinite(reached).all():
+                what = f"the simulated motion has diverged at {t1:.3g} s"
+                raise BadInput(what, channel=name, hint="check the device, its terms, the drive and the drift")
         yield paths
 
 
@@ -181,9 +193,8 @@ def settled_state(axis: Axis, plan: Plan) -> InitialState:
     """
     chunks = max(1, int(np.ceil(plan.settle / CHUNK_S)))
     edges = -plan.settle + plan.settle * np.arange(chunks + 1) / chunks
-    *_, paths = simulate_motion(
-        {axis.name: axis}, plan, {axis.name: InitialState(START_ANGLE_RAD, 0.0)}, edges.tolist()
-    )
+    pieces = simulate_motion({axis.name: axis}, plan, {axis.name: InitialState(START_ANGLE_RAD, 0.0)}, edges.tolist())
+    (paths,) = deque(pieces, maxlen=1)  # earlier pieces are dropped, as the settling may be long
     path = paths[axis.name]
     _require_motion(axis.name, path.angle, plan)
     return InitialState(float(path.angle[-1]), float(path.rate[-1]))
@@ -246,6 +257,23 @@ def _motion_pieces(
     yield {name: path.from_step(first) for name, path in paths.items()}
 
 
+def _check_samples(device: Device, plan: Plan, settles: bool) -> None:
+    """Check the number of samples that are held in memory; with terms, those of the settling are too.
+
+    Raises:
+        BadInput: they are less than two or more than ``MAX_SAMPLES``.
+    """
+    simulated = f"{plan.duration:g} s at {plan.sample_rate:g} samples a second"
+    if plan.duration * plan.sample_rate < 1.5:
+        raise BadInput(f"{simulated} make no recording", hint="simulate for longer, or faster")
+    terms = any(device.sensed_axis(name).terms for name in device.axes)
+    before = plan.settle if settles and terms else 0.0
+    if (plan.duration + before) * plan.sample_rate > MAX_SAMPLES:
+        simulated += f", after {before:g} s until the motion of this Q has settled," if before else ""
+        what = f"{simulated} are {(plan.duration + before) * plan.sample_rate:.2g} samples"
+        raise BadInput(what, hint=f"simulate {MAX_SAMPLES:g} at most: a shorter time, or fewer samples a second")
+
+
 def _check_steps(device: Device, plan: Plan) -> None:
     """Check that the steps of the integration resolve the motion.
 
@@ -287,14 +315,13 @@ def simulate(
         nominal: the device that the recording states, where its calibration differs from the truth.
 
     Raises:
-        BadInput: the plan holds less than two samples, or the device lacks what it needs.
+        BadInput: the plan holds less than two samples or too many, the device lacks what it needs, or the motion
+            diverges.
 
     Returns:
         the recording and the content of its ``/truth``: ``angle_x``, ``angle_y`` at every sample, and ``scene``.
     """
-    if round(plan.duration * plan.sample_rate) < 2:
-        what = f"{plan.duration:g} s at {plan.sample_rate:g} samples a second make no recording"
-        raise BadInput(what, hint="simulate for longer, or faster")
+    _check_samples(device, plan, start is None)
     _check_steps(device, plan)
     rng = np.random.default_rng(seed)
     parts: dict[str, list[Array]] = {}

@@ -22,6 +22,9 @@ FWHM_PER_SD = 2 * math.sqrt(2 * math.log(2))
 MIN_SPOT_PX = 0.5
 """Least standard deviation of a spot [scene pixels]: a sampled Gaussian is 7 % too narrow there, 0.1 % at 0.7."""
 
+MAX_PHOTONS = 1e15
+"""Most photons in a sample: doubles represent their counts exactly, and numpy draws them."""
+
 MAX_BITS = 24
 """Most bits of a converter: float32 represents their codes exactly."""
 
@@ -103,6 +106,9 @@ class Detector:
         for name, value in positive.items():
             if not (math.isfinite(value) and value > 0):
                 raise BadInput(f"the detector's {name} is {value}", hint="give a finite value above zero")
+        if self.photons_per_sample > MAX_PHOTONS:
+            what = f"the detector's photons_per_sample is {self.photons_per_sample:g}"
+            raise BadInput(what, hint=f"give at most {MAX_PHOTONS:g}")
         if not (math.isfinite(self.read_noise_sd) and self.read_noise_sd >= 0):
             raise BadInput(f"the detector's read_noise_sd is {self.read_noise_sd}", hint="give zero or more")
         if self.bits is not None and not 1 <= self.bits <= MAX_BITS:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scanner.arrays import Array
+from scanner.device_toml import FINITE, check_values
 from scanner.errors import BadInput
 
 CYCLE_RAD = 2 * np.pi
@@ -51,10 +52,13 @@ class Sine(Waveform):
     starts. Equation 16 of chen2020 omits the offset; its table I states 0 to 60 V.
     """
 
-    frequency: float
-    amplitude: float
-    offset: float = 0.0
-    phase: float = 0.0
+    frequency: float = field(metadata=FINITE)
+    amplitude: float = field(metadata=FINITE)
+    offset: float = field(default=0.0, metadata=FINITE)
+    phase: float = field(default=0.0, metadata=FINITE)
+
+    def __post_init__(self) -> None:
+        check_values(self)
 
     def angle(self, t: ArrayLike) -> Array:
         """Phase at times ``t`` [s]: [rad], of t's shape."""

@@ -96,8 +96,18 @@ def _run_command(words: Sequence[str], stop: StopRequest, announce: bool) -> int
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + "." if called else None)
         if called:
             module = add_command(name, command)
+            _check_not_empty(words[1:], command)
     args = parser.parse_args(words)
     return _run(module, args, f"{parser.prog} {args.command}", stop, announce and args.command in COMPILED)
+
+
+def _check_not_empty(words: Sequence[str], parser: _Parser) -> None:
+    """Exit with a line on an empty argument. As a path it would mean the current folder, as a name no name."""
+    for before, word in zip(["", *words], words, strict=False):
+        option, equals, value = word.partition("=") if word.startswith("-") else (before, "=", word)
+        if equals and not value.strip():
+            name = option if option.startswith("-") else "an argument"
+            parser.error(f"{name} is given an empty text; write a value, or leave it out")
 
 
 def add_command(name: str, parser: argparse.ArgumentParser) -> ModuleType:

@@ -7,7 +7,7 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon.cli.argument_types import parse_axis_pair, parse_positive, parse_size
+from recon.cli.argument_types import parse_axis_pair, parse_not_negative, parse_positive, parse_size
 
 if TYPE_CHECKING:
     from recon.scan_design import ScanCandidate, ScanRequirements, SustainedBand
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--margin",
-        type=float,
+        type=parse_not_negative,
         default=0.0005,
         help="relative change of either stiffness that the field has to survive (0.0005)",
     )

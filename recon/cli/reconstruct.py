@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon.cli.argument_types import parse_count, parse_positive, parse_size
+from recon.cli.argument_types import parse_count, parse_positive, parse_size, parse_whole
 
 if TYPE_CHECKING:
     from recon.reconstruction import Options
@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--fill",
-        type=int,
+        type=parse_whole,
         default=0,
         metavar="PX",
         help="fill holes up to PX pixels wide, marked in fill.tif (0: none)",
@@ -118,7 +118,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spot", type=parse_positive, metavar="PX", help="sd of the beam's spot in pixels, for the blur's account"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of whatever is drawn at random (nothing is, at present)")
+    parser.add_argument(
+        "--seed", type=parse_whole, default=0, help="of whatever is drawn at random (nothing is, at present)"
+    )
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:

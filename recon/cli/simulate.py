@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon.cli.argument_types import parse_drive, parse_positive
+from recon.cli.argument_types import parse_drive, parse_not_negative, parse_number, parse_positive, parse_whole
 
 if TYPE_CHECKING:
     from phantoms.waveforms import Sine
@@ -34,18 +34,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=parse_positive, default=0.06, help="s (0.06)")
     parser.add_argument("--rate", type=parse_positive, default=5e6, help="samples a second (5e6)")
     parser.add_argument(
-        "--drift", type=float, default=-0.002, help="relative change of both stiffnesses in the end (-0.002)"
+        "--drift", type=parse_number, default=-0.002, help="relative change of both stiffnesses in the end (-0.002)"
     )
     parser.add_argument("--drift-tau", type=parse_positive, default=0.025, help="its time constant, s (0.025)")
     parser.add_argument(
         "--field-um", type=parse_positive, default=250.0, help="width of the field on the sample, um (250)"
     )
-    parser.add_argument("--spot-um", type=float, default=0.4, help="sd of the beam spot, um (0.4)")
+    parser.add_argument("--spot-um", type=parse_not_negative, default=0.4, help="sd of the beam spot, um (0.4)")
     parser.add_argument(
         "--photons", type=parse_positive, default=1000.0, help="photons a sample at full brightness (1000)"
     )
     parser.add_argument("--angles", action="store_true", help="record the true angles as reference channels too")
-    parser.add_argument("--seed", type=int, default=0, help="of all noise (0)")
+    parser.add_argument("--seed", type=parse_whole, default=0, help="of all noise (0)")
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:

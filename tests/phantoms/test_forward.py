@@ -1,5 +1,6 @@
 """The forward simulation: accuracy of the integration, laws of the readouts, drifts, and agreement with the truth."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.forward import InitialState, Plan, settled_state, simulate, simulate_trajectory
+from phantoms.optics import Detector
 from phantoms.waveforms import Constant, Multisine, Sine
 from scanner import devices
 from scanner.device import Device
@@ -126,6 +128,39 @@ def test_intensity_is_the_scene_at_the_true_angles() -> None:
     column, row = (np.clip((0.5 * 1600 * (v + 1)).astype(int), 0, 1599) for v in s)
     assert np.corrcoef(intensity, scene[row, column])[0, 1] > 0.99
     assert {"sense", "drive_x", "drive_y", "intensity"} == set(recording.channels)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"drift_tau": float("nan")}, "drift_tau: is nan and must be a number greater than 0"),
+        ({"drift": {"x": float("nan")}}, "drift: is nan and must be a finite number"),
+        ({"drift": {"y": -1.0}}, "drift: is -1; give a relative change above -1"),
+        ({"drift": {"x": 1e14}}, "x: the simulated motion has diverged at"),
+        ({"duration": 1e9}, r"1e\+09 s at 5e\+06 samples a second are 5e\+15 samples; simulate 1e\+08 at most"),
+        ({"spot_um": 100.0}, "a standard deviation of 100 um is too wide for a field of 250 x 250 um; give 0.25"),
+    ],
+)
+def test_senseless_experiments_are_refused(changes: dict, words: str) -> None:
+    with pytest.raises(BadInput, match=words):
+        simulate_experiment(Experiment(**{"duration": 0.001, "target": "siemens_star"} | changes))
+
+
+def test_a_drive_or_a_detector_without_a_finite_number_is_refused() -> None:
+    with pytest.raises(BadInput, match="offset: is inf and must be a finite number"):
+        Sine(1000.0, 1.0, float("inf"))
+    with pytest.raises(BadInput, match=r"photons_per_sample is 1e\+30; give at most 1e\+15"):
+        Detector(photons_per_sample=1e30)
+
+
+def test_a_long_settling_takes_no_more_memory() -> None:
+    axis, peaks = devices.find("imaging").axis("x"), []
+    for settle in (0.05, 1.0):
+        tracemalloc.start()
+        settled_state(axis, Plan({"x": DRIVES["x"]}, 0.01, 5e5, settle=settle))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 2.0 * peaks[0]
 
 
 def test_device_is_loaded_by_name() -> None:

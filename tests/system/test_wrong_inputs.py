@@ -291,6 +291,7 @@ def test_numbers_of_frames_are_positive(arguments: dict) -> None:
     result = lissajous.reconstruct(arrays(), device=Device.from_toml(DEVICE), pixels=(20, 20))
     with pytest.raises(BadInput, match="give a positive number"):
         lissajous.frames(result, **arguments)
+    assert len(lissajous.frames(result, frame_time=1e9)) == 1
 
 
 def test_a_target_is_not_scanned_by_a_device_of_one_axis(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -1,5 +1,6 @@
 """The command line as a user runs it: output files, keys, exit codes, and one line for bad input."""
 
+import argparse
 import json
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from recon.cli import main
+from recon.cli import COMMANDS, add_command, main
 from scanner.recording import Recording
 from tests.support.simulated import imaging, separate_electrodes
 
@@ -288,6 +289,35 @@ def test_bad_arguments_are_refused_in_one_line(scan: Path, tmp_path: Path, capsy
 
 
 @pytest.mark.slow
+def options(command: str) -> list[argparse.Action]:
+    parser = argparse.ArgumentParser()
+    add_command(command, parser)
+    return parser._actions
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_refuses_numbers_that_no_quantity_has(command: str) -> None:
+    for option in options(command):
+        if option.type in (None, Path):
+            continue
+        count = len(option.metavar.split(",")) if isinstance(option.metavar, str) else 1
+        for number in ("nan", "inf", "-inf", "1e30", "-1e30", "1e-30", "9" * 5000):
+            with pytest.raises(argparse.ArgumentTypeError, match=r"is no|not"):
+                option.type(",".join([number, *["1"] * (count - 1)]))  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_empty_arguments_are_refused_in_one_line(command: str, capsys: pytest.CaptureFixture) -> None:
+    for words, name in ((["-o", ""], "-o"), (["--terms="], "--terms"), ([""], "an argument"), (["a", " "], "an arg")):
+        with pytest.raises(SystemExit) as stopped:
+            main([command, *words])
+        assert stopped.value.code == 2
+        error = capsys.readouterr().err
+        assert f"lissajous {command}: {name}" in error
+        assert "is given an empty text" in error
+        assert error.count("\n") == 1
+
+
 def test_a_failed_run_does_not_change_earlier_results(scan: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     main(["reconstruct", str(scan), "-o", str(out), "--estimator", "constant"])
