@@ -62,7 +62,7 @@ def load_truth(path: Path) -> Truth | None:
     """Return the truth in a recording's file; None where it contains no true angle.
 
     Raises:
-        BadInput: a true angle has no sample_rate.
+        BadInput: as :func:`truth_from_simulation`.
     """
     return truth_from_simulation(read_truth(path) or {}, path)
 
@@ -76,24 +76,36 @@ def truth_from_simulation(simulated: Mapping[str, Any], path: Path | None = None
         path: of the file, for error messages.
 
     Raises:
-        BadInput: a true angle has no sample_rate.
+        BadInput: a true angle has no sample_rate, or a value is no number or no array of the shape that belongs to it.
     """
+
+    def numbers(value: object, dimensions: int, name: str) -> Array:
+        try:
+            array = np.asarray(value, np.float64)
+        except (TypeError, ValueError):
+            array = None
+        if array is None or array.ndim != dimensions or not array.size:
+            what = f"is not {('a number', 'an array of numbers', 'a matrix of numbers')[dimensions]}"
+            hint = "store it as `lissajous simulate` does, or remove /truth"
+            raise BadInput(what, file=path, channel=f"/truth/{name}", hint=hint)
+        return array
+
     angles = {}
+    values = {name: value[0] if isinstance(value, tuple) else value for name, value in simulated.items()}
     for axis in ("x", "y"):
-        value: Any = simulated.get(f"angle_{axis}")
-        if value is None:
+        name = f"angle_{axis}"
+        if values.get(name) is None:
             continue
-        values, attrs = value if isinstance(value, tuple) else (value, {})
-        if "sample_rate" not in attrs:
-            raise BadInput(
-                "states no sample_rate", file=path, channel=f"/truth/angle_{axis}", hint="store it as attribute"
-            )
-        angles[axis] = (np.asarray(values, np.float64), float(attrs["sample_rate"]), float(attrs.get("start", 0.0)))
-    scene = simulated.get("scene")
-    scene = scene[0] if isinstance(scene, tuple) else scene
+        stated = simulated[name][1] if isinstance(simulated[name], tuple) else {}
+        rate, start = (float(numbers(stated.get(key, 0.0), 0, f"{name}, {key}")) for key in ("sample_rate", "start"))
+        if not 0.0 < rate < np.inf:
+            what = "states no sample_rate" if "sample_rate" not in stated else f"states a sample_rate of {rate:g} Hz"
+            raise BadInput(what, file=path, channel=f"/truth/{name}", hint="store it as attribute")
+        angles[axis] = numbers(values[name], 1, name), rate, start
     if not angles:
         return None
-    return Truth(angles, None if scene is None else np.asarray(scene, np.float64), float(simulated.get("spot_sd", 0.0)))
+    scene = numbers(values["scene"], 2, "scene") if values.get("scene") is not None else None
+    return Truth(angles, scene, float(numbers(values.get("spot_sd", 0.0), 0, "spot_sd")))
 
 
 def evaluate_axis(axis: AxisMotion, angle: Array, rate: float, start: float) -> AxisEvaluation:

@@ -44,12 +44,15 @@ def block_phasors(
         gain: factor on the values.
 
     Returns:
-        (centre times [s], Z), both of shape (n // block,).
+        (centre times [s], Z), both of shape (n // block,); Z is NaN where a sample of the block is not finite.
     """
     starts = np.arange(values.size // block) * block
     fitted, _ = block_products(values, starts, _phasor_weights(block, frequency / rate), 1, gain)
     centres = start + (starts + 0.5 * (block - 1)) / rate
-    return np.asarray(centres, np.float64), np.asarray(fitted[:, 1] + 1j * fitted[:, 0], np.complex128)
+    phasors = np.full(starts.size, np.nan, np.complex128)
+    finite = np.isfinite(fitted).all(axis=1)
+    phasors[finite] = fitted[finite, 1] + 1j * fitted[finite, 0]
+    return np.asarray(centres, np.float64), phasors
 
 
 def phasor_noise(rate: float, frequency: float, block: int) -> float:

@@ -29,6 +29,8 @@ from scanner.truth import Truth, write_truth
 
 FORMAT = "lissajous-recording"
 VERSIONS = (1,)
+TEXT_ATTRIBUTES = ("name", "notes", "acquired")
+"""Attributes of the file that are texts; a number is accepted as one."""
 
 # A sample less than this fraction of a sample before a cut belongs to the part after it: rounding of times moved it.
 _ROUNDING = 1e-6
@@ -68,8 +70,9 @@ class Recording:
             growing: another program may be writing the file; the recording is what it has written so far.
 
         Raises:
-            BadInput: no such file, no HDF5, truncated, another format or version, no channels, or a channel that
-                :func:`scanner.channel.make_channel` refuses. Links and storage outside the file are refused too.
+            BadInput: no such file, no HDF5, truncated, another format or version, a name that is no text, no channels,
+                or a channel that :func:`scanner.channel.make_channel` refuses. Links and storage outside the file are
+                refused too.
         """
         path = Path(path)
         file = open_hdf5(path, growing)
@@ -77,6 +80,7 @@ class Recording:
             with undamaged(path):
                 attrs = attributes(file)
                 _check_format(attrs.pop("format", None), attrs.pop("version", None), path)
+                _check_texts(attrs, path)
                 group = child(file, "channels", h5py.Group)
                 if group is None or not len(group):
                     raise BadInput("holds no channels", file=path, hint="store signals under /channels")
@@ -297,6 +301,13 @@ def _check_format(name: object, version: object, path: Path) -> None:
     if version not in VERSIONS:
         what = "states no version" if version is None else f"is a recording of version {version!r}"
         raise BadInput(what, file=path, hint=f"versions read here: {', '.join(map(str, VERSIONS))}")
+
+
+def _check_texts(attrs: Mapping[str, Any], path: Path) -> None:
+    for key in TEXT_ATTRIBUTES:
+        if not isinstance(attrs.get(key, ""), (str, int, float)):
+            hint = f"store {key} as one text, or remove it"
+            raise BadInput(f"attribute {key} is {type(attrs[key]).__name__}, not text", file=path, hint=hint)
 
 
 def _device_text(file: h5py.File, path: Path) -> str | None:

@@ -13,6 +13,7 @@ from estimation.optics.scene import CellVariances, SamplingGeometry
 from scanner.arrays import Array, Mask
 from scanner.channel import Channel
 from scanner.device import AXES
+from scanner.errors import BadInput
 from scanner.interpolation import shift_samples
 from scanner.motion import AngleTrack
 
@@ -134,6 +135,9 @@ def read_scan(tracks: Mapping[str, AngleTrack], intensity: Channel) -> ScanSampl
     Args:
         tracks: angle of each axis at the intensity's samples.
         intensity: shape (n,) or (n, detectors).
+
+    Raises:
+        BadInput: no sample is finite and has known angles.
     """
     size = min(intensity.size, *(tracks[axis].size for axis in AXES))
     part = MAX_SAMPLES // 3
@@ -143,6 +147,9 @@ def read_scan(tracks: Mapping[str, AngleTrack], intensity: Channel) -> ScanSampl
     values = values.mean(axis=1) if values.ndim == 2 else values
     angles = {axis: np.concatenate([tracks[axis].read(*run) for run in runs]) for axis in AXES}
     finite = np.isfinite(values) & np.isfinite(angles["x"]) & np.isfinite(angles["y"])
+    if not finite.any():
+        what, hint = "has no sample at which both angles are known", "check the channels' start times"
+        raise BadInput(what, file=intensity.file, channel=intensity.name, hint=hint)
     low, high = ({axis: float(end(angles[axis])) for axis in AXES} for end in (np.nanmin, np.nanmax))
     validation = (index * TIME_BLOCKS // size) % VALIDATION_EVERY == VALIDATION_EVERY // 2
     scan = ScanSamples(

@@ -271,9 +271,14 @@ def _common_phasors(
 
 
 def _phasor(channel: Channel, start: float, stop: float, frequency: float) -> tuple[complex, float]:
-    """Phasor at ``frequency`` [Hz] of a channel between two times [s], and its variance there. Gaps count as zero."""
+    """Phasor at ``frequency`` [Hz] of a channel between two times [s], and its variance there, 0 without samples.
+
+    Gaps count as zero.
+    """
     first, last = (round((time - channel.start) * channel.sample_rate) for time in (start, stop))
-    values = np.nan_to_num(channel.read(first, last), nan=0.0)
+    values = np.nan_to_num(channel.read(first, last), nan=0.0, posinf=0.0, neginf=0.0)
+    if not values.size:
+        return 0j, 0.0
     values = values - values.mean()
     time = channel.time(first, first + values.size)
     return complex(2.0 * np.mean(values * np.exp(-2j * np.pi * frequency * time))), float(np.mean(values**2))

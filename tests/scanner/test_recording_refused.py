@@ -134,6 +134,10 @@ BAD_FILES = {
         "is a recording of version 2; versions read here: 1",
     ),
     "no version": (without("/", "version"), "states no version; versions read here: 1"),
+    "names": (
+        lambda file: file.attrs.update(name=["a", "b"]),
+        "attribute name is ndarray, not text; store name as one text, or remove it",
+    ),
     "device no text": (
         lambda file: file["device"].attrs.update(toml=3),
         "/device: attribute toml is not text; store the device as TOML text",

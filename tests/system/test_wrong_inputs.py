@@ -15,6 +15,7 @@ import pytest
 
 import lissajous
 from recon.cli import main
+from recon.evaluation import truth_from_simulation
 from scanner.device import Device
 from scanner.errors import BadInput
 from tests.support.wrong_inputs import (
@@ -231,6 +232,21 @@ def test_a_wrong_table_is_refused_in_one_line(case: str, tmp_path: Path, capsys:
 
 def test_there_are_forty_wrong_inputs() -> None:
     assert len(REFUSED_RECORDINGS) + len(WARNED) + len(FILES) + len(TABLES) >= 40
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"scene": "hello"}, "/truth/scene: is not a matrix of numbers; store it as `lissajous simulate` does"),
+        ({"scene": np.ones(9)}, "/truth/scene: is not a matrix"),
+        ({"angle_x": (np.ones(9), {"sample_rate": "fast"})}, "/truth/angle_x, sample_rate: is not a number"),
+        ({"angle_x": (np.ones(9), {"sample_rate": 0.0})}, "/truth/angle_x: states a sample_rate of 0 Hz"),
+        ({"spot_sd": [1.0, 2.0]}, "/truth/spot_sd: is not a number"),
+    ],
+)
+def test_a_truth_that_is_none_is_refused(changes: dict, words: str) -> None:
+    with pytest.raises(BadInput, match=words):
+        truth_from_simulation({"angle_x": (np.ones(9), {"sample_rate": 1e3})} | changes)
 
 
 def test_a_position_in_another_unit_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -19,6 +19,7 @@ from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from recon.report.diagnosis import diagnosis_report
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.motion import SampledAngle
 from scanner.optics import beam_position, intensity_delay, intensity_gain
 from scanner.recording import Recording
@@ -160,6 +161,12 @@ def test_a_term_is_linearised_in_the_measured_parameters(
     effects = candidate_effects(samples, DRIVE_RATE_RAD_S)
     effect = next(e for e in effects if e.name == "law" and e.axis == ("x" if channel == "intensity" else "y"))
     assert effect.direction == pytest.approx(direction, rel=1e-3)
+
+
+def test_an_intensity_without_known_angles_is_refused() -> None:
+    tracks = {axis: SampledAngle(np.full(5000, np.nan), 1e6) for axis in "xy"}
+    with pytest.raises(BadInput, match="intensity: has no sample at which both angles are known; check the channels'"):
+        read_scan(tracks, scan()["intensity"])
 
 
 def test_effects_on_a_sample_without_features_are_reported_as_not_detectable() -> None:

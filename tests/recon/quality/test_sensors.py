@@ -245,6 +245,15 @@ def test_without_a_drive_the_sign_is_noted_once_with_its_gain() -> None:
     assert sum("nothing in the recording confirms it" in each for each in reconstruct(recording, OPTIONS).notes) == 1
 
 
+@pytest.mark.parametrize(("start", "sample"), [(-1e9, 0.0), (0.0, np.inf)])
+def test_a_drive_at_another_time_or_with_an_infinite_sample_has_a_gap(start: float, sample: float) -> None:
+    drive = bench()["drive_x"].read()
+    drive[100] = sample
+    recording = scan(drive_x=(drive, "V", RATE, start))
+    assert list(describe_inverted_sensors(recording, DEVICE)) == []
+    assert any(note.startswith(("drive_x: gap", "drive_x: missing")) for note in reconstruct(recording, OPTIONS).notes)
+
+
 def test_combs_do_not_confirm_the_sign() -> None:
     x = replace(DEVICE.axis("x"), drive=Drive("electrostatic"))
     device = replace(DEVICE, axes={**DEVICE.axes, "x": x})
