@@ -168,7 +168,8 @@ def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
     picture = grid_intensity(beam, prepared.intensity, grid, unlocated)
     field_notes = check_field(picture, estimated.motion, options.allow_outside)
     if not picture.coverage.any():
-        raise BadInput("no sample was mapped: the angle is known nowhere", channel="intensity")
+        hint = "check the channels' start times, and that the sensors recorded a motion throughout"
+        raise BadInput("no sample was mapped: the angle is known nowhere", channel="intensity", hint=hint)
     defective = to_sample_ranges(((defect.start, defect.stop) for defect in prepared.defects), prepared.intensity)
     affected = find_visited_pixels(beam, subtract_ranges(defective, unlocated), grid)
     affected |= mark_path_during_jumps(beam, prepared.clock_jumps, grid)

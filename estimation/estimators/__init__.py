@@ -33,7 +33,7 @@ def find_estimator(name: str) -> Estimator:
     """
     known = estimators()
     if name not in known:
-        raise BadInput(f"no estimator is named {name!r}", hint=f"there are {', '.join(known)}")
+        raise BadInput(f"no estimator is named {name!r}", channel="estimator", hint=f"there are {', '.join(known)}")
     return known[name]
 
 

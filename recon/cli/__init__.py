@@ -42,6 +42,10 @@ COMPILED = ("reconstruct", "simulate", "identify", "predict", "diagnose", "desig
 """Commands whose numerical code is compiled at the first run."""
 
 
+INPUTS = ("recordings", "recording", "file", "film", "study")
+"""Names of the arguments that are files which a command reads."""
+
+
 class _PrintVersion(argparse.Action):
     """``--version``: print the installed version and exit."""
 
@@ -153,6 +157,8 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequ
     except BadInput as error:
         if stop.came:  # an interrupt may have caused it
             raise
+        if error.file is None and (error.channel or "").lstrip("-").replace("-", "_") not in vars(args):
+            error.file = _inputs(args)
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
     except MemoryError:
@@ -161,6 +167,13 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequ
     except OSError as error:  # a full disk, a folder that may not be written
         print(f"{prog}: {line_of(error, 'output')}", file=sys.stderr)
         return 1
+
+
+def _inputs(args: argparse.Namespace) -> str | None:
+    """The files that a command reads, for an error that names neither a file nor an argument; None if there is none."""
+    given = next((value for name in INPUTS if (value := getattr(args, name, None)) is not None), None)
+    paths = given if isinstance(given, list) else [given]
+    return None if given is None else ", ".join(map(str, paths[:3])) + (" and others" if len(paths) > 3 else "")
 
 
 def _printable(text: str) -> str:

@@ -42,5 +42,5 @@ def find(source: Device | str | Path) -> Device:
         return load(str(source))
     if not Path(source).exists():
         hint = f"there are {', '.join(names())}; `lissajous new-device` writes a file to edit"
-        raise BadInput(f"no device is named {str(source)!r} and no file is", hint=hint)
+        raise BadInput(f"no device is named {str(source)!r} and no file is", channel="device", hint=hint)
     return Device.load(source)

@@ -112,7 +112,8 @@ def edges(scale: float = 1.0, swapped: bool = False, frequency: float = 2000.0, 
     return change
 
 
-def refused(arguments: list[str], folder: Path, words: str, capsys: pytest.CaptureFixture) -> None:
+def refused(arguments: list[str], folder: Path, words: str, capsys: pytest.CaptureFixture) -> str:
+    """Check that a command ends with one line that holds ``words``, and writes nothing; return the line."""
     capsys.readouterr()
     assert main([*arguments, "-o", str(folder / "out")]) == 2
     captured = capsys.readouterr()
@@ -121,3 +122,4 @@ def refused(arguments: list[str], folder: Path, words: str, capsys: pytest.Captu
     assert words in lines[0]
     assert "Traceback" not in captured.err
     assert not (folder / "out").exists()
+    return lines[0]

@@ -134,7 +134,8 @@ def test_a_wrong_recording_or_device_is_refused_in_one_line(
 ) -> None:
     device, change, words = REFUSED_RECORDINGS[case]
     write(tmp_path / "scan.h5", device, change, left_out(device))
-    refused(["reconstruct", str(tmp_path / "scan.h5"), "--pixels", "40x40"], tmp_path, words, capsys)
+    line = refused(["reconstruct", str(tmp_path / "scan.h5"), "--pixels", "40x40"], tmp_path, words, capsys)
+    assert f"{tmp_path / 'scan.h5'}: " in line
 
 
 @pytest.mark.parametrize(
