@@ -241,6 +241,9 @@ def _channel(name: str, spec: Mapping[str, Any], contents: Contents, source: Pat
         if raw.ndim != 2 or spec["row"] not in range(raw.shape[0]):
             raise bad(f"there is no row {spec['row']!r} of {spec['variable']!r}", f"count from 0; {holds}")
         raw = matrix_row(raw, spec["row"])
+    if raw.ndim == 2 and raw.shape[0] < raw.shape[1]:
+        hint = "choose a row of it by row = 0 in a mapping, or export it as (samples, detectors)"
+        raise bad(f"variable {spec['variable']!r} of shape {raw.shape} has fewer samples than detectors", hint)
     file = f"{source} by {plan_source}"
     lock_in = {key: spec.get(key) for key in ("reference", "level")}
     return make_channel(

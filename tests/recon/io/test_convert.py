@@ -335,6 +335,13 @@ def test_an_instruments_file_gives_the_same_picture_as_the_recording(tmp_path: P
     np.testing.assert_array_equal(from_recording, from_mapping)
 
 
+def test_a_matrix_whose_rows_are_signals_is_no_channel(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", a=np.zeros((2, 50)))
+    spec = {"variable": "a", "unit": "V", "sample_rate": 1e6}
+    with pytest.raises(BadInput, match=r"'a' of shape \(2, 50\) has fewer samples than detectors; choose a row"):
+        convert(tmp_path / "a.npz", {"channels": {"intensity": spec}})
+
+
 def test_a_row_of_a_matrix_is_a_channel(tmp_path: Path) -> None:
     rows = np.arange(30.0).reshape(3, 10)
     np.savez(tmp_path / "a.npz", rows=rows)
