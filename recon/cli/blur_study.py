@@ -32,10 +32,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def format_summary(summary: dict[str, Any]) -> str:
-    from recon.report.conclusions import conclude_study
-
     lines = [
-        conclude_study(summary),
+        summary["conclusion"],
         f"{summary['output']}: {summary['cells']} cells, {summary['computed']} of them computed now, "
         f"{summary['failed']} failed",
     ]

@@ -114,9 +114,10 @@ def design_scan(
             "output": str(output),
         }
     )
+    summary["conclusion"] = conclude_design(summary)
     with replacing_folder(output) as folder:
         write_json(folder / "summary.json", summary)
-        page = design_report(device.name, requirements, bands, candidates, notes, conclude_design(summary))
+        page = design_report(device.name, requirements, bands, candidates, notes, summary["conclusion"])
         (folder / "report.html").write_text(page, encoding="utf-8")
     return dict(summary)
 
@@ -171,12 +172,10 @@ def _design_notes(best: ScanCandidate, requirements: ScanRequirements) -> list[s
 
 
 def format_summary(summary: dict[str, Any]) -> str:
-    from recon.report.conclusions import conclude_design
-
     best, *others = summary["candidates"]
     drive = best["drive_hz"]
     lines = [
-        conclude_design(summary),
+        summary["conclusion"],
         f"{summary['output']}: drive x at {drive['x']:.4f} Hz and y at {drive['y']:.4f} Hz: {best['windings']['x']} : "
         f"{best['windings']['y']}, {best['frame_rate']:.4f} pictures a second",
         f"  fill {best['fill']['worst']:.1%} at the worst phase between the axes, {best['fill']['best']:.1%} at the "

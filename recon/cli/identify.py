@@ -50,6 +50,7 @@ def identify_files(
     from estimation.identification.calibrate import identify
     from recon.io.convert import check_different, open_any
     from recon.io.output import check_folder, replacing_folder, write_json
+    from recon.report.conclusions import conclude_identification
     from recon.report.identification import identification_report
     from scanner import devices
     from scanner.errors import BadInput
@@ -63,18 +64,20 @@ def identify_files(
             hint = "give one with --device, or record it under /device"
             raise BadInput("states no device", file=paths[0], channel="/device", hint=hint)
         identification = identify(recordings, nominal)
-    summary = {
+    summary: dict[str, Any] = {
         "recordings": [str(path) for path in paths],
         "device": nominal.name,
         "axes": _axes_summary(identification),
         "notes": list(identification.notes),
+        "output": str(output),
     }
+    summary["conclusion"] = conclude_identification(summary)
     with replacing_folder(output, device, *paths) as folder:
         (folder / "device.toml").write_text(identification.device.to_toml(), encoding="utf-8")
         write_json(folder / "summary.json", summary)
         page = identification_report(summary, nominal, [path.name for path in paths])
         (folder / "report.html").write_text(page, encoding="utf-8")
-    return summary | {"output": str(output)}
+    return summary
 
 
 def _axes_summary(identification: Identification) -> dict[str, Any]:
@@ -92,10 +95,9 @@ def _axes_summary(identification: Identification) -> dict[str, Any]:
 
 
 def format_summary(summary: dict[str, Any]) -> str:
-    from recon.report.conclusions import conclude_identification
     from recon.report.numbers import format_interval
 
-    lines = [conclude_identification(summary), f"{summary['output']}: {summary['device']} identified"]
+    lines = [summary["conclusion"], f"{summary['output']}: {summary['device']} identified"]
     for name, axis in summary["axes"].items():
         lines.append(f"  {name}: {'; '.join(axis['used'])}")
         for key, value in axis["values"].items():

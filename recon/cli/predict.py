@@ -42,6 +42,7 @@ def predict_file(
     from estimation.device_fit.predict import beyond_measured_laws, predict
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder, write_json
+    from recon.report.conclusions import conclude_prediction
     from scanner import devices
     from scanner.errors import BadInput
     from scanner.recording import Recording
@@ -69,17 +70,17 @@ def predict_file(
                 }
                 for name, prediction in predictions.items()
             },
+            "output": str(output),
         }
+        summary["conclusion"] = conclude_prediction(summary)
         with replacing_folder(output, device, path) as folder:
             predicted.write(folder / "predicted.h5")
             write_json(folder / "summary.json", summary)
-    return summary | {"output": str(output)}
+    return summary
 
 
 def format_summary(summary: dict[str, Any]) -> str:
-    from recon.report.conclusions import conclude_prediction
-
-    lines = [conclude_prediction(summary)]
+    lines = [summary["conclusion"]]
     lines.append(f"{summary['output']}: {len(summary['channels'])} channels predicted from the first samples on")
     for name, fraction in summary["beyond_measured_law"].items():
         if fraction > 0.0:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging import blur
-from recon.report.conclusions import conclude_study
 from recon.report.figures import COLOURS, figure_uri, new_figure, use_plain_ticks
 from recon.report.page import Figure, Section, Table, render
 from recon.study.plan import Study
@@ -52,7 +51,7 @@ def study_report(study: Study, data: Columns, summary: Mapping[str, Any]) -> str
                 "24rem",
             ),
         ]
-    return render(study.name, conclude_study(summary), sections, notes, subject)
+    return render(study.name, summary["conclusion"], sections, notes, subject)
 
 
 ESTIMATORS_TEXT = (

@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from recon.executors import open_executor, picklable_task
 from recon.io.output import check_folder, finite, replacing_folder, write_json
+from recon.report.conclusions import conclude_study
 from recon.study.job import run_job
 from recon.study.plan import Job, cell_key, plan_jobs, read_study, remaining_jobs
 from recon.study.table import estimator_statistics, require_parquet, table_columns, table_rows, write_csv, write_parquet
@@ -80,6 +81,7 @@ def run_study(
                 "seconds": time.perf_counter() - began,
             }
         )
+        summary["conclusion"] = conclude_study(summary)
         with replacing_folder(output) as folder:
             write_csv(folder / "table.csv", table)
             if parquet:

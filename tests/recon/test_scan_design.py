@@ -142,6 +142,7 @@ def test_the_simulation_of_the_first_pair_has_the_designed_amplitude_and_fill(
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"summary.json", "report.html"}
     assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
     assert (tmp_path / "out" / "report.html").read_text().count('src="data:image') == 4
+    assert summary["conclusion"].startswith("Drive x at ")
     first = summary["candidates"][0]
     assert first["frame_rate"] >= 60
     assert any("skips pixels" in note for note in summary["notes"])

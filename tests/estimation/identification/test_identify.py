@@ -230,7 +230,9 @@ def test_the_command_writes_a_device_closer_to_the_truth(tmp_path, capsys):
     paths = calibration(tmp_path)
     assert main(["identify", *map(str, paths), "-o", str(tmp_path / "out"), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["axes"] == summary["axes"]
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
+    assert "constants of" in summary["conclusion"]
+    assert summary["output"] == str(tmp_path / "out")
     values = summary["axes"]["x"]["values"]
     device = Device.load(tmp_path / "out" / "device.toml")
     axis, m = device.axis("x"), AXIS.require_mechanics()

@@ -106,6 +106,16 @@ def test_reconstruct_writes_the_documented_files_and_keys(
 
 
 @pytest.mark.slow
+def test_a_prediction_concludes_and_states_its_folder(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert main(["predict", str(scan), "-o", str(tmp_path / "out"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["conclusion"].startswith("From the drive alone ")
+    assert summary["output"] == str(tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text()) == summary
+
+
 def test_flips_mirror_the_picture(scan: Path, tmp_path: Path) -> None:
     common = ["reconstruct", str(scan), "--estimator", "constant"]
     main([*common, "-o", str(tmp_path / "plain")])

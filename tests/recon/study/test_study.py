@@ -47,6 +47,7 @@ def test_a_study_writes_table_summary_and_report(finished_study: Path) -> None:
     }  # fmt: skip
     assert_study_is_complete(finished_study)
     summary = json.loads((finished_study / "summary.json").read_text())
+    assert summary["conclusion"].startswith("Use ")
     assert (summary["cells"], summary["computed"], summary["failed"]) == (CELLS, CELLS, 0)
     assert (
         summary["estimators"]["tracker"]["phase_rmse_deg_median"]
