@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.film_correction import CorrectedFilm
 from recon.imaging.line_phase import lag_at
+from recon.io.film import Film
 from recon.report.figures import (
     COLOURS,
     LEGEND,
@@ -23,6 +24,7 @@ from recon.report.figures import (
 )
 from recon.report.numbers import format_uncertain, format_value
 from recon.report.page import Figure, Section, Table, render
+from recon.report.reconstruction import round_scale_bar
 from scanner.arrays import Array
 
 PHASE_CAPTION = (
@@ -74,8 +76,9 @@ def bidirectional_report(result: CorrectedFilm, summary: Mapping[str, Any]) -> s
         ),
     ]
     limits = contrast_limits(result.before)
+    bar, grey = _scale_bar(result.film), (f"{limits[0]:.3g}", f"{limits[1]:.3g}")
     pictures = [
-        Figure(_picture(picture, limits), caption)
+        Figure(_picture(picture, limits), caption, scale_bar=bar, grey_scale=grey)
         for picture, caption in ((result.before, "As recorded: the middle of one frame."), (result.after, "Corrected."))
     ]
     sections = [
@@ -111,6 +114,17 @@ def _lag_figure(result: CorrectedFilm) -> str:
     panel.set(xlabel="column", ylabel="shift / shift at the middle")
     panel.legend(**LEGEND, ncols=2)
     return figure_uri(drawing)
+
+
+def _scale_bar(film: Film) -> tuple[str, float]:
+    """Scale bar of the shown part of a frame: in the unit of length that ImageJ states in the film, else in pixels."""
+    columns = film.shape[-1]
+    width, unit = float(columns - 2 * (columns // 4)), "px"
+    stated = str(film.description.get("metadata", {}).get("unit", "")).replace("\\u00B5", "µ")
+    pixels_per_unit = film.description.get("resolution", (0.0,))[0]
+    if stated not in ("", "pixel") and 0.0 < pixels_per_unit < np.inf:
+        width, unit = width / pixels_per_unit, stated
+    return round_scale_bar(width, unit)
 
 
 def _picture(picture: Array, limits: tuple[float, float]) -> str:

@@ -104,6 +104,11 @@ def scale_bar(grid: Grid, part: float = 1.0) -> tuple[str, float]:
     width, unit = (
         (width * grid.width * part, "µm") if unit == "um" else (1e3 * width * grid.width * part, f"mrad {grid.angle}")
     )
+    return round_scale_bar(width, unit)
+
+
+def round_scale_bar(width: float, unit: str) -> tuple[str, float]:
+    """Label and length of a scale bar, as a fraction, for a picture of ``width`` in ``unit``."""
     power = 10.0 ** math.floor(math.log10(width / 4.0))
     length = max(step * power for step in (1.0, 2.0, 5.0) if step * power <= width / 4.0)
     return f"{length:g} {unit}", length / width

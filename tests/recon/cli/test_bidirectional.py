@@ -195,6 +195,16 @@ def test_channels_of_a_frame_share_one_phase(frames: np.ndarray, tmp_path: Path)
     assert tifffile.imread(tmp_path / "corrected.tif").shape == both.shape
 
 
+@pytest.mark.parametrize(("unit", "length"), [({"unit": "um"}, "5 um"), ({}, "10 px")])
+def test_pictures_of_the_report_have_a_length_and_a_grey_scale(unit: dict, length: str, tmp_path: Path) -> None:
+    path = tmp_path / "film.tif"
+    tifffile.imwrite(path, film(SHIFTS[:3]), imagej=True, metadata={"axes": "TYX", **unit}, resolution=(2.0, 2.0))
+    assert main(["bidirectional", str(path), "-o", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert page.count(f"{length}</span>") == 2
+    assert page.count('class="grey"') == 2
+
+
 def test_compressed_films_and_odd_lines_are_read(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "film.tif", film(SHIFTS[:3], 129), photometric="minisblack", compression="zlib")
     result = correct_film(open_film(tmp_path / "film.tif"), tmp_path / "corrected.tif", quiet=True)
