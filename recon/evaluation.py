@@ -116,12 +116,18 @@ def evaluate_axis(axis: AxisMotion, angle: Array, rate: float, start: float) -> 
         angle: true angle, shape (n,) [rad].
         rate: sample rate of the true angle [Hz].
         start: time of its first sample [s].
+
+    Raises:
+        BadInput: the two have no time in common.
     """
     track, track_angle = axis.angle, axis.angle.read()
     if (track.sample_rate, track.start, track.size) != (rate, start, angle.size):
         time = track.start + np.arange(track.size) / track.sample_rate
         angle = np.interp(time, start + np.arange(angle.size) / rate, angle, left=np.nan, right=np.nan)
     both = np.isfinite(track_angle) & np.isfinite(angle)
+    if not both.any():
+        what, hint = "has no angle at the time of the motion", "correct the channels' start times, or remove /truth"
+        raise BadInput(what, channel="/truth", hint=hint)
     first, last = int(both.argmax()), both.size - int(both[::-1].argmax())
     begin = track.start + first / track.sample_rate
     frequency = float(np.median(axis.frequency))

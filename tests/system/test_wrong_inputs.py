@@ -250,6 +250,12 @@ def test_a_truth_that_is_none_is_refused(changes: dict, words: str) -> None:
         truth_from_simulation({"angle_x": (np.ones(9), {"sample_rate": 1e3})} | changes)
 
 
+def test_a_truth_of_another_time_is_refused() -> None:
+    angle = (np.ones(SAMPLES), {"sample_rate": RATE, "start": 5.0})
+    with pytest.raises(BadInput, match="/truth: has no angle at the time of the motion; correct the channels' start"):
+        lissajous.reconstruct(arrays(), Device.from_toml(DEVICE), pixels=(20, 20), truth={"angle_x": angle})
+
+
 def test_a_position_in_another_unit_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     write(tmp_path / "scan.h5", DEVICE, z_in_micrometres, DRIVES)
     arguments = ["--pixels", "40x40", "--frames", "-o", str(tmp_path / "out"), "--json"]
