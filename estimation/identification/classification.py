@@ -23,10 +23,14 @@ def classify_recording(recording: Recording, name: str) -> str | None:
 
     ``"rest"``, ``"free decay"`` or ``"driven"`` with a reference, or ``UNREFERENCED_DECAY`` or ``UNREFERENCED_DRIVE``.
     A reference is the angle, the velocity, the acceleration, or amplitude and phase of a lock-in amplifier.
+
+    Raises:
+        BadInput: a sample of the drive, or of a sense signal without a reference, is not finite.
     """
     drive, sense = (recording.channels.get(f"{kind}_{name}") for kind in ("drive", "sense"))
     oscillates = False
     if drive is not None:
+        check_signal(drive, constant_ok=True)
         values = drive.read()
         oscillates = bool(np.std(values) > MIN_DRIVE_VARIATION * max(np.abs(values).max(), 1e-300))
     if lock_in_only(recording, name):

@@ -262,6 +262,9 @@ def test_a_recording_is_classified_as_rest_free_decay_or_driven(decay):
     assert classify_recording(made(sense=swinging, drive=swinging), "x") == "driven motion without a reference angle"
     assert classify_recording(made(sense=still, drive=swinging), "x") is None
     assert classify_recording(made(sense=still), "y") is None
+    gap = np.where(np.arange(n) == 100, np.nan, swinging)
+    with pytest.raises(BadInput, match=r"drive_x: sample 100 at 0\.001 s is not finite"):
+        classify_recording(made(angle=swinging, drive=gap), "x")
 
 
 def test_driven_recordings_without_a_reference_angle_are_refused(tmp_path, capsys):
