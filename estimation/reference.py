@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.short_tone import MIN_PERIODS, fit_short_tone
-from scanner.arrays import Array
+from scanner.arrays import Array, Complex
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block, unwrap_phase
@@ -73,6 +73,10 @@ class PhaseReference:
         )
         inside += np.minimum(time - self.knots[0], 0.0) * first + np.maximum(time - self.knots[-1], 0.0) * last
         return inside + 2 * np.pi * self.frequency * time
+
+    def relative_phase(self, time: Array, phasors: Complex) -> Array:
+        """Phase of ``phasors`` less psi at ``time`` [s]: [rad], without jumps, within half a turn at first."""
+        return unwrap_phase(np.angle(phasors * np.exp(-1j * self.phase(time))))
 
     def frequency_at(self, time: Array) -> Array:
         """Frequency of the reference, psi' / 2 pi, at ``time`` [s]: shape (n,) [Hz]."""

@@ -31,7 +31,7 @@ from scanner.channel import Channel, check_signal, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
-from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block, unwrap_phase
+from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 from scanner.stages import Position
@@ -180,7 +180,7 @@ def axis_motion_from_angle(
     amplitude = np.abs(phasors)
     if noise_sd is None:
         noise_sd = white_noise_sd(angle[:NOISE_SAMPLES])
-    phase = unwrap_phase(np.angle(phasors) - reference.phase(time))
+    phase = reference.relative_phase(time, phasors)
     return AxisMotion(
         time=time,
         phase=phase,

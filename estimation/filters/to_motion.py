@@ -15,7 +15,7 @@ from estimation.reference import PhaseReference
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
-from scanner.lock_in import block_phasors, slow_clock_block, unwrap_phase
+from scanner.lock_in import block_phasors, slow_clock_block
 from scanner.motion import AxisMotion, SampledAngle
 
 BLOCK_CYCLES = 4.0
@@ -75,7 +75,7 @@ def axis_motion_from_filter(
             channel=channel.name,
             hint="record for longer",
         )
-    phase = unwrap_phase(np.angle(phasors) - reference.phase(time))
+    phase = reference.relative_phase(time, phasors)
     phase += 2 * np.pi * np.round((problem.start.axes[name].phase - phase[0]) / (2 * np.pi))
     track_sample = np.arange(filtered.track.shape[1]) * filtered.stride + filtered.stride
     variance = _phase_variance(filtered.theta[i, track_sample], filtered.track[i], 2 * np.pi * f)

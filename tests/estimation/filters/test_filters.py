@@ -287,6 +287,7 @@ def test_sensor_estimator_uses_position_readouts() -> None:
     axis = estimate(recording, device).axes["x"]
     assert axis.sign == "known: sense_x"
     assert np.allclose(axis.angle.values, recording["sense_x"].read() / 10.0)
+    assert abs(axis.phase[0]) <= np.pi
 
 
 def test_error_of_an_unknown_estimator_lists_the_known_ones() -> None:
