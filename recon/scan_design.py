@@ -336,9 +336,15 @@ def design(
     candidates = [candidate for candidate in evaluated if candidate.fill["worst"] > 0.0]
     if not candidates:
         raise BadInput("the scan visits no pixel", hint="give a larger field, or more samples a second")
-    order = ("at any phase", "at the best phase", "no")
-    candidates.sort(key=lambda c: (order.index(c.fill_reached(requirements.fill)), c.figure.frame_rate, c.gap["worst"]))
-    return bands, candidates
+    return bands, sorted(candidates, key=lambda candidate: _rank(candidate, requirements.fill))
+
+
+def _rank(candidate: ScanCandidate, fill: float) -> tuple[float, ...]:
+    """Sort key of pairs: those that reach ``fill``, nearest to the frame rate first; of the others the most filled."""
+    reached = candidate.fill_reached(fill)
+    order = ("at any phase", "at the best phase", "no").index(reached)
+    first = -candidate.fill["worst"] if reached == "no" else candidate.figure.frame_rate
+    return order, first, candidate.gap["worst"]
 
 
 def _evaluate_figure(

@@ -189,6 +189,9 @@ def test_the_fill_at_the_worst_phase_is_below_that_at_the_best() -> None:
     _, candidates = design(devices.load("imaging"), requirements, (30.0, 30.0))
     assert all(candidate.fill["worst"] <= candidate.fill["best"] for candidate in candidates)
     assert {"best", "worst"} == {candidate.phases["worst"] for candidate in candidates}
+    fills = [candidate.fill["worst"] for candidate in candidates]
+    assert len(set(fills)) > 1
+    assert fills == sorted(fills, reverse=True)  # none reaches the required fill
 
 
 def test_an_infinite_frame_rate_is_refused() -> None:
