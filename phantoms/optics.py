@@ -22,8 +22,8 @@ FWHM_PER_SD = 2 * math.sqrt(2 * math.log(2))
 MIN_SPOT_PX = 0.5
 """Least standard deviation of a spot [scene pixels]: a sampled Gaussian is 7 % too narrow there, 0.1 % at 0.7."""
 
-MAX_PHOTONS = 1e15
-"""Most photons in a sample: doubles represent their counts exactly, and numpy draws them."""
+MAX_PHOTONS = 1e18
+"""Most photons in a sample: numpy draws numbers of a Poisson distribution up to a mean of 9e18."""
 
 MAX_BITS = 24
 """Most bits of a converter: float32 represents their codes exactly."""
