@@ -95,20 +95,25 @@ def find_z_slices(position: Channel, intensity: Channel, step: float | None = No
         list(zip(first[kept].tolist(), end[kept].tolist(), strict=True)),
         tuple(samples[kept].tolist()),
         lambda begin, stop: number[labels(begin, stop)],
-        (*_describe(blocks, kept.size, 1.0 - samples.sum() / intensity.size), *varying),
+        (*_describe(blocks, kept.size, 1.0 - samples.sum() / intensity.size, step), *varying),
     )
 
 
-def _describe(blocks: PositionBlocks, slices: int, unassigned: float) -> list[str]:
+def _describe(blocks: PositionBlocks, slices: int, unassigned: float, step: float | None) -> list[str]:
     """Notes on missing samples, a single slice and the samples of the intensity without a slice."""
     notes = []
+    travel = blocks.most - blocks.least
     if blocks.missing:
         notes.append(f"position_z: {blocks.missing} samples are not finite; the intensity there belongs to no slice")
-    if blocks.most - blocks.least > MAX_TRAVEL_M:
-        travel = blocks.most - blocks.least
+    if travel > MAX_TRAVEL_M:
         notes.append(f"position_z: moves by {travel:.4g} m; no objective does: check its unit")
     if slices == 1:
-        why = "does not change beyond its noise" if blocks.constant else "has one position only"
+        if blocks.constant:
+            why = "does not change beyond its noise"
+        elif step is None:
+            why = "has one position only"
+        else:
+            why = f"a step of {step:.3g} m does not divide the travel of {travel:.3g} m"
         notes.append(f"position_z: {why}: the stack has a single slice")
     if unassigned > 0.0:
         notes.append(

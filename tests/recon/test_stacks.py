@@ -87,6 +87,12 @@ def test_steps_are_the_centres_of_the_slices_that_are_sorted_by_z() -> None:
     assert sum(slices.samples) == LIGHT.size
 
 
+def test_a_step_larger_than_the_travel_makes_one_slice_with_a_note() -> None:
+    slices = find_z_slices(z_channel(10e-6 * times() / times()[-1]), LIGHT, 1.0)
+    note = "position_z: a step of 1 m does not divide the travel of 1e-05 m: the stack has a single slice"
+    assert slices.notes == (note,)
+
+
 @pytest.mark.parametrize("rate", [2e3, 20e3, 100e3])
 @pytest.mark.parametrize("gap", [1.5, 2.0])
 def test_positions_closer_than_the_noise_that_become_one_slice_are_noted(gap: float, rate: float) -> None:
