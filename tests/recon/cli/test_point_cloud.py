@@ -1,5 +1,6 @@
 """``lissajous point-cloud``: rays of a mirror, points of a wall, files, bad input in one line."""
 
+import base64
 import json
 import re
 import sys
@@ -15,6 +16,7 @@ from recon.cli import main
 from recon.io.point_files import write_points
 from recon.point_cloud import make_point_cloud
 from recon.reconstruction import Options
+from recon.report.point_cloud import draw_view
 from scanner import devices
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -163,3 +165,11 @@ def test_geometry_is_read_and_written_with_the_device() -> None:
     for wrong in ('kind = "prism"', 'order = "xz"', "incidence = 45", "range_sd = -1"):
         with pytest.raises(BadInput, match="geometry"):
             Device.from_toml(f"[x.mechanics]\nJ = 1\nb = 1\nk = 1\n[geometry]\n{wrong}")
+
+
+def test_a_colour_bar_of_equal_distances_does_not_show_the_rounding_of_the_arithmetic() -> None:
+    across, distance = np.linspace(-1.0, 1.0, 50), np.linspace(1.0, 1.0 + 1e-14, 50) * 2.0
+    picture = draw_view(across, across, distance, "x [m]", "y [m]", "distance [m]")
+    labels = re.findall("<!-- (.*?) -->", base64.b64decode(picture.partition(",")[2]).decode())
+    assert "2.00" in labels
+    assert max(map(len, labels)) == len("distance [m]")
