@@ -104,6 +104,6 @@ def describe_drift(drifts: Sequence[IntensityDrift | None], unit: str) -> list[s
             lines.append(f"{detector}: no {drift.kind} drift was found")
             continue
         size = f"{change:.3g} {unit} rms" if drift.kind == "offset" else f"{100 * change:.3g} % rms"
-        error = f"{sd:.1g} {unit}" if drift.kind == "offset" else f"{100 * sd:.1g} %"
+        error = f"{sd:.2g} {unit}" if drift.kind == "offset" else f"{100 * sd:.2g} %"
         lines.append(f"{detector}: {drift.kind} drift of {size}, known to {error} at each moment, was removed")
     return lines

@@ -70,6 +70,14 @@ def falling(recording: Recording) -> Recording:
     return recording.with_channel(replace(intensity, raw=intensity.read() * np.linspace(1.0, 0.75, intensity.size)))
 
 
+def test_a_change_of_the_gain_is_written_without_powers_of_ten() -> None:
+    gain = SlowGain(np.array([0.5, -0.5]), np.diag([0.1, 0.1]) ** 2)
+    (note,) = describe_slow_gain([gain])
+    assert "fall by 63.2 % ± 5.2 % during" in note
+    (note,) = describe_slow_gain([gain._replace(log_gain=-gain.log_gain)])
+    assert "rise by 172 % ± 38 % during" in note
+
+
 def test_a_falling_gain_does_not_change_the_phase_and_is_reported_once() -> None:
     """Attributed to the phase, it shifts y by 0.19° with a stated standard deviation of 0.04°."""
     recording, simulation = simulate_experiment(Experiment(target="immunohistochemistry", duration=0.03), 34000)
@@ -80,5 +88,5 @@ def test_a_falling_gain_does_not_change_the_phase_and_is_reported_once() -> None
         difference = fallen.motion.axes[axis].phase - steady.motion.axes[axis].phase
         assert np.max(np.abs(difference)) < 0.5 * np.min(sd)
         np.testing.assert_allclose(fallen.motion.axes[axis].phase_sd, sd, rtol=0.25)
-    assert sum("fall by 25 %" in note and "--intensity-drift gain" in note for note in fallen.notes) == 1
+    assert sum("fall by 25" in note and "--intensity-drift gain" in note for note in fallen.notes) == 1
     assert not any("--intensity-drift" in note for note in steady.notes)
