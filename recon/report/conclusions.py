@@ -15,6 +15,10 @@ SHARP_FRACTION = 0.99
 """Fraction of the scan within the bound p/m from which a picture is called sharp: blur in the remaining hundredth of
 the samples is not visible."""
 
+MIN_USABLE_FRACTION = 0.5
+"""Fraction of the scan within the bound below which a picture is called blurred, and no estimator is recommended: most
+samples are then in a wrong pixel."""
+
 MIN_READOUT_ERROR_SD = 3.0
 """Phase error of the readout in standard deviations from which it is stated: chance exceeds it in 0.3 % of readouts."""
 
@@ -34,7 +38,7 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
     key, what = ("phase_rmse_deg", "the phase error is") if measured else ("phase_sd_deg", "the phase is known to")
     errors = " and ".join(f"{_degrees(summary[axis][key])} in {axis}" for axis in axes)
     bounds = sorted({f"{summary[axis]['bound_deg']:.3f}°" for axis in axes})
-    verdict = "sharp" if within >= SHARP_FRACTION else "partly blurred" if within >= 0.5 else "blurred"
+    verdict = "sharp" if within >= SHARP_FRACTION else "partly blurred" if within >= MIN_USABLE_FRACTION else "blurred"
     limits = "".join(f"{limit[0].upper()}{limit[1:]}. " for limit in summary["limits"])
     subject = "The motion alone would give a picture that is" if limits else "The picture is"
     text = f"{limits}{_describe_readout_phase(summary)}" + (
@@ -212,8 +216,14 @@ def conclude_study(summary: Mapping[str, Any]) -> str:
         return f"None of {_count(summary['cells'], 'cell')} was computed; the reasons are listed below."
     best = min(statistics, key=lambda name: statistics[name]["phase_rmse_deg_median"])
     values = statistics[best]
+    usable = values["within_bound"] >= MIN_USABLE_FRACTION
+    subject = (
+        f"Use {best}: its phase error is the smallest"
+        if usable
+        else f"No estimator is accurate enough: the smallest phase error is that of {best}"
+    )
     text = (
-        f"Use {best}: its phase error is the smallest, {_degrees(values['phase_rmse_deg_median'])} rms (median), "
+        f"{subject}, {_degrees(values['phase_rmse_deg_median'])} rms (median), "
         f"with {values['within_bound']:.1%} of the scan within the bound p/m."
     )
     if summary["failed"]:

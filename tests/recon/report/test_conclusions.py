@@ -6,7 +6,7 @@ import numpy as np
 
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
-from recon.report.conclusions import conclude_reconstruction
+from recon.report.conclusions import conclude_reconstruction, conclude_study
 from recon.report.summary import summarise
 from tests.support.simulated import imaging
 
@@ -27,3 +27,12 @@ def test_only_a_picture_that_shows_its_scene_is_called_sharp() -> None:
     for text in (saturated, conclude(noise)):
         assert "The picture is" not in text
         assert "The motion alone would give a picture that is" in text
+
+
+def test_an_estimator_that_blurs_every_picture_is_not_recommended() -> None:
+    def conclude_single(error_deg: float, within: float) -> str:
+        statistics = {"phase_rmse_deg_median": error_deg, "within_bound": within}
+        return conclude_study({"cells": 1, "failed": 0, "estimators": {"tracker": statistics}})
+
+    assert conclude_single(0.01, 1.0).startswith("Use tracker: its phase error is the smallest")
+    assert conclude_single(97.9, 0.05).startswith("No estimator is accurate enough")
