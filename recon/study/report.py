@@ -100,12 +100,12 @@ def _blur_figure(study: Study, data: Columns) -> Figure:
                 above.loglog(error[x | y], data["blur_phase_px"][x | y], sign, label=label, **style)
                 below.loglog(np.hypot(error[x], error[y]) / np.sqrt(2.0), data["picture_error"][x], sign, **style)
         for panel in (above, below):
+            panel.set_xlabel("phase error, rms [°]")
             for p in study.p:
                 bound = np.degrees(blur.phase_bound(p, pixels / 2))
                 panel.axvline(bound, color="#444", lw=0.8, ls="--")
                 panel.text(bound, 0.98, f" p = {p:g}", transform=panel.get_xaxis_transform(), va="top", fontsize=7)
         above.set_title(f"{pixels} × {pixels} pixels", fontsize=9)
-        below.set_xlabel("phase error, rms [°]")
         for axis in (above.xaxis, above.yaxis, below.xaxis, below.yaxis):
             use_plain_ticks(axis)
     axes[0, 0].set_ylabel("blur by phase, rms [px]")

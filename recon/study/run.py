@@ -68,16 +68,18 @@ def run_study(
             _run_jobs(executor, left, done, file, sum(1 for job in all_jobs for _ in job.cells()))
         records = [done[cell_key(cell)] for job in all_jobs for cell in job.cells()]
         table = table_rows(records)
+        failed = sum("failed" in record for record in records)
         summary = finite(
             {
                 "study": study.name,
                 "output": str(output),
                 "cells": len(records),
                 "computed": len(done) - before,
-                "failed": sum("failed" in record for record in records),
+                "failed": failed,
                 "reasons": sorted({record["failed"] for record in records if "failed" in record}),
                 "rows": len(table),
                 "estimators": estimator_statistics(table),
+                "exit": 2 if failed == len(records) else 0,
                 "seconds": time.perf_counter() - began,
             }
         )

@@ -169,6 +169,12 @@ def test_a_second_run_in_the_same_folder_is_refused(finished_study: Path, capsys
     assert "another run" in capsys.readouterr().err
 
 
+def test_a_study_of_which_no_cell_was_computed_is_not_done(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = small_study(tmp_path, "drifts = [0.0, -0.001]", "drifts = [-1.5]")
+    assert main(["blur-study", str(path), "-o", str(tmp_path / "out"), "--workers", "1"]) == 2
+    assert "drift: is -1.5" in capsys.readouterr().out
+
+
 def test_a_failed_reconstruction_is_a_record_of_the_study(tmp_path: Path) -> None:
     # The drive does not sustain a motion, so every variant fails.
     study = read_study(small_study(tmp_path, "27680.0, 30.0, 30.0", "27680.0, 3.0, 3.0"))
