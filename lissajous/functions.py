@@ -5,11 +5,12 @@ A recording that is given by its path is opened here, and its file is closed whe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -143,6 +144,7 @@ def reconstruct(
         BadInput: the recording or the device lacks what is needed.
     """
     from recon.evaluation import load_truth, truth_from_simulation
+    from recon.imaging.intensity_drift import DriftKind
     from recon.pipeline import reconstruct as reconstruct_recording
     from recon.reconstruction import Options
 
@@ -150,6 +152,11 @@ def reconstruct(
         isinstance(pixels, Sequence) and len(pixels) == 2 and all(isinstance(n, Integral) and n > 0 for n in pixels)
     ):
         raise BadInput(f"is {pixels!r}", channel="pixels", hint="give width and height, as (400, 400)")
+    for name, value in (("p", p), ("spot", spot)):
+        if value is not None and not (isinstance(value, Real) and 0.0 < value < math.inf):
+            raise BadInput(f"is {value!r}", channel=name, hint="give a positive number of pixels")
+    if intensity_drift not in (None, *get_args(DriftKind)):
+        raise BadInput(f"is {intensity_drift!r}", channel="intensity_drift", hint="give 'offset', 'gain' or None")
     options = Options(
         estimator=estimator,
         pixels=pixels,
@@ -167,7 +174,7 @@ def reconstruct(
     elif sample_rate is not None:
         raise BadInput("is for arrays; a recording has its own rates", channel="sample_rate", hint="leave it out")
     known = truth_from_simulation(truth) if truth is not None else None
-    if known is None and not isinstance(recording, Recording) and mapping is None:
+    if known is None and isinstance(recording, (str, Path)) and mapping is None:
         known = load_truth(Path(recording))
     return reconstruct_recording(_opened(recording, device, mapping), options, known, quiet=True)
 
@@ -255,6 +262,9 @@ def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: Ma
     """The recording, opened if a path is given; ``device``, if given, replaces the device of the recording."""
     from recon.io.convert import open_any
 
+    if not isinstance(recording, (Recording, str, Path)):
+        hint = "give a Recording (Recording.from_arrays makes one of arrays) or the path of a file"
+        raise BadInput(f"is a {type(recording).__name__}, no recording", channel="recording", hint=hint)
     if not isinstance(recording, Recording):
         recording = open_any(Path(recording), None if mapping is None else _as_mapping(mapping))
     return recording if device is None else replace(recording, device_toml=load_device(device).to_toml())
@@ -286,7 +296,9 @@ def _as_list(recordings: RecordingSource | Sequence[RecordingSource]) -> list[Re
     Raises:
         BadInput: there are none.
     """
-    listed = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
+    if isinstance(recordings, (Recording, str, Path)) or not isinstance(recordings, Iterable):
+        return [recordings]
+    listed = list(recordings)
     if not listed:
         raise BadInput("holds none", channel="recordings", hint="give a recording, the path of one, or several of them")
     return listed

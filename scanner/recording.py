@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Device
+from scanner.devices import find
 from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput, ChannelMissing
 from scanner.files import replacing
@@ -96,7 +97,7 @@ class Recording:
     def from_arrays(
         cls,
         channels: Mapping[str, tuple[Any, ...]],
-        device: Device | None = None,
+        device: Device | str | Path | None = None,
         name: str | None = None,
         detectors: Sequence[str] = (),
         **attrs: Any,
@@ -115,7 +116,7 @@ class Recording:
                 where it is left out. Channels may differ in sample rate, start and length. ``sync_x`` and ``sync_y``
                 are (edge times, unit, attributes), as ``(times, "s", {"event": "both-edges", "angle": 0.01})``. After
                 start, ``amplitude_x`` and ``phase_x`` may have {"reference": ..., "level": ...} as well.
-            device: the nominal device.
+            device: the nominal device, the name of one that comes with the program, or the path of a device file.
             name: of the recording.
             detectors: names of the columns of ``intensity``.
             attrs: further attributes of the recording (``notes``, ``acquired``).
@@ -144,7 +145,7 @@ class Recording:
                 key, raw, unit=unit, sample_rate=sample_rate, start=first, detectors=names, **stated
             )
         attrs = ({} if name is None else {"name": name}) | attrs
-        text = None if device is None else device.to_toml()
+        text = None if device is None else find(device).to_toml()
         return cls(MappingProxyType(made), MappingProxyType(attrs), device_toml=text, edges=MappingProxyType(edges))
 
     def __repr__(self) -> str:

@@ -19,9 +19,14 @@ def phase_bound(p: float, m: float) -> float:
         p: tolerated displacement [px].
         m: half the number of pixels across.
 
+    Raises:
+        BadInput: one of them is not positive.
+
     Source:
         Chen et al. (2020), eq (7).
     """
+    if not (p > 0.0 and m > 0.0):
+        raise BadInput(f"p = {p} and m = {m}", hint="give positive numbers of pixels")
     return p / m
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -142,3 +143,36 @@ def test_arrays_are_reconstructed_without_a_file() -> None:
         lissajous.reconstruct({"drive_x": arrays["drive_x"]}, recording.device)
     with pytest.raises(lissajous.BadInput, match="sample_rate: is for arrays"):
         lissajous.reconstruct(cut, sample_rate=5e6)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"p": 0}, "p: is 0; give a positive number of pixels"),
+        ({"p": "1"}, "p: is '1'"),
+        ({"spot": -1.0}, "spot: is -1.0"),
+        ({"intensity_drift": "bleaching"}, "intensity_drift: is 'bleaching'; give 'offset', 'gain' or None"),
+    ],
+)
+def test_reconstruct_refuses_a_value_without_a_meaning(option: dict, message: str) -> None:
+    with pytest.raises(lissajous.BadInput, match=message):
+        lissajous.reconstruct(imaging()[0], **option)
+
+
+@pytest.mark.parametrize("function", [lissajous.estimate, lissajous.reconstruct, lissajous.diagnose, lissajous.predict])
+@pytest.mark.parametrize("source", [None, 3, np.zeros(5)])
+def test_what_is_no_recording_is_named(function: Callable, source: object) -> None:
+    with pytest.raises(lissajous.BadInput, match=r"recording: is a \w+, no recording; give a Recording"):
+        function(source)
+
+
+def test_from_arrays_takes_the_name_of_a_device() -> None:
+    recording = lissajous.Recording.from_arrays({"sense": (np.zeros(3), "V", 1e3)}, "imaging")
+    assert recording.device == lissajous.load_device("imaging")
+
+
+def test_a_bound_needs_positive_numbers_of_pixels() -> None:
+    assert lissajous.phase_bound(1, 200) == 0.005
+    for p, m in ((0.0, 200), (1, 0), (-1, -3)):
+        with pytest.raises(lissajous.BadInput, match="give positive numbers of pixels"):
+            lissajous.phase_bound(p, m)
