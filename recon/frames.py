@@ -143,12 +143,14 @@ def frames(
         z_step: thickness of a slice [m]: samples are sorted by z, whether it rests or not.
 
     Raises:
-        BadInput: a number is not positive; a frame or a slice would hold less than one sample; slices are asked for,
-            and ``position_z`` is missing or does not rest.
+        BadInput: a number is not positive; both count and time are given; a frame or a slice would hold less than one
+            sample; slices are asked for, and ``position_z`` is missing or does not rest.
     """
     for name, value in (("count", count), ("frame_time", frame_time), ("z_step", z_step)):
         if value is not None and not 0.0 < value < math.inf:
             raise BadInput(f"is {value}", channel=name, hint="give a positive number")
+    if count is not None and frame_time is not None:
+        raise BadInput("is given beside a count", channel="frame_time", hint="give one of the two")
     intensity = result.intensity
     unlocated = to_sample_ranges(unrecoverable_intervals(result.motion, result.defects), intensity)
     if z_step is not None and (count or frame_time):

@@ -17,6 +17,7 @@ from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
 from recon.report.movie import draw_frame
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.recording import Recording
 from tests.support.simulated import imaging
 
@@ -106,6 +107,11 @@ def test_options_of_frames_need_frames(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.slow
+def test_frames_by_number_and_by_time_at_once_are_refused(result: Reconstruction) -> None:
+    with pytest.raises(BadInput, match="frame_time: is given beside a count"):
+        frames(result, 2, frame_time=0.001)
+
+
 def test_a_folder_of_frames_is_replaced(tmp_path: Path) -> None:
     recording, _ = imaging()
     recording.write(tmp_path / "scan.h5")
