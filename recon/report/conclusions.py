@@ -179,6 +179,12 @@ def conclude_prediction(summary: Mapping[str, Any]) -> str:
         return "The recording has no channel that the device predicts."
     worst = max(channels, key=lambda name: channels[name]["nrmse"])
     channel = channels[worst]
+    if channel["nrmse"] >= 1.0:
+        return (
+            f"From the drive alone {summary['device']} does not predict {worst}: they differ by {channel['nrmse']:.2g} "
+            "times the signal, no less than without a prediction. Check sign, unit and axis of the channel, then run "
+            "lissajous diagnose to find what the device lacks."
+        )
     text = (
         f"From the drive alone {summary['device']} predicts "
         + {1: "the channel", 2: "both channels"}.get(len(channels), f"all {len(channels)} channels")

@@ -6,7 +6,7 @@ import numpy as np
 
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
-from recon.report.conclusions import conclude_reconstruction, conclude_study
+from recon.report.conclusions import conclude_prediction, conclude_reconstruction, conclude_study
 from recon.report.summary import summarise
 from tests.support.simulated import imaging
 
@@ -36,3 +36,12 @@ def test_an_estimator_that_blurs_every_picture_is_not_recommended() -> None:
 
     assert conclude_single(0.01, 1.0).startswith("Use tracker: its phase error is the smallest")
     assert conclude_single(97.9, 0.05).startswith("No estimator is accurate enough")
+
+
+def test_a_prediction_as_far_off_as_none_is_no_prediction() -> None:
+    def conclude_single(nrmse: float) -> str:
+        channel = {"nrmse": nrmse, "rmse": 0.1, "unit": "V", "noise_sd": 0.1}
+        return conclude_prediction({"device": "mirror", "channels": {"sense_x": channel}})
+
+    assert "predicts the channel to 5 % of the signal" in conclude_single(0.05)
+    assert "does not predict sense_x: they differ by 2 times the signal" in conclude_single(2.0)
