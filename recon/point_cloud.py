@@ -120,8 +120,9 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
         located[first:stop] = False
     kept = np.flatnonzero(returned & located)
     if not kept.size:
-        hint = "list the recording's channels with lissajous info"
-        raise BadInput("has no return at a known angle of the mirror", channel="range", hint=hint)
+        span = f"from {cut.start:.4g} to {cut.start + cut.size / cut.sample_rate:.4g} s"
+        hint = "compare its start with those of the motion's channels, which lissajous info lists"
+        raise BadInput(f"has no return at a known angle of the mirror {span}", channel="range", hint=hint)
     geometry = prepared.device.geometry or Geometry()
     angles = {axis: estimated.beam.axes[axis].angle.read()[kept] for axis in AXES}
     when = cut.start + kept / cut.sample_rate

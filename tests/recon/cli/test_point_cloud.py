@@ -130,6 +130,9 @@ def test_recordings_without_intensity_are_used() -> None:
     cloud = make_point_cloud(replace(recording, channels=channels), Options(), quiet=True)
     assert np.isnan(cloud.intensity).all()
     assert np.std(cloud.position[:, 2] - 5.0) < 1.1 * 0.01
+    late = {**channels, "range": replace(channels["range"], start=5.0)}
+    with pytest.raises(BadInput, match=r"no return at a known angle of the mirror from 5 to 5\.0"):
+        make_point_cloud(replace(recording, channels=late), Options(), quiet=True)
 
 
 def test_bad_input_ends_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
