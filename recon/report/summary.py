@@ -31,8 +31,7 @@ MAX_FILL_SAMPLES = 1 << 22
 def picture_phase_error(errors: list[PhaseError], axis: str) -> dict[str, Any]:
     """Phase error that the picture shows [degrees]: of each time slice, and the mean of the slices that determine one.
 
-    Each has its standard error, which is infinite where the picture determines nothing. That of the mean is not less
-    than the scatter of the slices gives: slices that contradict each other do not make a precise mean.
+    Each has its standard error, which is infinite where the picture determines nothing.
     """
     estimates = [getattr(error, axis) for error in errors]
     slices = [
@@ -43,8 +42,7 @@ def picture_phase_error(errors: list[PhaseError], axis: str) -> dict[str, Any]:
     if not determined:
         return {"value": math.nan, "sd": math.inf, "slices": slices}
     value, sd = (np.array(column) for column in zip(*determined, strict=True))
-    scatter = np.var(value, ddof=1) * sd.size if sd.size > 1 else 0.0
-    mean_sd = math.sqrt(max(float(np.sum(sd**2)), float(scatter))) / sd.size
+    mean_sd = math.sqrt(float(np.sum(sd**2))) / sd.size
     return {"value": math.degrees(value.mean()), "sd": math.degrees(mean_sd), "slices": slices}
 
 

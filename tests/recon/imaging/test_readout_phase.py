@@ -25,7 +25,7 @@ from recon.imaging.readout_phase_model import (
 )
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
-from recon.report.summary import picture_phase_error, summarise
+from recon.report.summary import summarise
 from scanner.recording import Recording
 from tests.support.simulated import imaging, with_sense
 
@@ -220,15 +220,6 @@ def test_a_correction_that_the_next_picture_confirms_is_applied() -> None:
     rounds = iter([phase_errors(0.1, 0.0), phase_errors(0.0, 0.0)])
     _, _, found = remove_readout_phase(motion, phase_errors(1.0, 0.5), lambda _: next(rounds))
     assert found["x"].value == pytest.approx(np.radians(1.1), abs=np.radians(0.05))
-
-
-def test_slices_that_contradict_each_other_make_no_precise_mean() -> None:
-    values = np.radians([0.0, -0.2, 5.0, 4.6])
-    nothing = PhaseEstimate(np.nan, np.inf)
-    errors = [PhaseError(float(k), PhaseEstimate(value, 0.003), nothing) for k, value in enumerate(values)]
-    mean = picture_phase_error(errors, "x")
-    assert mean["value"] == pytest.approx(2.35)
-    assert mean["sd"] == pytest.approx(np.degrees(np.std(values, ddof=1)) / 2.0)
 
 
 def featureless() -> Recording:
