@@ -25,7 +25,7 @@ from estimation.tracker.observations import lay_out_blocks
 from estimation.tracker.process_noise import INITIAL_DENSITIES, noise_posterior, tuning_parts, with_offset_density
 from estimation.tracker.track import tune_section
 from phantoms.forward import InitialState, Plan, simulate
-from recon.imaging.readout_phase import UNDESCRIBED_DELAY_SD_S
+from recon.imaging.scan_phase.readout_phase import UNDESCRIBED_DELAY_SD_S
 from scanner import devices
 from scanner.device import AXES, Device
 from scanner.drift import Drift, exponential

@@ -19,7 +19,7 @@ from phantoms.lidar import add_ranges, measure_wall
 from phantoms.raster_film import count_photons, scan_raster_frame
 from phantoms.sync import SyncDetector, sync_edges
 from recon.evaluation import evaluate_axis
-from recon.imaging.line_phase import column_places, lag_at
+from recon.imaging.raster.line_phase import column_places, lag_at
 from scanner import devices
 from scanner.arrays import Array
 from scanner.geometry import Geometry

@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 from phantoms.raster_film import count_photons, scan_raster_frame
 from phantoms.targets import TISSUES, load_tissue
 from recon.film_correction import correct_film
-from recon.imaging.line_phase import column_places, lag_at
+from recon.imaging.raster.line_phase import column_places, lag_at
 from recon.io.film import open_film
 from scanner.arrays import Array
 

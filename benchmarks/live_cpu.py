@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.imaging.bidirectional_phase import slow_period
+from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.live_frames import (
     FrameSums,
     LiveScan,

@@ -20,9 +20,9 @@ from benchmarks.sparse_pictures import (
     scan,
     sum_samples,
 )
-from recon.imaging.kernel_picture import kernel_mean
+from recon.imaging.picture_kinds.kernel_picture import kernel_mean
+from recon.imaging.picture_kinds.posterior_picture import posterior_picture
 from recon.imaging.pixel_noise import measure_sample_noise
-from recon.imaging.posterior_picture import posterior_picture
 from scanner.arrays import Array
 
 ALL_SCENES = (

@@ -24,8 +24,8 @@ import numpy as np
 from scipy.ndimage import shift
 
 from benchmarks.sparse_pictures import SCENES, coverage, load_scene, psnr, scan, sum_samples
+from recon.imaging.picture_kinds.recursive_frames import recursive_picture
 from recon.imaging.pixel_noise import measure_sample_noise
-from recon.imaging.recursive_frames import recursive_picture
 from scanner.arrays import Array
 
 FRAMES = 11

@@ -21,8 +21,8 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector, blur_by_spot, detect, sample_scene
 from phantoms.targets import make_target
 from recon.evaluation import truth_from_simulation
-from recon.imaging.bidirectional_phase import measure_phase_errors
 from recon.imaging.picture import grid_of_scan
+from recon.imaging.scan_phase.bidirectional_phase import measure_phase_errors
 from scanner.arrays import Array
 
 PHOTONS = (130.0, 300.0, 700.0)

@@ -16,13 +16,13 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from estimation.estimate import estimate
-from recon.imaging.held_out import SplitSums
 from recon.imaging.intensity_gridding import grid_intensity
-from recon.imaging.kernel_picture import kernel_picture
 from recon.imaging.picture import Grid, Picture
-from recon.imaging.picture_estimate import estimate_picture
+from recon.imaging.picture_kinds.held_out import SplitSums
+from recon.imaging.picture_kinds.kernel_picture import kernel_picture
+from recon.imaging.picture_kinds.picture_estimate import estimate_picture
+from recon.imaging.picture_kinds.posterior_picture import posterior_picture
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
-from recon.imaging.posterior_picture import posterior_picture
 from recon.io.convert import convert
 from scanner.arrays import Array
 

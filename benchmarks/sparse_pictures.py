@@ -16,11 +16,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from recon.imaging.held_out import SplitSums, held_out_ranges, hold_out_neighbours
-from recon.imaging.kernel_picture import kernel_picture
 from recon.imaging.picture import Grid, Picture, fill_holes
+from recon.imaging.picture_kinds.held_out import SplitSums, held_out_ranges, hold_out_neighbours
+from recon.imaging.picture_kinds.kernel_picture import kernel_picture
+from recon.imaging.picture_kinds.posterior_picture import posterior_picture
 from recon.imaging.pixel_noise import measure_sample_noise
-from recon.imaging.posterior_picture import posterior_picture
 from recon.imaging.smoothing import kernel_mean
 from scanner.arrays import Array
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from estimation.diagnosis.diagnose import Diagnosis
     from estimation.identification.calibrate import Identification
     from recon.imaging.intensity_drift import DriftKind
-    from recon.imaging.picture_estimate import PictureKind
+    from recon.imaging.picture_kinds.picture_estimate import PictureKind
     from recon.reconstruction import Reconstruction
     from scanner.motion import Motion
 

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from estimation.optics.correction import beam_motion
-from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.intensity_drift import IntensityDrift
 from recon.imaging.picture import Grid
-from recon.imaging.readout_phase_model import ReadoutPhase
-from recon.imaging.sample_motion import SampleMotion
-from recon.imaging.sample_motion_correction import relative_to_sample
+from recon.imaging.sample_motion.correction import relative_to_sample
+from recon.imaging.sample_motion.rigid_motion import SampleMotion
+from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.preparation import PreparedRecording
 from scanner.motion import Motion
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.rail import upper_rail
-from recon.imaging.film_phase import FilmModel, fit_film, own_phase
+from recon.imaging.raster.film_phase import FilmModel, fit_film, own_phase
 from scanner.errors import BadInput
 
 MAX_REPEATED_LINES = 0.25

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from recon.film_checks import check_repeated_lines, describe_columns, describe_saturation
-from recon.imaging.film_equations import PooledEquations
-from recon.imaging.film_phase import FilmModel, fit_film, frame_phase, share_equations, with_reference
-from recon.imaging.line_phase import BLOCKS_ACROSS, MAX_SHIFT_SD_PX
-from recon.imaging.line_shift import correct_frame, to_dtype
-from recon.imaging.phase_smoothing import smooth_phases
+from recon.imaging.raster.film_equations import PooledEquations
+from recon.imaging.raster.film_phase import FilmModel, fit_film, frame_phase, share_equations, with_reference
+from recon.imaging.raster.line_phase import BLOCKS_ACROSS, MAX_SHIFT_SD_PX
+from recon.imaging.raster.line_shift import correct_frame, to_dtype
+from recon.imaging.raster.phase_smoothing import smooth_phases
 from recon.io.film import Film, write_film
 from recon.io.output import finite
 from scanner.arrays import Array

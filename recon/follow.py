@@ -25,8 +25,8 @@ from tqdm import tqdm
 from estimation.estimate import estimate
 from recon.growing_recording import Snapshot, common_time_span, poll_recording
 from recon.imaging import blur
-from recon.imaging.bidirectional_phase import slow_period
-from recon.imaging.readout_phase_model import ReadoutPhase
+from recon.imaging.scan_phase.bidirectional_phase import slow_period
+from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.interrupts import acknowledge_stop
 from recon.io.output import check_folder
 from recon.live_frames import (

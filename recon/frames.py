@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from recon.frame_axis import FrameAxis, position_axis
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, fill_holes
-from recon.imaging.picture_estimate import EstimatedPicture, estimate_picture
+from recon.imaging.picture_kinds.picture_estimate import EstimatedPicture, estimate_picture
 from recon.imaging.pixel_noise import MAX_NOISE_SAMPLES, measure_noise
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.io.ome_zarr import write_ome_zarr

@@ -17,19 +17,19 @@ import numpy as np
 
 from estimation.tracker import track_end
 from recon.estimated_motion import EstimatedMotion
-from recon.imaging.bidirectional_phase import slow_period
-from recon.imaging.carried_readout_phase import apply_readout_phase, update_readout_phase
-from recon.imaging.held_out import held_out_ranges
 from recon.imaging.intensity_gridding import PixelSums, add_samples, add_scattered, empty_sums
 from recon.imaging.picture import Grid, Picture
-from recon.imaging.picture_estimate import (
+from recon.imaging.picture_kinds.held_out import held_out_ranges
+from recon.imaging.picture_kinds.picture_estimate import (
     EstimatedPicture,
     kernel_widths,
     picture_of_sums,
     picture_without_sd,
 )
 from recon.imaging.pixel_noise import SampleNoise, measure_noise
-from recon.imaging.readout_phase_model import ReadoutPhase
+from recon.imaging.scan_phase.bidirectional_phase import slow_period
+from recon.imaging.scan_phase.carried_readout_phase import apply_readout_phase, update_readout_phase
+from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.io.output import write_tiff
 from recon.phase_and_drift import measure_phase_errors, wants_readout_phase
 from recon.pipeline import estimate_motion

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from estimation.rail import upper_rail
-from recon.imaging.doubled_frequency import describe_doubled_axes
-from recon.imaging.phase_agreement import describe_contradictions
 from recon.imaging.picture import Grid, detector_names
 from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
+from recon.imaging.scan_phase.doubled_frequency import describe_doubled_axes
+from recon.imaging.scan_phase.phase_agreement import describe_contradictions
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
 from recon.quality.defects import Defect, describe_clipped_positions

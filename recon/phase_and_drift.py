@@ -10,15 +10,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from recon.estimated_motion import EstimatedMotion
-from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors
 from recon.imaging.intensity_correction import (
     correct_drift,
     describe_drift,
     exceeds_uncertainty,
     measure_intensity_drift,
 )
-from recon.imaging.readout_phase import describe_readout_phase, remove_readout_phase
-from recon.imaging.slow_gain import describe_slow_gain
+from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_motion_phase_errors
+from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
+from recon.imaging.scan_phase.slow_gain import describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice, register_slices_separately
 from recon.reconstruction import Options
 from recon.registration_segments import registration_segments

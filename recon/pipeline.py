@@ -18,13 +18,13 @@ from estimation.estimate import default_estimator, estimate
 from recon.estimated_motion import EstimatedMotion
 from recon.evaluation import Truth, evaluate_axis
 from recon.field_check import check_field, check_units, own_half_angle
-from recon.imaging.image_phase import refine_motion
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
 from recon.imaging.picture import Grid, Picture, grid_of_scan
-from recon.imaging.picture_estimate import estimate_picture
+from recon.imaging.picture_kinds.picture_estimate import estimate_picture
 from recon.imaging.pixel_noise import measure_noise
-from recon.imaging.sample_motion_correction import describe_sample_motion, measure_sample_motion
+from recon.imaging.sample_motion.correction import describe_sample_motion, measure_sample_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
+from recon.imaging.scan_phase.image_phase import refine_motion
 from recon.notes import (
     describe_clock_jumps,
     describe_coarse_sampling,

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from recon.evaluation import AxisEvaluation, Truth
 from recon.imaging import blur
-from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.intensity_drift import DriftKind, IntensityDrift
 from recon.imaging.picture import Picture
-from recon.imaging.picture_estimate import PictureKind
+from recon.imaging.picture_kinds.picture_estimate import PictureKind
 from recon.imaging.pixel_noise import SampleNoise
-from recon.imaging.readout_phase_model import ReadoutPhase
-from recon.imaging.sample_motion import SampleMotion
+from recon.imaging.sample_motion.rigid_motion import SampleMotion
+from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.preparation import DeviceSource
 from recon.quality.defects import Defect
 from scanner.channel import Channel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.optics.readout_effects import ReferencePhase
-from recon.imaging.readout_phase import measured_phase_error
+from recon.imaging.scan_phase.readout_phase import measured_phase_error
 from recon.phase_and_drift import correct_readout_phase
 from recon.pipeline import estimate_motion
 from recon.preparation import prepare

@@ -15,10 +15,10 @@ from benchmarks.papers.figures import Results, entry, figure
 from benchmarks.papers.phase import rms
 from phantoms.optics import Detector, blur_by_spot, detect, sample_scene
 from phantoms.targets import load_tissue
-from recon.imaging.bidirectional_phase import measure_phase_errors
 from recon.imaging.blur import compare_with_scene, phase_bound
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
+from recon.imaging.scan_phase.bidirectional_phase import measure_phase_errors
 from recon.report.figures import fill_small_holes
 from scanner.arrays import Array
 

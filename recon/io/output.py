@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from recon.frame_axis import FrameAxis
 from recon.imaging.picture import Grid, Picture
-from recon.imaging.sample_motion import SampleMotion
+from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.files import IS_REPLACING, check_no_input, check_writable

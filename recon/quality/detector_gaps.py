@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.imaging.bidirectional_phase import slow_period
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid, Picture
+from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.sample_ranges import SampleRanges, runs_of_true, subtract_ranges
 from scanner.arrays import Array
 from scanner.channel import Channel

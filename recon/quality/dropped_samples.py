@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
 from recon.imaging.gridding import map_samples, pixel_index
 from recon.imaging.picture import Grid
+from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples
 from scanner.device import AXES

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from recon.film_correction import CorrectedFilm
-from recon.imaging.line_phase import lag_at
+from recon.imaging.raster.line_phase import lag_at
 from recon.io.film import Film
 from recon.report.figures import (
     COLOURS,

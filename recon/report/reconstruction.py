@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.picture import Grid
-from recon.imaging.sample_motion_correction import describe_sample_motion
+from recon.imaging.sample_motion.correction import describe_sample_motion
 from recon.io.output import pixel_size
 from recon.reconstruction import Reconstruction
 from recon.report.conclusions import conclude_reconstruction, describe_stack

@@ -11,9 +11,9 @@ import numpy as np
 from recon.evaluation import AxisEvaluation
 from recon.frame_axis import position_axis
 from recon.imaging import blur
-from recon.imaging.bidirectional_phase import PhaseError
 from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
+from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.reconstruction import Reconstruction
 from recon.z_rests import cut_to_intensity, read_blocks
 from recon.z_slices import ZSlices

@@ -22,7 +22,7 @@ from estimation.tracker import track_end
 from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.follow import follow_recording, repeat_time
-from recon.imaging.carried_readout_phase import apply_readout_phase
+from recon.imaging.scan_phase.carried_readout_phase import apply_readout_phase
 from recon.live_frames import (
     add_part,
     finish_frame,

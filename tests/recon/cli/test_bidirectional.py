@@ -13,9 +13,9 @@ import tifffile
 from phantoms.raster_film import count_photons, scan_raster_frame
 from recon.cli import main
 from recon.film_correction import correct_film
-from recon.imaging.film_phase import fit_film, frame_phase, own_phase, with_reference
-from recon.imaging.line_shift import correct_frame, to_dtype
-from recon.imaging.phase_smoothing import smooth_phases
+from recon.imaging.raster.film_phase import fit_film, frame_phase, own_phase, with_reference
+from recon.imaging.raster.line_shift import correct_frame, to_dtype
+from recon.imaging.raster.phase_smoothing import smooth_phases
 from recon.io.film import open_film
 
 FILL = 0.85

@@ -1,0 +1,168 @@
+"""Rigid motion of the sample during a scan, estimated at the crossings of the scan path.
+
+1. At rest: the equations of each block around no motion (``block_equations``), and the likelihood of a walk
+   and of vibrations over rest (``motion_smoother``). Without a gain of ``MIN_LOG_LIKELIHOOD_GAIN``, here or at the end,
+   nothing is reported.
+2. Coarse: parts of ``SEARCH_PERIODS`` by exhaustive comparison (``coarse_search``).
+3. Fine: Gauss-Newton over blocks of one period of the slower axis. Every round maps the samples with the present
+   motion, and smooths the equations of all blocks. Kernels become narrower from round to round.
+4. Left: the variance of a motion that both halves of the scene show after that (``residual``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.imaging.sample_motion.block_equations import PARTS, ScanSamples, block_equations
+from recon.imaging.sample_motion.coarse_search import search_motion
+from recon.imaging.sample_motion.jumps import MotionKnots, place_jumps
+from recon.imaging.sample_motion.motion_smoother import SmoothedMotion, part_shift, smooth_motion
+from recon.imaging.sample_motion.residual import residual_variance
+from recon.imaging.sample_motion.vibrations import Vibration
+from scanner.arrays import Array
+from scanner.channel import Channel
+
+SEARCH_PERIODS = 12
+"""Periods of the slower axis in a part of the coarse search: fewer visit too little of the picture."""
+
+WIDTHS_PX = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
+"""Kernels that are compared [px]. Below 0.7 the gradient is that of single pixels."""
+
+COARSE_WIDTHS_PX = (4.0, 2.8, 2.0)
+"""Kernels of the first rounds after the search, whose error is up to its cell of two pixels."""
+
+MAX_ROUNDS = 8
+"""Rounds with the narrowest kernel at most; three or four are usual."""
+
+CONVERGED_SD = 0.1
+"""Change of the motion, in its standard deviations, below which the rounds end."""
+
+MIN_LOG_LIKELIHOOD_GAIN = 10.0
+"""Gain of the log likelihood from which a motion is reported. Chance exceeds it with a probability of exp(-10) = 5e-5
+for the two variances of the walk (Wilks 1938)."""
+
+MIN_BLOCKS = 16
+"""Least number of blocks: with fewer the noise of the equations is not known."""
+
+MIN_INFORMATION = 1e-8
+"""Information on a position in a scene without structure [1/px²]: the field is narrower than 10^4 pixels."""
+
+MIN_COMPARED = 0.5
+"""Fraction of the samples that need samples of other blocks within reach of the narrowest kernel, at crossings."""
+
+
+@dataclass(frozen=True)
+class SampleMotion:
+    """Translation of the sample over time; its mean over the recording is 0.
+
+    Attributes:
+        length: samples in a block, a period of the slower axis.
+        sample: sample numbers of the knots between which the displacement is linear: the middles of blocks, of their
+            parts where the sample vibrates, and two knots at each jump, shape (knots,).
+        shift: x and y at the knots, shape (knots, 2) [px]; 0 for a sample at rest.
+        sd: of ``shift``, shape (knots, 2) [px]; for a sample at rest that of the position of a single block.
+        moving: whether a motion was found.
+        gain: of the log likelihood by the motion over rest.
+        left: standard deviation of a motion in x and y that was not followed, shape (2,) [px]; 0 where none is
+            significant. ``sd`` contains it.
+        vibrations: that were found; frequencies in cycles per sample, amplitudes in pixels.
+    """
+
+    length: int
+    sample: Array
+    shift: Array
+    sd: Array
+    moving: bool
+    gain: float
+    left: Array
+    vibrations: tuple[Vibration, ...]
+
+    def times(self, intensity: Channel) -> Array:
+        """Times of the knots on the clock of the intensity that the motion was estimated from, shape (knots,) [s]."""
+        return np.asarray(intensity.start + self.sample / intensity.sample_rate)
+
+    def at(self, sample: Array) -> Array:
+        """Displacement at sample numbers, shape (2, n) [px]."""
+        return np.stack([np.interp(sample, self.sample, each) for each in self.shift.T])
+
+
+def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int, int]) -> SampleMotion | None:
+    """Estimate the motion of the sample; None where the scan has too few crossings.
+
+    Args:
+        samples: of the scan.
+        period: of the slower axis [samples].
+        shape: height and width of the picture [px].
+    """
+    part = max(round(period / PARTS), 1)
+    length = part * PARTS
+    blocks = -(-samples.x.size // length)
+    if blocks < MIN_BLOCKS:
+        return None
+    position = np.zeros((blocks, 2))
+    at_rest = part_shift(position, [])
+    width, compared = choose_width(samples, at_rest, part, shape)
+    if compared < MIN_COMPARED:
+        return None
+    equations = block_equations(samples, at_rest, part, shape, width)
+    first = final = smooth_motion(equations, position, jumps=False)
+    if first.gain >= MIN_LOG_LIKELIHOOD_GAIN:
+        start = first._replace(position=_coarse_motion(samples, length, blocks, shape), vibrations=[])
+        final, width = _follow(samples, start, part, shape)
+    gain = min(first.gain, final.gain)
+    moving = gain >= MIN_LOG_LIKELIHOOD_GAIN
+    if moving:
+        knots, shift, vibrations = place_jumps(samples, final, part, shape, width), final.shift, final.vibrations
+    else:
+        middle: Array = np.asarray((np.arange(blocks) + 0.5) * length - 0.5, np.float64)
+        information = equations.information[:, :2, :2].mean(axis=0) + MIN_INFORMATION * np.eye(2)
+        sd_of_a_block = np.sqrt(first.motion.scale * np.diag(np.linalg.inv(information)))
+        knots, shift, vibrations = MotionKnots(middle, position, np.tile(sd_of_a_block, (blocks, 1))), at_rest, []
+    left = residual_variance(samples, shift, part, shape, width)
+    sample, displacement, sd = (each[knots.sample < samples.x.size] for each in knots)  # the last block may be cut off
+    per_sample = tuple(each._replace(frequency=each.frequency / length) for each in vibrations)
+    return SampleMotion(length, sample, displacement, np.sqrt(sd**2 + left), moving, gain, np.sqrt(left), per_sample)
+
+
+def choose_width(samples: ScanSamples, shift: Array, part: int, shape: tuple[int, int]) -> tuple[float, float]:
+    """Return the kernel [px] whose picture of the other blocks predicts the samples best.
+
+    The fraction of the samples that the narrowest kernel compares with others is returned too.
+    """
+    found = [block_equations(samples, shift, part, shape, width) for width in WIDTHS_PX]
+    return WIDTHS_PX[int(np.argmin([each.misfit for each in found]))], found[0].compared
+
+
+def _follow(
+    samples: ScanSamples, smoothed: SmoothedMotion, part: int, shape: tuple[int, int]
+) -> tuple[SmoothedMotion, float]:
+    """The motion after rounds of Gauss-Newton from a coarse one, and the kernel [px] of the last ones."""
+    for coarse in COARSE_WIDTHS_PX:
+        smoothed = _round(samples, smoothed, part, shape, coarse)
+    width, _ = choose_width(samples, smoothed.shift, part, shape)
+    for _ in range(MAX_ROUNDS):
+        before = smoothed
+        smoothed = _round(samples, before, part, shape, width)
+        variance = np.einsum("bpii->bpi", smoothed.covariance()).mean()
+        if np.mean((smoothed.shift - before.shift) ** 2) < CONVERGED_SD**2 * variance:
+            break
+    return smoothed, width
+
+
+def _round(
+    samples: ScanSamples, around: SmoothedMotion, part: int, shape: tuple[int, int], width: float
+) -> SmoothedMotion:
+    """A step of Gauss-Newton, without the mean, which no sample determines."""
+    found = block_equations(samples, around.shift, part, shape, width)
+    smoothed = smooth_motion(found, around.position, around.vibrations, around)
+    return smoothed._replace(position=smoothed.position - smoothed.position.mean(axis=0))
+
+
+def _coarse_motion(samples: ScanSamples, length: int, blocks: int, shape: tuple[int, int]) -> Array:
+    """Translation of each block by the coarse search, linear between the middles of its parts."""
+    parts = max(blocks // SEARCH_PERIODS, 1)
+    coarse = search_motion(samples, SEARCH_PERIODS * length, parts, shape)
+    middle = SEARCH_PERIODS * (np.arange(parts) + 0.5)
+    return np.column_stack([np.interp(np.arange(blocks) + 0.5, middle, each) for each in coarse.T])
