@@ -9,7 +9,7 @@ data, pictures and reports do not belong here. Modules in the order of the compu
    evidence; ``linearisation``: that model around a fit, and fits from it; ``law_selection``: laws selected, fitted and
    selected again; ``pruning``: terms and amplitudes that are not required; ``significance``; ``selection``: named laws,
    else a discrepancy, else nothing.
-4. ``localisation``: channel, time and harmonics of a misfit; ``gain_drift``: damping that a drifting gain imitates;
+4. ``localisation``: channel, time and harmonics of a misfit; ``free_decay``: what one decay cannot tell apart;
    ``identifiability``: detectability of every effect; ``experiment_design``: further measurements;
    ``corrected_parameters``: parameters beside a discrepancy.
 5. ``discrepancy_law``, ``effect_curve``: a fitted effect as formula and curve.

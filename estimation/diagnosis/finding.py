@@ -16,7 +16,7 @@ from estimation.diagnosis.corrected_parameters import CorrectedParameters
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
-from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE, may_be_gain_drift
+from estimation.diagnosis.free_decay import decay_advice, decay_confounders
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_parameters
 from estimation.diagnosis.localisation import describe_localisation
 from estimation.diagnosis.screening import ScoreTest
@@ -100,10 +100,11 @@ def find_effect(
         if name != effect and (probability > 1e-4 or name in fits_as_well)
     )
     advice = _advice(result, step, distance)
-    if may_be_gain_drift(result.likelihood.runs, result.final.model.device, candidate) and "gain-drift" not in {
-        rival.effect for rival in rivals
-    }:
-        rivals, advice = (*rivals, Rival("gain-drift", 0.0)), "; ".join(filter(None, (advice, GAIN_DRIFT_ADVICE)))
+    known = {rival.effect for rival in rivals}
+    confounders = decay_confounders(result.likelihood.runs, result.final.model.device, candidate)
+    if unlisted := [confounder for confounder in confounders if confounder not in known]:
+        rivals += tuple(Rival(confounder, probabilities.get(confounder, 0.0)) for confounder in unlisted)
+        advice = "; ".join(filter(None, (advice, decay_advice(unlisted))))
     return Finding(
         axis=candidate.axis,
         stage=candidate.term.stage,

@@ -11,7 +11,7 @@ import numpy as np
 from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
-from estimation.diagnosis.gain_drift import GAIN_DRIFT_ADVICE
+from estimation.diagnosis.free_decay import confounders_in_one_decay, decay_advice
 from estimation.least_squares import Z_95
 from estimation.lock_in_channels import lock_in_amplitude
 from estimation.reference import MIN_SAMPLES_PER_PERIOD
@@ -207,8 +207,10 @@ def _finding(
     rivals = [Rival(effect, p) for effect, p in others.items() if p > MIN_RIVAL_PROBABILITY]
     advice = None
     if fit_curve(decays, common=True).score < best.score + MIN_SCORE_GAIN or len(decays.parts) == 1:
-        rivals.append(Rival("gain-drift", 0.0))
-        advice = GAIN_DRIFT_ADVICE
+        known = {rival.effect for rival in rivals}
+        confounders = [each for each in confounders_in_one_decay(law.effect) if each not in known]
+        rivals += [Rival(confounder, others.get(confounder, 0.0)) for confounder in confounders]
+        advice = decay_advice(confounders)
     return Finding(
         axis=axis.name,
         stage="mechanics",

@@ -56,7 +56,7 @@ def test_cubic_damping_is_named_with_its_size_in_every_unit(unit: str) -> None:
     (b3,) = finding.parameters
     assert b3.value == pytest.approx(true, rel=0.1)
     assert found.device.axes["x"].terms["cubic-damping"]["b3"] == b3.value
-    assert [rival.effect for rival in finding.rivals][-1] == "gain-drift"
+    assert {"gain-drift", "damping-drift"} <= {rival.effect for rival in finding.rivals}
     assert "record another amplitude" in str(finding.advice)
 
 

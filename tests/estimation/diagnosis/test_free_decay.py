@@ -1,4 +1,4 @@
-"""A gain that drifts is listed where damping is seen in one free decay only."""
+"""A gain or a damping that drifts is listed where damping is seen in one free decay only."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import diagnose as diagnosing
-from estimation.diagnosis.gain_drift import may_be_gain_drift
+from estimation.diagnosis.free_decay import decay_confounders
 from scanner.active_terms import stated_terms
 from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, simulate_axis
@@ -31,19 +31,23 @@ def decay(amplitude: float, angle: bool = False) -> Recording:
     return Recording.from_arrays(channels, DEVICE)
 
 
-def is_listed(*recordings: Recording, effect: str = "cubic-damping", device: Device = DEVICE) -> bool:
+def listed(*recordings: Recording, effect: str = "cubic-damping", device: Device = DEVICE) -> tuple[str, ...]:
     runs = [prepare_run(recording, device) for recording in recordings]
-    return may_be_gain_drift(runs, device, Candidate(catalogue()[effect], "x", "sense"))
+    return decay_confounders(runs, device, Candidate(catalogue()[effect], "x", "sense"))
 
 
-def test_one_decay_of_a_sensor_of_motion_does_not_exclude_a_drift_of_its_gain() -> None:
-    assert is_listed(decay(0.2))
-    assert not is_listed(decay(0.2), effect="cubic-stiffness")
+def test_one_decay_of_a_sensor_of_motion_does_not_exclude_changes_in_time() -> None:
+    assert listed(decay(0.2)) == ("gain-drift", "damping-drift")
+    assert listed(decay(0.2), effect="damping-drift") == ("gain-drift", "cubic-damping")
+    assert listed(decay(0.2), effect="cubic-stiffness") == ()
 
 
-def test_another_amplitude_an_angle_channel_or_a_drive_excludes_it() -> None:
-    assert not is_listed(decay(0.2), decay(0.1))
-    assert not is_listed(decay(0.2, angle=True))
+def test_an_angle_channel_excludes_a_gain_that_drifts() -> None:
+    assert listed(decay(0.2, angle=True)) == ("damping-drift",)
+
+
+def test_another_amplitude_or_a_drive_excludes_all() -> None:
+    assert listed(decay(0.2), decay(0.1)) == ()
     driven = Device(
         "lever", {"x": Axis(NOMINAL.mechanics, drive=Drive("linear", 1.0), readout=NOMINAL.readout, name="x")}
     )
@@ -53,7 +57,7 @@ def test_another_amplitude_an_angle_channel_or_a_drive_excludes_it() -> None:
         "sense_x": (decay(0.2)["sense_x"].read(), "V", SAMPLE_RATE),
     }
     with_drive = Recording.from_arrays({k: (*v, 0.0) for k, v in channels.items()}, driven)
-    assert not is_listed(with_drive, device=driven)
+    assert listed(with_drive, device=driven) == ()
 
 
 def test_the_diagnosis_lists_it_with_the_measurement_that_separates_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,5 +65,5 @@ def test_the_diagnosis_lists_it_with_the_measurement_that_separates_them(monkeyp
     monkeypatch.setattr(diagnosing, "catalogue", lambda: known)
     (finding,) = diagnosing.diagnose([decay(0.2)]).findings
     assert finding.effect == "cubic-damping"
-    assert finding.rivals[-1].effect == "gain-drift"
+    assert {"gain-drift", "damping-drift"} <= {rival.effect for rival in finding.rivals}
     assert "record another amplitude" in str(finding.advice)
