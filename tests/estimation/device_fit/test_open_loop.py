@@ -1,0 +1,41 @@
+"""Open-loop prediction by a device that is not exactly right."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimation.device_fit.predict import predict
+from scanner.active_terms import stated_terms
+from scanner.device import Axis, Device
+from scanner.forward_model import DriveInput, simulate_axis
+from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
+
+SAMPLE_RATE_HZ = 2000.0
+CREEP = 0.003  # [V]
+RESONANCE = 2 * np.pi * 300.0
+STAGE = Axis(
+    Mechanics(1.0 / RESONANCE**2, 1.0 / RESONANCE, 1.0),
+    drive=Drive("linear", 1.0),
+    readout=Position(1.0, 2e-5),
+    name="x",
+)
+
+
+def stage_recording() -> Recording:
+    """A stage that is scanned in a growing spiral at 20 Hz, and creeps by a tenth of the scan after its start."""
+    time = np.arange(2401) / SAMPLE_RATE_HZ
+    drive = 0.03 * time / time[-1] * np.sin(2 * np.pi * 20.0 * time)
+    middle = np.interp(time[:-1] + 0.5 / SAMPLE_RATE_HZ, time, drive)
+    nodes = np.stack([drive[:-1], middle, drive[1:]], axis=1)
+    angle = simulate_axis(STAGE, stated_terms(STAGE), DriveInput(nodes, 1 / SAMPLE_RATE_HZ), (0.0, 0.0)).angle
+    sensed = angle - CREEP * np.exp(-time[: angle.size] / 0.3)
+    sensed = sensed + 2e-5 * np.random.default_rng(1).standard_normal(angle.size)
+    channels = {"drive_x": (drive, "V", SAMPLE_RATE_HZ), "sense_x": (sensed, "V", SAMPLE_RATE_HZ)}
+    return Recording.from_arrays({name: (*channel, 0.0) for name, channel in channels.items()})
+
+
+def test_the_start_of_an_axis_that_follows_its_drive_does_not_imitate_what_the_device_omits() -> None:
+    predicted = predict(stage_recording(), Device("stage", {"x": STAGE}))["sense_x"]
+    error = np.abs(predicted.values - predicted.measured)
+    assert error.max() < 2.0 * CREEP
