@@ -36,6 +36,10 @@ BAND_HARMONICS = 16
 """Highest frequency that is compared, in multiples of the motion's frequency. Harmonics of a Gaussian capacitance
 decrease quickly; a wider band would only add noise and computing time."""
 
+MAX_QUALITY_FORGETTING = np.pi
+"""Quality factor below which a free motion decays by more than a factor e within a period. Then only the first samples
+determine the initial state: without them it would follow an error of the model, with values far beyond the motion."""
+
 FILTER_EDGE_SAMPLES = 16
 """Samples at either end of a decimated channel that are not compared: the decimation filter extends over 16 decimated
 samples on either side, and there beyond the recording."""
@@ -260,7 +264,8 @@ def _output(channel: Channel, axes: tuple[str, ...], device: Device, step: float
     drive = max((lines[name].max() for name in axes if lines[name].size), default=0.0)
     band = min(0.35 / interval, max(BAND_HARMONICS * fastest, 1.5 * drive))
     edge = FILTER_EDGE_SAMPLES if decimation > 1 else 2
-    guard = (max(edge, ceil(1.0 / (fastest * interval))), edge)
+    forgotten = min(device.axis(name).quality for name in axes) < MAX_QUALITY_FORGETTING
+    guard = (0 if forgotten else max(edge, ceil(1.0 / (fastest * interval))), edge)
     kind = channel.name.partition("_")[0]
     readout = readout_of(device, axes[0])
     noise = readout.noise_sd if kind == "sense" and readout is not None else None

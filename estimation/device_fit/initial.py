@@ -27,17 +27,12 @@ EXCLUDED_HARMONICS = 12
 """Harmonics of the motion around which no noise is measured, because a misfit concentrates there."""
 
 
-def follow_their_drives(model: Model) -> bool:
-    """Whether every axis moves far below its resonance, so that it follows its drive and soon forgets its start."""
-    return all(scales.rate < 0.5 * np.sqrt(scales.k / scales.J) for run in model.runs for scales in run.scales.values())
-
-
 def window_schedule(model: Model) -> list[float]:
     """Growing windows as fractions of the recordings, the last one 1.
 
-    Where every axis follows its drive, its phase cannot be lost and one window suffices.
+    Far below its resonance an axis follows its drive, so its phase cannot be lost and one window suffices.
     """
-    if follow_their_drives(model):
+    if all(scales.rate < 0.5 * np.sqrt(scales.k / scales.J) for run in model.runs for scales in run.scales.values()):
         return [1.0]
     periods = min(run.duration * scales.rate / (2 * np.pi) for run in model.runs for scales in run.scales.values())
     stops = [FIRST_WINDOW_PERIODS / periods]
@@ -46,19 +41,9 @@ def window_schedule(model: Model) -> list[float]:
     return [*stops, 1.0] if stops[0] < 0.7 else [1.0]
 
 
-def flat_whiteners(model: Model, with_first_samples: bool = False) -> list[list[Whitener]]:
-    """Whiteners for white noise with the level of each channel at high frequencies.
-
-    Args:
-        with_first_samples: compare the samples of the guard at the start too.
-    """
-    return [
-        [
-            make_whitener(flat_psd(o.data, o.bins), o.data.size, (0 if with_first_samples else o.guard[0], o.guard[1]))
-            for o in run.outputs
-        ]
-        for run in model.runs
-    ]
+def flat_whiteners(model: Model) -> list[list[Whitener]]:
+    """Whiteners for white noise with the level of each channel at high frequencies."""
+    return [[make_whitener(flat_psd(o.data, o.bins), o.data.size, o.guard) for o in run.outputs] for run in model.runs]
 
 
 def estimate_whiteners(model: Model, x: Array) -> list[list[Whitener]]:

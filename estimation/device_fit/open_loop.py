@@ -13,7 +13,7 @@ import numpy as np
 
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import TIME_BLOCKS, Likelihood, fit_model, held_out_samples
-from estimation.device_fit.initial import fit_initial_state, flat_whiteners, follow_their_drives, window_schedule
+from estimation.device_fit.initial import fit_initial_state, flat_whiteners, window_schedule
 from estimation.device_fit.model import Model
 from scanner.arrays import Array
 from scanner.device import Device
@@ -51,14 +51,12 @@ class OpenLoop:
 def fit_start_only(runs: Sequence[Run], device: Device) -> tuple[Model, Array]:
     """Model of a device with its stated values, and parameters of which only the initial state of every run is fitted.
 
-    The initial state is fitted to the first periods of the motion. An axis far below its resonance forgets it within
-    the guard at the start, so that only the samples there determine it: without them it would follow an error of the
-    model.
+    The initial state is fitted to the first periods of the motion.
     """
     model = Model(runs, device, mains=())
     is_start = np.array([f.kind in ("start", "hidden") for f in model.parameters], bool)
     model.precision = np.where(is_start, model.precision, FIXED_PARAMETER_PRECISION)
-    likelihood = Likelihood(runs, flat_whiteners(model, with_first_samples=follow_their_drives(model)))
+    likelihood = Likelihood(runs, flat_whiteners(model))
     first = window_schedule(model)[0]
     x = fit_model(likelihood, model, fit_initial_state(likelihood, model, first).x, first, 12, tolerance=1e-3).x
     return model, np.where(is_start, x, 0.0)

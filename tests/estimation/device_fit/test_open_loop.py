@@ -39,3 +39,19 @@ def test_the_start_of_an_axis_that_follows_its_drive_does_not_imitate_what_the_d
     predicted = predict(stage_recording(), Device("stage", {"x": STAGE}))["sense_x"]
     error = np.abs(predicted.values - predicted.measured)
     assert error.max() < 2.0 * CREEP
+
+
+def test_the_start_of_an_overdamped_axis_is_that_of_the_first_samples() -> None:
+    slow = 2 * np.pi / 500.0
+    tank = Axis(Mechanics(1.0 / slow**2, 2.0 / slow, 1.0), drive=Drive("linear", 2.0), readout=Position(1.0, 0.02),
+                name="x")  # fmt: skip
+    true = Axis(Mechanics(1.4 / slow**2, 1.4 / slow, 1.0), drive=Drive("linear", 1.7), readout=Position(1.0, 0.02),
+                name="x")  # fmt: skip
+    drive = 2.5 + np.random.default_rng(2).uniform(-2.0, 2.0, 17).repeat(60)
+    inputs = DriveInput(np.repeat(drive[:-1, None], 3, axis=1), 4.0)
+    level = simulate_axis(true, stated_terms(true), inputs, (5.0, 0.0)).angle
+    noise = 0.02 * np.random.default_rng(3).standard_normal(level.size)
+    channels = {"drive_x": (drive, "V", 0.25, 0.0), "sense_x": (level + noise, "V", 0.25, 0.0)}
+    predicted = predict(Recording.from_arrays(channels, Device("tank", {"x": true})), Device("tank", {"x": tank}))
+    values = predicted["sense_x"].values
+    assert abs(values[0] - level[0]) < 0.2 * np.ptp(level)
