@@ -12,6 +12,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+from scanner.arguments import check_flags
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -89,10 +90,12 @@ def estimate(
         flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
 
     Raises:
-        BadInput: no such estimator, or the recording or the device lacks what it needs.
+        BadInput: no such estimator, a flip is neither True nor False, or the recording or the device lacks what is
+            needed.
     """
     from estimation.estimate import estimate as estimate_motion
 
+    check_flags(flip_x=flip_x, flip_y=flip_y)
     return estimate_motion(_opened(recording, device, mapping), None, estimator, {"x": flip_x, "y": flip_y})
 
 
@@ -141,7 +144,7 @@ def reconstruct(
         truth: of a simulation, for ``evaluation``; a simulated file's own truth is read from the file.
 
     Raises:
-        BadInput: the recording or the device lacks what is needed.
+        BadInput: an option has no meaning, or the recording or the device lacks what is needed.
     """
     from recon.evaluation import load_truth, truth_from_simulation
     from recon.imaging.intensity_drift import DriftKind
@@ -157,6 +160,8 @@ def reconstruct(
             raise BadInput(f"is {value!r}", channel=name, hint="give a positive number of pixels")
     if intensity_drift not in (None, *get_args(DriftKind)):
         raise BadInput(f"is {intensity_drift!r}", channel="intensity_drift", hint="give 'offset', 'gain' or None")
+    check_flags(flip_x=flip_x, flip_y=flip_y, sense_only=sense_only)
+    check_flags(allow_outside=allow_outside, sample_motion=sample_motion)
     options = Options(
         estimator=estimator,
         pixels=pixels,

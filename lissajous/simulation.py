@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from math import isfinite
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lissajous.functions import DeviceSource, load_device
+from scanner.arguments import check_flags
+from scanner.errors import BadInput
 from scanner.recording import Recording
+
+if TYPE_CHECKING:
+    from phantoms.waveforms import Sine
 
 
 class Simulation(NamedTuple):
@@ -61,20 +68,22 @@ def simulate(
         spot_um: standard deviation of the beam's spot [um].
         photons: photons a sample at full brightness.
         angles: record the true angles as the reference channels ``angle_x`` and ``angle_y`` too.
-        seed: of all noise.
+        seed: of all noise, a whole number, 0 or greater.
         nominal: the device that the recording states, where the calibration differs from the true device.
 
     Raises:
-        BadInput: the device cannot be simulated, or there is no such target.
+        BadInput: an argument has no meaning, the device cannot be simulated, or there is no such target.
     """
     from phantoms.experiment import Experiment, simulate_experiment
     from phantoms.optics import Detector
-    from phantoms.waveforms import Sine
 
+    if not isinstance(seed, Integral) or seed < 0:
+        raise BadInput(f"is {seed!r}", channel="seed", hint="give a whole number, 0 or greater")
+    check_flags(angles=angles)
     experiment = Experiment(
         device=load_device(device),
         target=target,
-        drives={"x": Sine(*drive_x), "y": Sine(*drive_y)},
+        drives={"x": _sine(drive_x, "drive_x"), "y": _sine(drive_y, "drive_y")},
         duration=duration,
         sample_rate=sample_rate,
         drift=dict(drift) if isinstance(drift, Mapping) else {"x": drift, "y": drift},
@@ -85,3 +94,18 @@ def simulate(
         angles=angles,
     )
     return Simulation(*simulate_experiment(experiment, seed, None if nominal is None else load_device(nominal)))
+
+
+def _sine(drive: object, name: str) -> Sine:
+    """The waveform of frequency [Hz], amplitude [V] and offset [V]; ``name`` is that of the argument.
+
+    Raises:
+        BadInput: the drive is not three finite numbers.
+    """
+    from phantoms.waveforms import Sine
+
+    numbers = list(drive) if isinstance(drive, Iterable) else []
+    if len(numbers) != 3 or not all(isinstance(number, Real) and isfinite(number) for number in numbers):
+        hint = "give frequency [Hz], amplitude [V] and offset [V], as (27680.0, 30.0, 30.0)"
+        raise BadInput(f"is {drive!r}", channel=name, hint=hint)
+    return Sine(*(float(number) for number in numbers))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.imaging.picture import Picture
+from scanner.arguments import check_flags
 from scanner.arrays import Array
 from scanner.errors import BadInput
 
@@ -110,10 +111,13 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
         flip_x, flip_y: whether the picture is mirrored.
 
     Raises:
-        BadInput: no pixel was visited.
+        BadInput: an argument is of a wrong type or shape, no pixel was visited, or picture or scene have one value
+            only.
     """
     from scipy.ndimage import map_coordinates
 
+    scene = _checked_scene(picture, scene)
+    check_flags(flip_x=flip_x, flip_y=flip_y)
     image = np.asarray(picture.image if picture.image.ndim == 2 else picture.image.mean(-1), np.float64)
     image = image[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
     count = picture.coverage[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
@@ -121,6 +125,9 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
     if not rows.size:
         raise BadInput("no pixel of the picture was visited")
     values, weight = image[rows, columns], np.ones(rows.size)
+    for name, compared in (("picture", values), ("scene", scene)):
+        if np.ptp(compared) == 0.0:
+            raise BadInput("has no contrast: all its values are equal", channel=name, hint="compare where it has some")
     y = 2.0 * (rows + 0.5) / image.shape[0] - 1.0
     x = 2.0 * (columns + 0.5) / image.shape[1] - 1.0
     # A pixel is a mean over its area, so the scene is first averaged to the resolution of the picture.
@@ -148,6 +155,18 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
     residual = float(np.sqrt(np.mean((values - gain * model - offset) ** 2)))
     contrast = abs(float(gain)) * float(np.std(model))
     return SceneComparison(residual / max(contrast, 1e-300), float(scale[0]), float(scale[1]))
+
+
+def _checked_scene(picture: object, scene: object) -> Array:
+    """The scene as float64, shape (H, W), after a check of the type of both."""
+    if not isinstance(picture, Picture):
+        hint = "give a Picture, such as lissajous.map_samples returns"
+        raise BadInput(f"is a {type(picture).__name__}, no picture", channel="picture", hint=hint)
+    numbers = np.asarray(scene)
+    if numbers.dtype.kind not in "biuf" or numbers.ndim != 2 or not np.isfinite(numbers).all():
+        what = f"is an array of {numbers.dtype} of shape {numbers.shape}"
+        raise BadInput(what, channel="scene", hint="give finite real numbers of shape (height, width)")
+    return np.asarray(numbers, np.float64)
 
 
 def _fit_linear(basis: list[Array], values: Array) -> Array:

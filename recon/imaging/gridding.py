@@ -230,9 +230,12 @@ def accumulate_samples(
         ``sums``, float64, and ``counts``, uint32.
 
     Raises:
-        BadInput: the shapes do not match.
+        BadInput: the shapes do not match, or values are not real numbers.
     """
     theta_x, theta_y, intensity = np.asarray(theta_x), np.asarray(theta_y), np.asarray(intensity)
+    for name, values in (("theta_x", theta_x), ("theta_y", theta_y), ("intensity", intensity)):
+        if values.dtype.kind not in "biuf":
+            raise BadInput(f"holds {values.dtype}, not real numbers", channel=name, hint="give integers or floats")
     one_clock = theta_x.ndim == 1 and theta_x.shape == theta_y.shape == intensity.shape[:1]
     if not one_clock or intensity.ndim > 2:
         raise BadInput(

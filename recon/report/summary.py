@@ -238,10 +238,16 @@ def seconds_to_fill(result: Reconstruction) -> dict[str, float | None]:
 
 
 def _picture_score(result: Reconstruction) -> dict[str, Any] | None:
-    """Rms error of the picture against the noiseless scene of a simulation, and its magnification; None without one."""
+    """Rms error of the picture against the noiseless scene of a simulation, and its magnification.
+
+    None without a scene, and where it cannot be compared: scene or picture have one value only.
+    """
     if result.truth is None or result.truth.scene is None:
         return None
-    return asdict(blur.compare_with_scene(result.picture, result.truth.scene, *is_mirrored(result)))
+    try:
+        return asdict(blur.compare_with_scene(result.picture, result.truth.scene, *is_mirrored(result)))
+    except BadInput:
+        return None
 
 
 def is_mirrored(result: Reconstruction) -> tuple[bool, bool]:

@@ -152,11 +152,30 @@ def test_arrays_are_reconstructed_without_a_file() -> None:
         ({"p": "1"}, "p: is '1'"),
         ({"spot": -1.0}, "spot: is -1.0"),
         ({"intensity_drift": "bleaching"}, "intensity_drift: is 'bleaching'; give 'offset', 'gain' or None"),
+        ({"flip_x": "no"}, "flip_x: is 'no'; give True or False"),
+        ({"sense_only": "no"}, "sense_only: is 'no'; give True or False"),
     ],
 )
 def test_reconstruct_refuses_a_value_without_a_meaning(option: dict, message: str) -> None:
     with pytest.raises(lissajous.BadInput, match=message):
         lissajous.reconstruct(imaging()[0], **option)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"seed": -1}, "seed: is -1; give a whole number, 0 or greater"),
+        ({"seed": 1.5}, "seed: is 1.5"),
+        ({"drive_x": "27680,30,30"}, "drive_x: is '27680,30,30'; give frequency"),
+        ({"drive_x": 27680}, "drive_x: is 27680"),
+        ({"drive_y": (6540.0, 30.0)}, "drive_y: is"),
+        ({"drive_y": (6540.0, 30.0, np.nan)}, "drive_y: is"),
+        ({"angles": "no"}, "angles: is 'no'; give True or False"),
+    ],
+)
+def test_simulate_refuses_a_value_without_a_meaning(option: dict, message: str) -> None:
+    with pytest.raises(lissajous.BadInput, match=message):
+        lissajous.simulate(duration=0.001, **option)
 
 
 @pytest.mark.parametrize("function", [lissajous.estimate, lissajous.reconstruct, lissajous.diagnose, lissajous.predict])

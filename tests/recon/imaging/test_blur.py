@@ -116,3 +116,18 @@ def test_a_mapped_scan_agrees_with_its_scene_and_a_phase_error_does_not():
 def test_an_empty_picture_is_refused():
     with pytest.raises(BadInput, match="no pixel"):
         compare_with_scene(picture_of(np.full((4, 4), np.nan)), scene())
+
+
+def test_what_cannot_be_compared_is_refused():
+    picture, flat = picture_of(shown(scene())), picture_of(np.ones((4, 4)))
+    with pytest.raises(BadInput, match="picture: has no contrast"):
+        compare_with_scene(flat, scene())
+    with pytest.raises(BadInput, match="scene: has no contrast"):
+        compare_with_scene(picture, np.ones((30, 30)))
+    with pytest.raises(BadInput, match="picture: is a ndarray, no picture"):
+        compare_with_scene(picture.image, scene())
+    for wrong in (scene()[0], scene() + 1j, np.full((4, 4), np.nan), picture):
+        with pytest.raises(BadInput, match=r"scene: is an array of .*; give finite real numbers"):
+            compare_with_scene(picture, wrong)
+    with pytest.raises(BadInput, match="flip_x: is 'no'; give True or False"):
+        compare_with_scene(picture, scene(), flip_x="no")

@@ -140,6 +140,11 @@ def test_invalid_samples_and_grids_are_refused():
         accumulate_samples(np.zeros(3), np.zeros(4), np.zeros(3), grid)
     with pytest.raises(BadInput, match=r"sums of shape \(4, 5\)"):
         accumulate_samples(np.zeros(3), np.zeros(3), np.zeros(3), grid, np.zeros((4, 5)), np.zeros((4, 5), np.uint32))
+    for values in (np.ones(3) + 1j, np.array(["a", "b", "c"]), np.array([None, 1, 2])):
+        with pytest.raises(BadInput, match=r"intensity: holds .*, not real numbers; give integers or floats"):
+            map_samples(np.zeros(3), np.zeros(3), values, grid)
+    with pytest.raises(BadInput, match="theta_x: holds complex128"):
+        map_samples(np.zeros(3, complex), np.zeros(3), np.zeros(3), grid)
     with pytest.raises(BadInput, match="0x4 pixels"):
         Grid(0, 4, 1.0, 1.0)
     with pytest.raises(BadInput, match="30000x30000 pixels"):
