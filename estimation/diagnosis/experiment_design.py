@@ -15,6 +15,7 @@ from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.identifiability import (
     DISCRIMINATION_SIGMA,
     candidate_sensitivities,
+    confusion_probability,
     linearise_simulated,
     stated_whitener,
     unexplained_norms,
@@ -83,7 +84,11 @@ def discrimination_advice(
 ) -> str:
     """Distance to a confounder in words, and the measurements that would distinguish the two."""
     name = rival.term.effect
-    distance_text = f"{name} is at a distance of {distance:.1f} σ, {DISCRIMINATION_SIGMA} are needed"
+    distance_text = (
+        f"{name} is at a distance of {distance:.1f} σ, at which noise would favour it in "
+        f"{confusion_probability(distance):.0%} of repeated recordings (at {DISCRIMINATION_SIGMA} σ in "
+        f"{confusion_probability(DISCRIMINATION_SIGMA):.0%})"
+    )
     computed = [
         f"{description}: {d:.1f} σ"
         for description, d in rank_experiments(likelihood, fit, candidate, rival)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import erfc, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,11 @@ MIN_NOMINAL_CHANGE = 1e-9
 MAX_POSTERIOR_VARIANCE = 0.5
 """Ratio of posterior to prior variance of a direction of the nominal values above which the recording does not
 determine it: then the recording has less information on it than the stated tolerance."""
+
+
+def confusion_probability(distance: float) -> float:
+    """Probability that noise favours the wrong one of two effects at this distance [sigma]: Phi(-d/2)."""
+    return 0.5 * erfc(0.5 * distance / sqrt(2.0))
 
 
 def determined_parameters(fit: Fit) -> Array:

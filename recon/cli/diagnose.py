@@ -131,7 +131,7 @@ def _format_diagnosis(summary: dict[str, Any]) -> str:
         heldout = finding["heldout"]
         lines.append(
             f"  {finding['axis']} {finding['stage']}: {finding['effect']} (probability "
-            f"{format_probability(finding['probability'])}), "
+            f"{format_probability(finding['probability'])} among the laws compared), "
             f"held-out {'chi-square' if 'chi-square' in heldout['metric'] else 'error'} "
             f"{heldout['before']:.3g} -> {heldout['after']:.3g}"
         )
@@ -141,7 +141,7 @@ def _format_diagnosis(summary: dict[str, Any]) -> str:
         ]
         if finding["rivals"]:
             rivals = [f"{r['effect']} ({format_probability(r['probability'])})" for r in finding["rivals"]]
-            lines.append(f"    or {', '.join(rivals)}")
+            lines.append(f"    alternative: {', '.join(rivals)}")
         if "advice" in finding:
             lines.append(f"    to distinguish them: {finding['advice']}")
     if summary["unexplained"]:

@@ -76,6 +76,7 @@ def _overview(diagnosis: Diagnosis) -> Section:
         rows.append(["not explained", f"{rest['channel']}, {rest['stage']}", "", f"{rest['share']:.1%}", "", ""])
     head = ["effect", "where", "probability", "share of the misfit", "misfit before", "misfit after"]
     text = (
+        "Probability: of the effect among the laws that were compared, by these recordings. "
         "Misfit: reduced chi-square on samples that were not used in the fit; noise alone gives 1. Share: of the mean "
         "square misfit of the nominal device on these samples, in the channel that shows the effect most; what is "
         "not explained near the noise is a share of the misfit in units of the noise."
