@@ -50,6 +50,15 @@ def test_compilation_is_announced_once(tmp_path: Path) -> None:
     assert messages == ["compiling, once (about a minute)\n", ""]
 
 
+def test_the_count_of_functions_leaves_the_line_empty(tmp_path: Path) -> None:
+    """What is printed next, as an error, begins a line of its own."""
+    on_a_terminal = "import sys\nsys.stderr.isatty = lambda: True\n" + CODE
+    shown, _ = _messages_of_two_runs(tmp_path / "script.py", on_a_terminal, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    counted, erased = shown.splitlines()[-2:]  # a carriage return is read as the end of a line
+    assert counted == "functions: 1"
+    assert erased == " " * len(counted)
+
+
 def test_no_law_is_compiled_in_a_second_run(tmp_path: Path) -> None:
     _, second = _messages_of_two_runs(tmp_path / "script.py", LAWS_CODE)
     assert second == ""
