@@ -256,7 +256,7 @@ def _repair_dropped_samples(
     when = recorded.start + timing_break.sample / recorded.sample_rate
     doubt = (
         f"from about {when:.4g} s on the forward and backward half-periods disagree: the phase drifted away, samples "
-        "of the intensity were lost, or the specimen changed"
+        "of the intensity were lost, or the scene changed"
     )
     if result.limits:  # they state why the picture does not show the scene; this follows from them
         return replace(result, notes=[*result.notes, doubt])

@@ -293,8 +293,10 @@ def _format_axis(name: str, axis: Mapping[str, Any]) -> str:
     measured = axis["picture_phase_error_deg"]
     if measured["sd"] is not None:
         line += f", phase error measured in the picture {measured['value']:+.3f}° ± {measured['sd']:.3f}°"
-    line += f", amplitude {axis['amplitude_rad']:.4g} rad"
-    return f"{line}{_format_amplitude_sd(axis)}; sign {axis['sign']}"
+    line += f", amplitude {axis['amplitude_rad']:.4g} rad{_format_amplitude_sd(axis)}"
+    if axis["amplitude_um"] is not None:
+        line += f", {axis['amplitude_um']:.4g} µm on the sample"
+    return f"{line}; sign {axis['sign']}"
 
 
 def _format_amplitude_sd(axis: Mapping[str, Any]) -> str:

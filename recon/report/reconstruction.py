@@ -162,7 +162,7 @@ def axis_table(summary: Mapping[str, Any]) -> Table:
         ["scan within the bound", *(f"{summary[a]['within_bound']:.1%}" for a in AXES)],
         ["phase error measured in the picture", *measured],
         ["drift of the phase over the scan [°]", *(f"{summary[a]['phase_drift_deg']:.3g}" for a in AXES)],
-        [f"amplitude [mrad {summary['angle']}]", *(f"{1e3 * summary[a]['amplitude_rad']:.2f}" for a in AXES)],
+        _amplitude_row(summary),
         [
             "standard deviation of the amplitude: scale of the picture",
             *(_format_amplitude_sd(summary[a]) for a in AXES),
@@ -202,6 +202,13 @@ def sample_motion_sections(result: Reconstruction) -> list[Section]:
 def blur_figure_of(parts: Mapping[str, Mapping[str, float]], p: float) -> Figure:
     """Bars of blur by cause."""
     return Figure(blur_figure(parts, p), "blur by cause; dashed: the tolerated p pixels")
+
+
+def _amplitude_row(summary: Mapping[str, Any]) -> list[str]:
+    """Amplitude of both axes, as a length where the device states the scale of the sample."""
+    if all(summary[a]["amplitude_um"] is not None for a in AXES):
+        return ["amplitude on the sample [µm]", *(f"{summary[a]['amplitude_um']:.4g}" for a in AXES)]
+    return [f"amplitude [mrad {summary['angle']}]", *(f"{1e3 * summary[a]['amplitude_rad']:.2f}" for a in AXES)]
 
 
 def _format_frequency(frequency: float | None) -> str:

@@ -64,6 +64,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
     """What the summary says of one axis."""
     own, bound = result.motion.axes[axis], result.phase_bound(axis)
     error, scale = result.evaluation.get(axis), result.picture.grid.angle_scale
+    metres = result.picture.grid.metres_per_radian
     summary: dict[str, Any] = {
         "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(own.phase_sd**2)))),
         "bound_deg": float(np.degrees(bound)),
@@ -72,6 +73,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
         else blur.within_bound(bound, error=error.phase),
         "sign": own.sign,
         "amplitude_rad": scale * float(np.mean(own.amplitude)),
+        "amplitude_um": None if metres is None else 1e6 * metres * float(np.mean(own.amplitude)),
         **amplitude_uncertainty(result, axis),
         "amplitude_from": amplitude_source(result, axis),
         "frequency_hz": None if own.reference == "blocks" else float(np.mean(own.frequency)),

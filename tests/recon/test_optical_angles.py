@@ -58,3 +58,21 @@ def test_files_and_reports_state_optical_angles(tmp_path: Path) -> None:
         assert own["x/angle"][:100] == pytest.approx(2 * other["x/angle"][:100], rel=1e-6)
         assert own["y/amplitude"][:] == pytest.approx(2 * other["y/amplitude"][:])
         assert own["x/phase"][:] == pytest.approx(other["x/phase"][:])
+
+
+def test_amplitudes_are_lengths_where_the_device_states_the_scale_of_the_sample(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    recording, _ = imaging()
+    device = recording.device
+    assert device is not None
+    scaled = replace(device, scan=Scan(0.18, 0.18, 1e-3))
+    replace(recording, device_toml=scaled.to_toml()).write(tmp_path / "scan.h5")
+    arguments = [str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out"), "--pixels", "60x60", "--estimator", "constant"]
+    assert main(["reconstruct", *arguments]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    length = summary["x"]["amplitude_um"]
+    assert length == pytest.approx(1e3 * summary["x"]["amplitude_rad"])
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "amplitude on the sample [µm]" in page
+    assert f"{length:.4g} µm on the sample; sign" in capsys.readouterr().out

@@ -178,11 +178,11 @@ def _phases_of_slices(
 
 
 AMBIGUOUS = (
-    "the specimen nearly equals its mirror image in {name}: its phase may be a quarter of a turn off, the picture wrong"
+    "the scene nearly equals its mirror image in {name}: its phase may be a quarter of a turn off, the picture wrong"
 )
 
 SEARCH_HINT = (
-    "check the drive frequencies of the device and the sample rate; a specimen without features shows no phase, and a "
+    "check the drive frequencies of the device and the sample rate; a scene without features shows no phase, and a "
     "sense or angle channel is then needed"
 )
 

@@ -165,7 +165,7 @@ def describe_contradictions(beam: Motion, intensity: Channel) -> list[str]:
             if 2 * sum(_is_folded(match.axes[column], _repeated(match.axes)) for match in slices) > len(slices):
                 frequency = float(np.median(beam.axes[name].frequency))
                 lines.append(
-                    f"{name}: the picture equals its mirror image in {name}: so does the specimen, or {name} moves at "
+                    f"{name}: the picture equals its mirror image in {name}: so does the scene, or {name} moves at "
                     f"{2 * frequency:.6g} Hz in place of {frequency:.6g} Hz and the picture is wrong: check kind and "
                     f"frequency in [{name}.drive]"
                 )

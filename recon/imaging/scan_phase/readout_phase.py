@@ -188,7 +188,7 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
         f"the picture determines no phase of {name}: no feature across it, a pattern that repeats, or too few photons. "
         f"The standard deviation of the phase allows for {UNDESCRIBED_DELAY_SD_S * 1e6:.2g} µs of readout delay that "
         f"the device file does not state; without such a delay it is {_sd_as_stated(motion.axes[name]):.2g}°. "
-        "A specimen with detail, more light or a longer scan narrows it"
+        "A scene with detail, more light or a longer scan narrows it"
         for name in AXES
         if name not in found
     ]

@@ -126,6 +126,6 @@ def describe_slow_gain(gains: Sequence[SlowGain]) -> list[str]:
     change, sd = max(clear, key=lambda each: abs(each[0]))
     return [
         f"intensity: samples of one place {'rise' if change > 0.0 else 'fall'} by {100 * abs(change):.3g} % "
-        f"± {100 * sd:.2g} % during the scan (gain, laser power or bleaching). The phase allows for it, the picture "
-        "does not: run again with --intensity-drift gain, or offset for stray light"
+        f"± {100 * sd:.2g} % during the scan: the gain of the channel or what it records drifts. The phase allows for "
+        "it, the picture does not: run again with --intensity-drift gain, or offset for a drift that adds to the signal"
     ]
