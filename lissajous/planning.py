@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lissajous.functions import DeviceSource, load_device
+from scanner.wording import counted
 
 if TYPE_CHECKING:
     from recon.scan_design import ScanCandidate, SustainedBand
@@ -26,7 +27,7 @@ class ScanDesign:
     candidates: Sequence[ScanCandidate]
 
     def __repr__(self) -> str:
-        lines = [f"ScanDesign: {len(self.candidates)} pairs of drive frequencies, best first"]
+        lines = [f"ScanDesign: {counted(len(self.candidates), 'pair')} of drive frequencies, best first"]
         lines += [
             f"  {pair.drive[0]:.2f} Hz x {pair.drive[1]:.2f} Hz: {pair.figure.frame_rate:.3f} pictures a second, "
             f"fill {pair.fill['worst']:.1%} to {pair.fill['best']:.1%}"

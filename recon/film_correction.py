@@ -24,6 +24,7 @@ from recon.io.film import Film, write_film
 from recon.io.output import finite
 from scanner.arrays import Array
 from scanner.errors import BadInput
+from scanner.wording import counted
 
 SAMPLED_FRAMES = 16
 """Frames, spread over the film, that determine the smoothing and where the fit of the fill begins."""
@@ -126,9 +127,8 @@ class CorrectedFilm:
         border = int(np.ceil(np.abs(self.shift).max() / 2))
         if border:
             data = "NaN or 0" if self.means else "part of the counts"
-            notes.append(
-                f"up to {border} columns at either border were recorded in one direction only ({data} in there)"
-            )
+            wide = counted(border, "column")
+            notes.append(f"a border of up to {wide} was recorded in one direction only ({data} in there)")
         if rows % 2:
             notes.append(
                 f"the number of lines, {rows}, is odd: if frames begin in alternate directions, the shift alternates "
@@ -136,8 +136,8 @@ class CorrectedFilm:
             )
         if self.undetermined:
             notes.append(
-                f"{self.undetermined} of {self.film.frames} frames do not determine their own phase to "
-                f"{MAX_SHIFT_SD_PX} pixels; they are corrected by that of the frames around them"
+                f"frames that do not determine their own phase to {MAX_SHIFT_SD_PX} pixels: {self.undetermined} of "
+                f"{self.film.frames}; they are corrected by that of the frames around them"
             )
         if self.rows_rms[1] > MAX_ROWS_GROWTH * self.rows_rms[0]:
             notes.append(
@@ -146,7 +146,7 @@ class CorrectedFilm:
             )
         if self.clipped:
             notes.append(
-                f"{self.clipped} pixels of the corrected film did not fit into {self.film.dtype} and are clipped"
+                f"{counted(self.clipped, 'pixel')} of the corrected film clipped to the range of {self.film.dtype}"
             )
         return notes
 

@@ -51,6 +51,7 @@ from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.wording import counted
 
 
 @dataclass(frozen=True)
@@ -248,7 +249,7 @@ def _repair_dropped_samples(
         repaired = _reconstruct_prepared(restored, options, truth, quiet)
         if slices_aligned(repaired.phase_errors, repaired.motion).all():
             start, stop = (recorded.start + at / recorded.sample_rate for at in (dropped.first, dropped.stop))
-            number = f"{abs(dropped.missing)} sample{'s' if abs(dropped.missing) > 1 else ''}"
+            number = counted(abs(dropped.missing), "sample")
             what = f"{number} lost" if dropped.missing > 0 else f"{number} too many"
             note = f"intensity: {what} at {start:.6g} s, as the picture shows; later samples were shifted back"
             defect = Defect("intensity", PHASE_JUMP, start, stop)

@@ -24,6 +24,7 @@ from scanner.errors import BadInput
 from scanner.geometry import Geometry, locate_points, trace_rays
 from scanner.motion import AxisMotion
 from scanner.recording import Recording
+from scanner.wording import counted
 
 ANGLE_STEP_RAD = 1e-5
 """Step of the central difference of a point by an angle: its square is far below the step, and rounding below 1e-11."""
@@ -206,9 +207,9 @@ def _notes(geometry: Geometry, assumed: bool, distance: Array, estimated: Estima
             f"range: {rail[1] / distance.size:.0%} of the values are exactly {rail[0]:.6g} m, the largest one: if that "
             "stands for no return, store nan in its place"
         )
-    for what, left_out in (("of 0 or less", distance <= 0.0), ("that are infinite", distance == np.inf)):
+    for what, left_out in (("of 0 or less", distance <= 0.0), ("of infinity", distance == np.inf)):
         if count := int(np.count_nonzero(left_out)):
-            notes.append(f"range: {count} values {what} were taken as no return")
+            notes.append(f"range: {counted(count, 'value')} {what}, taken as no return")
     for axis in AXES:
         if estimated.motion.axes[axis].sign.startswith("ambiguous"):
             notes.append(f"the sign of {axis} is not known: --flip-{axis} mirrors the points")

@@ -21,6 +21,7 @@ from scanner.channel_names import suggest_name
 from scanner.device import AXES, VALUES, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.wording import counted
 
 DeviceSource = str | Path | Device
 """A device, the path of a TOML file, or the name of a device of ``scanner.devices``."""
@@ -164,7 +165,7 @@ def _check_shape(intensity: Channel) -> None:
         BadInput: it has not.
     """
     if len(intensity.shape) == 2 and intensity.shape[1] > intensity.shape[0]:
-        what = f"has {intensity.shape[0]} samples of {intensity.shape[1]} detectors: its axes are swapped"
+        what = f"has {counted(intensity.shape[0], 'sample')} of {intensity.shape[1]} detectors: its axes are swapped"
         hint = "store it as (samples, detectors)"
         raise BadInput(what, file=intensity.file, channel=intensity.name, hint=hint)
 

@@ -14,6 +14,7 @@ from recon.z_rests import PositionBlocks, cut_to_intensity, find_rests, read_blo
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, LazySamples
 from scanner.errors import BadInput
+from scanner.wording import counted
 
 MAX_TRAVEL_M = 0.1
 """Travel of z above which a note asks for its unit: stages of microscopes travel some centimetres at most [m]."""
@@ -104,7 +105,8 @@ def _describe(blocks: PositionBlocks, slices: int, unassigned: float, step: floa
     notes = []
     travel = blocks.most - blocks.least
     if blocks.missing:
-        notes.append(f"position_z: {blocks.missing} samples are not finite; the intensity there belongs to no slice")
+        missing = counted(blocks.missing, "sample")
+        notes.append(f"position_z: {missing} without a finite value; the intensity there belongs to no slice")
     if travel > MAX_TRAVEL_M:
         notes.append(f"position_z: moves by {travel:.4g} m; no objective does: check its unit")
     if slices == 1:

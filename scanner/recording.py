@@ -27,6 +27,7 @@ from scanner.errors import BadInput, ChannelMissing
 from scanner.files import replacing
 from scanner.hdf5 import attributes, child, new_hdf5, open_hdf5, undamaged
 from scanner.truth import Truth, write_truth
+from scanner.wording import counted
 
 FORMAT = "lissajous-recording"
 VERSIONS = (1,)
@@ -156,7 +157,9 @@ class Recording:
             f"at {channel.sample_rate:.9g} Hz from {channel.start:.6g} s"
             for channel in self.channels.values()
         ]
-        lines += [f"  {edges.name}: {edges.times.size} edges, {edges.event}" for edges in self.edges.values()]
+        lines += [
+            f"  {edges.name}: {counted(edges.times.size, 'edge')}, {edges.event}" for edges in self.edges.values()
+        ]
         return "\n".join(lines)
 
     def __enter__(self) -> Recording:

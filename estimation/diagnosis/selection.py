@@ -43,6 +43,7 @@ from estimation.diagnosis.significance import evidence_gain, residual_is_noise, 
 from estimation.parallel import map_fits
 from scanner.device import Device
 from scanner.terms import Term
+from scanner.wording import counted
 
 Progress = Callable[[str], None]
 """Called with one line of text at every step."""
@@ -147,7 +148,7 @@ def select_terms(
     certain = {candidate.term.effect for candidate in clipped}
     named = [term for term in terms.values() if term.effect not in certain]
     pool = all_candidates(device, nominal.model, [*named, *DISCREPANCY_TERMS.values()])
-    progress(f"{len(pool)} candidates")
+    progress(counted(len(pool), "candidate"))
     selected = _choose_terms(likelihood, nominal, early, stops, pool, progress)
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
     return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps, selected.need.remaining)

@@ -29,6 +29,7 @@ from scanner.arrays import Array
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.wording import counted
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 
@@ -150,7 +151,7 @@ def frequency_responses(recording: Recording, device: Device) -> list[Response]:
         order = np.argsort(frequency)
         good = order[np.isfinite(amplitude[order]) & np.isfinite(phase[order]) & (amplitude[order] > 0.0)]
         if np.unique(frequency[good]).size < MIN_TONES:
-            what = f"holds {np.unique(frequency[good]).size} steady tones, {MIN_TONES} are needed"
+            what = f"holds {counted(np.unique(frequency[good]).size, 'steady tone')}, {MIN_TONES} are needed"
             raise BadInput(what, channel=key, hint="measure tones on both sides of the resonance")
         scale = float(np.abs(recording[key].read()).max() / amplitude[good].max())
         found.append(Response(name, frequency[good], amplitude[good] * np.exp(1j * phase[good]), in_rad, scale))

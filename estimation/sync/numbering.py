@@ -10,6 +10,7 @@ from numba import njit
 from scanner.arrays import Array, Index
 from scanner.edges import Edges
 from scanner.errors import BadInput
+from scanner.wording import counted
 
 MIN_EDGES = 12
 """Edges that a phase is estimated from at least: six half-periods of each kind."""
@@ -72,7 +73,7 @@ def number_edges(edges: Edges) -> NumberedEdges:
 
     times, kinds = edges.times, 2 if edges.event in ("both-edges", "turn") else 1
     if times.size < MIN_EDGES:
-        raise bad(f"holds {times.size} edges; {MIN_EDGES} are needed", "record for longer")
+        raise bad(f"holds {counted(times.size, 'edge')}; {MIN_EDGES} are needed", "record for longer")
     gaps = np.diff(times)
     bounce = DOUBLED_PERIODS * float(np.median(gaps))
     clean = times[np.append(True, gaps > 4.0 * bounce)]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from recon.cli.argument_types import parse_count
+from scanner.wording import counted
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +35,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 def format_summary(summary: dict[str, Any]) -> str:
     lines = [
         summary["conclusion"],
-        f"{summary['output']}: {summary['cells']} cells, {summary['computed']} of them computed now, "
+        f"{summary['output']}: {counted(summary['cells'], 'cell')}, {summary['computed']} of them computed now, "
         f"{summary['failed']} failed",
     ]
     lines += [f"  failed: {reason}" for reason in summary["reasons"]]

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from scanner.wording import counted
+
 # What may be said of channels in arguments: option -> key of the mapping, and what its value is.
 OPTIONS = {
     "unit": ("unit", str),
@@ -101,8 +103,10 @@ def format_summary(summary: dict[str, Any]) -> str:
         by = own["stated_by"]
         line = f"  {name}: {own['variable']}, {own['unit']} ({by['unit']})"
         line += f", {own['sample_rate']:.9g} Hz ({by['sample_rate']})"
-        line += f", from {own['start']:.9g} s ({by['start']}), {own['shape'][0]} samples"
+        line += f", from {own['start']:.9g} s ({by['start']}), {counted(own['shape'][0], 'sample')}"
         line += "".join(f"; the file states {key} {value}" for key, value in own["overruled"].items())
         lines.append(line + suggest_name(name))
-    lines += [f"  {name}: {edges['number']} edges, {edges['event']}" for name, edges in summary["edges"].items()]
+    lines += [
+        f"  {name}: {counted(edges['number'], 'edge')}, {edges['event']}" for name, edges in summary["edges"].items()
+    ]
     return "\n".join(lines)

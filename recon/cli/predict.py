@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from scanner.wording import counted
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, help="the recording (.h5), or an instrument's file with --mapping")
@@ -81,7 +83,9 @@ def predict_file(
 
 def format_summary(summary: dict[str, Any]) -> str:
     lines = [summary["conclusion"]]
-    lines.append(f"{summary['output']}: {len(summary['channels'])} channels predicted from the first samples on")
+    lines.append(
+        f"{summary['output']}: {counted(len(summary['channels']), 'channel')} predicted from the first samples on"
+    )
     for name, fraction in summary["beyond_measured_law"].items():
         if fraction > 0.0:
             lines.append(f"  axis {name}: {fraction:.1%} of the samples lie beyond the range of its measured law")

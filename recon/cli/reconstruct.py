@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recon.cli.argument_types import parse_count, parse_positive, parse_size, parse_whole
+from scanner.wording import counted
 
 if TYPE_CHECKING:
     from recon.reconstruction import Options
@@ -311,7 +312,8 @@ def _format_amplitude_sd(axis: Mapping[str, Any]) -> str:
 
 
 def _format_live(live: Mapping[str, Any]) -> str:
-    line = f"  live: {live['frames']} frames of {1e3 * (live['frame_s'] or 0.0):.4g} ms, {live['dropped']} dropped"
+    line = f"  live: {counted(live['frames'], 'frame')} of {1e3 * (live['frame_s'] or 0.0):.4g} ms"
+    line += f", {live['dropped']} dropped"
     if live["frames"]:
         line += f", {live['latency_s']['median']:.2f} s late (at most {live['latency_s']['max']:.2f} s)"
     return f"{line}; {live['ended']}"

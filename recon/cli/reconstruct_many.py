@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from recon.cli.reconstruct import reconstruct_file
+from scanner.wording import counted
 
 if TYPE_CHECKING:
     from recon.reconstruction import Options
@@ -111,7 +112,7 @@ def format_summary(summary: dict[str, Any]) -> str:
     from recon.report.conclusions import describe_stack
 
     rows = summary["recordings"]
-    lines = [f"{summary['output']}: {len(rows) - summary['failed']} of {len(rows)} recordings reconstructed"]
+    lines = [f"{summary['output']}: {len(rows) - summary['failed']} of {counted(len(rows), 'recording')} reconstructed"]
     if summary["kept"]:
         lines.append(f"  {summary['kept']} were kept from an earlier run; --overwrite does them anew")
     if summary["stack"]:

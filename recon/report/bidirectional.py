@@ -26,6 +26,7 @@ from recon.report.numbers import format_uncertain, format_value
 from recon.report.page import Figure, Section, Table, render
 from recon.report.reconstruction import round_scale_bar
 from scanner.arrays import Array
+from scanner.wording import counted
 
 PHASE_CAPTION = (
     "Shift between the two directions in every frame. Points: the frame by itself; line and band: smoothed over time, "
@@ -85,7 +86,7 @@ def bidirectional_report(result: CorrectedFilm, summary: Mapping[str, Any]) -> s
         Section("Line phase", "", Table(["quantity", "value"], rows), figures),
         Section("Pictures", "", figures=pictures, pixelated=True),
     ]
-    size = f"{summary['frames']} frames of {summary['columns']} x {summary['lines']} pixels"
+    size = f"{counted(summary['frames'], 'frame')} of {summary['columns']} x {summary['lines']} pixels"
     subject = f"{summary['film']}: {size}, channels: {summary['channels']}."
     return render("Bidirectional scan", summary["conclusion"], sections, summary["notes"], subject)
 

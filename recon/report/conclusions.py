@@ -10,6 +10,7 @@ from typing import Any
 
 from recon.frame_axis import format_positions
 from recon.report.numbers import format_interval, format_uncertain, format_value
+from scanner.wording import counted
 
 SHARP_FRACTION = 0.99
 """Fraction of the scan within the bound p/m from which a picture is called sharp: blur in the remaining hundredth of
@@ -165,7 +166,7 @@ def conclude_identification(summary: Mapping[str, Any]) -> str:
     """How many constants were measured, and the least certain of them."""
     values = {f"{axis}.{name}": v for axis, r in summary["axes"].items() for name, v in r["values"].items()}
     relative = {name: v["sd"] / abs(v["value"]) for name, v in values.items() if v["value"] and v["sd"]}
-    text = f"{_count(len(values), 'constant')} of {summary['device']} measured"
+    text = f"{counted(len(values), 'constant')} of {summary['device']} measured"
     if relative:
         worst = max(relative, key=lambda name: relative[name])
         text += f", the least certain {worst} to {100 * relative[worst]:.2g} %"
@@ -219,7 +220,7 @@ def conclude_study(summary: Mapping[str, Any]) -> str:
         if values["phase_rmse_deg_median"] is not None and values["within_bound"] is not None
     }
     if not statistics:
-        return f"None of {_count(summary['cells'], 'cell')} was computed; the reasons are listed below."
+        return f"None of {counted(summary['cells'], 'cell')} was computed; the reasons are listed below."
     best = min(statistics, key=lambda name: statistics[name]["phase_rmse_deg_median"])
     values = statistics[best]
     usable = values["within_bound"] >= MIN_USABLE_FRACTION
@@ -233,7 +234,7 @@ def conclude_study(summary: Mapping[str, Any]) -> str:
         f"with {values['within_bound']:.1%} of the scan within the bound p/m."
     )
     if summary["failed"]:
-        text += f" {summary['failed']} of {_count(summary['cells'], 'cell')} failed."
+        text += f" {summary['failed']} of {counted(summary['cells'], 'cell')} failed."
     return text
 
 
@@ -241,7 +242,7 @@ def conclude_many(summary: Mapping[str, Any]) -> str:
     """How many recordings were reconstructed, and which one needs a look."""
     rows: Sequence[Mapping[str, Any]] = summary["recordings"]
     done = [row for row in rows if not row["failed"]]
-    text = f"{len(done)} of {_count(len(rows), 'recording')} reconstructed."
+    text = f"{len(done)} of {counted(len(rows), 'recording')} reconstructed."
     if done:
         worst = min(done, key=lambda row: min(row["within_bound"].values()))
         share = min(worst["within_bound"].values())
@@ -276,9 +277,10 @@ def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
     reach = max(abs(edge) for edge in summary["extent_m"]["z"])
     sd = max(summary["sd_m"].values())
     of_angles = "" if summary["range_sd_m"] else "; by the angles alone, without the range finder's noise"
+    points, shots = counted(summary["points"], "point"), counted(summary["shots"], "shot")
     return (
-        f"{summary['points']} points from {summary['shots']} shots, up to {reach:.3g} m away, with a standard "
-        f"deviation of at most {1e3 * sd:.2g} mm (rms of an axis{of_angles}). Use {file}."
+        f"{points} from {shots}, up to {reach:.3g} m away, with a standard deviation of "
+        f"at most {1e3 * sd:.2g} mm (rms of an axis{of_angles}). Use {file}."
     )
 
 
@@ -291,18 +293,14 @@ def conclude_fleet(summary: Mapping[str, Any]) -> str:
         if row.get("effect"):
             effects.setdefault(f"{row['axis']} {row['effect']}", set()).add(row["recording"])
     affected = len(set().union(*effects.values()))
-    text = f"{affected} of {_count(diagnosed, 'recording')} show effects that the nominal device omits."
+    text = f"{affected} of {counted(diagnosed, 'recording')} show effects that the nominal device omits."
     if effects:
         name, where = max(effects.items(), key=lambda item: len(item[1]))
         text += f" The most frequent is {name}, in {len(where)}."
     if summary["failed"]:
-        text += f" {_count(summary['failed'], 'recording')} failed; the reasons are listed below."
+        text += f" {counted(summary['failed'], 'recording')} failed; the reasons are listed below."
     return text
 
 
 def _degrees(value: float) -> str:
     return f"{value:.2g}°" if value < 1.0 else f"{value:.2f}°"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")

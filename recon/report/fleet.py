@@ -12,6 +12,7 @@ from recon.report.conclusions import conclude_fleet
 from recon.report.figures import COLOURS, NARROW_WIDTH_IN, figure_uri, new_figure
 from recon.report.numbers import format_interval, format_probability, format_value
 from recon.report.page import Figure, Section, Table, render
+from scanner.wording import counted
 
 MAX_FIGURES = 6
 """Effects with a figure: those that most devices have."""
@@ -39,7 +40,7 @@ def fleet_report(summary: Mapping[str, Any]) -> str:
         Section("Recordings", "A folder of each holds its diagnosis.", Table(each_head, [_line(row) for row in rows])),
     ]
     failed = [row["failed"] for row in summary["table"] if row.get("failed")]
-    subject = f"{summary['recordings']} recordings, computed in {summary['seconds']:.1f} s."
+    subject = f"{counted(summary['recordings'], 'recording')}, computed in {summary['seconds']:.1f} s."
     return render("Diagnosis of many devices", conclude_fleet(summary), sections, failed, subject)
 
 

@@ -16,6 +16,7 @@ from recon.study.plan import Study
 from recon.study.table import Columns
 from scanner.arrays import Array
 from scanner.device import AXES
+from scanner.wording import counted
 
 MARKERS = "o+^xs"
 """Markers of the phantoms, repeated if there are more."""
@@ -33,7 +34,8 @@ def study_report(study: Study, data: Columns, summary: Mapping[str, Any]) -> str
     subject = (
         f"Phantoms {len(study.phantoms)}, scan designs {len(study.designs)}, drifts {len(study.drifts)}, noise levels "
         f"{max(1, len(study.snr_db))}, seeds {study.seeds}, estimators {len(study.estimators)}, resolutions "
-        f"{len(study.pixels)}, values of p {len(study.p)}: {summary['cells']} cells, {summary['failed']} failed."
+        f"{len(study.pixels)}, values of p {len(study.p)}: {counted(summary['cells'], 'cell')}, "
+        f"{summary['failed']} failed."
     )
     worked = {name: column[data["failed"] == ""] for name, column in data.items()}
     notes = [f"failed: {reason}" for reason in summary["reasons"]]

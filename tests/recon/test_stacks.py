@@ -140,7 +140,7 @@ def test_missing_samples_belong_to_no_slice() -> None:
     slices = find_z_slices(z_channel(z), LIGHT)
     assert slices.positions == pytest.approx(POSITIONS)
     assert (slices.labels(5000, 20_000) == -1).all()  # 1 ms to 4 ms
-    assert slices.notes[0] == "position_z: 301 samples are not finite; the intensity there belongs to no slice"
+    assert slices.notes[0] == "position_z: 301 samples without a finite value; the intensity there belongs to no slice"
     assert "belongs to no slice" in slices.notes[1]
     binned = find_z_slices(z_channel(z), LIGHT, 2e-6)
     assert (binned.labels(5000, 20_000) == -1).all()

@@ -164,8 +164,8 @@ def test_a_line_that_is_no_toml_is_quoted(line: str, words: str, tmp_path: Path)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda r: np.where(np.arange(r.size) % 5 == 0, np.inf, r), "4000 values that are infinite were taken as no"),
-        (lambda r: np.where(np.arange(r.size) % 5 == 0, -1.0, r), "4000 values of 0 or less were taken as no return"),
+        (lambda r: np.where(np.arange(r.size) % 5 == 0, np.inf, r), "4000 values of infinity, taken as no return"),
+        (lambda r: np.where(np.arange(r.size) % 5 == 0, -1.0, r), "4000 values of 0 or less, taken as no return"),
     ],
 )
 def test_shots_without_a_range_are_counted(change, words: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:  # type: ignore[no-untyped-def]

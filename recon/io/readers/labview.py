@@ -23,6 +23,7 @@ from recon.io.readers.contents import (
 from recon.io.readers.reader import Reader
 from recon.io.readers.text_table import parse_number, parse_number_blocks, read_lines, split_fields
 from scanner.errors import BadInput
+from scanner.wording import counted
 
 MAGIC = "LabVIEW Measurement"
 END_OF_HEADER = "***End_of_Header***"
@@ -88,14 +89,16 @@ def _one_segment(lines: Iterable[str], path: Path) -> Iterator[str]:
 def _columns(names: list[str], kind: str, count: int, path: Path) -> list[tuple[int | None, int]]:
     """Columns of each channel's times and values; ``kind`` is the header's X_Columns: One, Multi or No."""
     if not 1 <= count <= len(names):
-        raise BadInput(f"says Channels {count} over {len(names)} columns", file=path, hint="export it again")
+        raise BadInput(f"says Channels {count} over {counted(len(names), 'column')}", file=path, hint="export it again")
     layout: list[tuple[int | None, int]]
     if kind == "Multi":
         layout = [(2 * index, 2 * index + 1) for index in range(count)]
     else:  # with "No", the column of times is there, empty
         layout = [(None if kind == "No" else 0, index + 1) for index in range(count)]
     if layout[-1][1] >= len(names):
-        raise BadInput(f"has {len(names)} columns for {count} channels", file=path, hint="export it again")
+        raise BadInput(
+            f"has {counted(len(names), 'column')} for {counted(count, 'channel')}", file=path, hint="export it again"
+        )
     return layout
 
 

@@ -36,6 +36,7 @@ from recon.io.readers.text_table import (
 )
 from scanner.arrays import Array
 from scanner.errors import BadInput
+from scanner.wording import counted
 
 MAX_HEADER_LINES = 200
 """Lines in which the table has to begin; headers of oscilloscopes have tens of lines."""
@@ -202,7 +203,7 @@ def _check_marks(path: Path, head: list[list[str]], row: str, separator: str, wi
     if odd and all(_NUMBER_LIKE.fullmatch(field) for field in names if field):
         raise BadInput(f"line {len(head)}: {odd[0][:40]!r} is no number", file=path, hint=ONE_MARK_HINT)
     if separator == "," and "." not in row and len(names) < width <= 2 * len(names):
-        what = f"its lines have {width} numbers without a point, and its heading {len(names)} names"
+        what = f"its lines have {width} numbers without a point, and its heading {counted(len(names), 'name')}"
         raise BadInput(what, file=path, hint=DECIMAL_COMMA_HINT)
 
 

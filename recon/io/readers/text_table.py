@@ -13,6 +13,7 @@ import numpy as np
 
 from scanner.arrays import Array
 from scanner.errors import BadInput
+from scanner.wording import counted
 
 MAX_LINE_CHARACTERS = 1 << 16
 """Limit of a line, which keeps a binary file without line ends out of memory."""
@@ -141,7 +142,7 @@ def _row(
         what = f"line {line} ends after {len(parts)} of {max(columns) + 1} columns"
         raise BadInput(what, file=path, hint="the file may be cut; export it again")
     if width is not None and count_filled(parts) > width:
-        what = f"line {line} has {count_filled(parts)} fields, and the table {width} columns"
+        what = f"line {line} has {counted(count_filled(parts), 'field')}, and the table {counted(width, 'column')}"
         raise BadInput(what, file=path, hint=DECIMAL_COMMA_HINT if separator == "," else "repair or remove the line")
     numbers = [parse_number(parts[column], decimal) for column in columns]
     if None in numbers:
