@@ -67,7 +67,9 @@ class FollowSummary:
         frame_s: duration of a frame [s]; NaN until it is known.
         frames: number of frames shown.
         dropped: number of frames not shown, because newer ones were complete or their motion could not be estimated.
-        overtaken: number of those that newer ones had overtaken: the machine is too slow for the frames.
+        overtaken: number of those that arrived later and that newer ones had overtaken: the machine is too slow for the
+            frames.
+        recorded_before: number of those that were complete when the recording was opened.
         latency_s: time from the arrival of a frame's last sample to its picture, for each frame shown [s].
         ended: why following ended.
         shown: end of each frame shown [s], and when its picture was complete [s on the monotonic clock].
@@ -77,6 +79,7 @@ class FollowSummary:
     frames: int = 0
     dropped: int = 0
     overtaken: int = 0
+    recorded_before: int = 0
     latency_s: list[float] = field(default_factory=list)
     ended: str = "interrupted"
     shown: list[tuple[float, float]] = field(default_factory=list)
@@ -85,9 +88,8 @@ class FollowSummary:
         """Return the part "live" of summary.json."""
         values = np.array(self.latency_s or [np.nan])
         latency = {"median": float(np.median(values)), "max": float(values.max()), "first": float(values[0])}
-        return {key: getattr(self, key) for key in ("frame_s", "frames", "dropped", "overtaken", "ended")} | {
-            "latency_s": latency
-        }
+        keys = ("frame_s", "frames", "dropped", "overtaken", "recorded_before", "ended")
+        return {key: getattr(self, key) for key in keys} | {"latency_s": latency}
 
 
 def follow_recording(
@@ -148,6 +150,7 @@ class _Follower:
         edges: of its parts [s]. They are fixed when it begins: a part that does not begin where the one before ended is
             not tracked from its end.
         span: begin and end of the recording [s].
+        opened_end: end of the recording when it was opened [s]; NaN before.
         search: length of the recording at which the repeat time is estimated next [s].
         arrivals: end of the recording [s on its clock], and when it was read [s].
         refusal: why the last frame was not shown.
@@ -164,6 +167,7 @@ class _Follower:
     part: int = 0
     edges: list[float] = field(default_factory=list)
     span: tuple[float, float] = (0.0, 0.0)
+    opened_end: float = np.nan
     search: float = FIRST_REPEAT_SEARCH_S
     arrivals: list[tuple[float, float]] = field(default_factory=list)
     refusal: str = ""
@@ -172,6 +176,7 @@ class _Follower:
     def arrive(self, snapshot: Snapshot) -> None:
         """Note the end of the recording, and find the repeat time of the scan once enough was recorded."""
         begin, end = self.span = common_time_span(snapshot.recording)
+        self.opened_end = end if np.isnan(self.opened_end) else self.opened_end
         self.arrivals.append((end, snapshot.read))
         self.summary.ended = snapshot.ended or self.summary.ended
         if np.isnan(self.summary.frame_s) and end - begin >= self.search:
@@ -180,11 +185,9 @@ class _Follower:
     def advance(self, recording: Recording) -> bool:
         """Reconstruct the next part if its samples are there; False if they are not."""
         (begin, end), length = self.span, self.summary.frame_s
-        complete = 0 if np.isnan(length) else floor((end - begin) / length + 1e-9)
+        complete = self._complete_frames(end)
         if self.part == 0 and complete - self.done > MAX_PENDING_FRAMES:
-            self.summary.dropped += complete - 1 - self.done
-            self.summary.overtaken += complete - 1 - self.done
-            self.done = complete - 1
+            self._drop_until(complete - 1)
         start, stop = begin + self.done * length, begin + (self.done + 1) * length
         if self.part == 0:
             self.edges = part_edges(start, stop, slow_period(self.scan.motion)) if self.scan else [start, stop]
@@ -204,6 +207,19 @@ class _Follower:
             self.summary.dropped += 1
             self._begin_next()
         return True
+
+    def _complete_frames(self, end: float) -> int:
+        """Number of frames that are complete by ``end`` [s]; 0 while their length is unknown."""
+        length = self.summary.frame_s
+        return 0 if np.isnan(length) else floor((end - self.span[0]) / length + 1e-9)
+
+    def _drop_until(self, frame: int) -> None:
+        """Leave out the frames before number ``frame``."""
+        before = max(0, min(frame, self._complete_frames(self.opened_end)) - self.done)
+        self.summary.dropped += frame - self.done
+        self.summary.recorded_before += before
+        self.summary.overtaken += frame - self.done - before
+        self.done = frame
 
     def _show(self, stop: float) -> None:
         """Write the picture of the complete frame, then whatever takes longer."""

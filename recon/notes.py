@@ -278,11 +278,23 @@ def describe_clock_jumps(recording: Recording, prepared: PreparedRecording) -> s
 
 
 def describe_live_frames(live: Mapping[str, Any] | None) -> list[str]:
-    """A line if frames were left out because the machine was too slow; live: summary of ``--follow``, None without."""
-    if not live or not live["overtaken"]:
+    """A line for each reason why frames were left out.
+
+    Args:
+        live: summary of ``--follow``; None without.
+    """
+    if not live:
         return []
-    return [
-        f"{live['overtaken']} of {live['frames'] + live['dropped']} live frames were left out, because newer ones had "
-        "arrived before they could be reconstructed: the machine is too slow for frames of "
-        f"{1e3 * live['frame_s']:.4g} ms; ask for longer frames (--frame-time), fewer pixels or --picture mean"
-    ]
+    notes, total = [], live["frames"] + live["dropped"]
+    if live["recorded_before"]:
+        notes.append(
+            f"live frames left out: {live['recorded_before']} of {total} were complete when the recording was opened; "
+            "without --follow, --frame-time makes a film of all"
+        )
+    if live["overtaken"]:
+        notes.append(
+            f"live frames left out: {live['overtaken']} of {total}, because newer ones had arrived before they could "
+            f"be reconstructed: the machine is too slow for frames of {1e3 * live['frame_s']:.4g} ms; ask for longer "
+            "frames (--frame-time), fewer pixels or --picture mean"
+        )
+    return notes

@@ -22,6 +22,7 @@ from estimation.tracker import track_end
 from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.follow import follow_recording, repeat_time
+from recon.growing_recording import Snapshot
 from recon.imaging.scan_phase.carried_readout_phase import apply_readout_phase
 from recon.live_frames import (
     add_part,
@@ -188,14 +189,26 @@ def test_each_part_begins_where_the_one_before_ended(tmp_path: Path, monkeypatch
     assert all(stop == start for (_, stop), (start, _) in itertools.pairwise(parts))
 
 
-def test_frames_that_newer_ones_overtake_are_counted_and_stated(scan: Path, tmp_path: Path) -> None:
+def test_frames_of_a_finished_recording_are_not_called_too_fast_for_the_machine(scan: Path, tmp_path: Path) -> None:
     options = Options(pixels=(50, 50))
     live = follow_recording(scan, tmp_path / "out", options, frame_time=0.004, quiet_time=0.1, quiet=True)
-    summary = live.summary()  # all five frames were complete at once
-    assert (live.frames, live.dropped, live.overtaken) == (1, 4, 4)
-    (note,) = describe_live_frames(summary)
-    assert "4 of 5 live frames were left out" in note
-    assert describe_live_frames(summary | {"dropped": 4, "overtaken": 0}) == []  # sensors without motion, for instance
+    assert (live.frames, live.dropped, live.overtaken, live.recorded_before) == (1, 4, 0, 4)
+    (note,) = describe_live_frames(live.summary())
+    assert "4 of 5 were complete when the recording was opened" in note
+    without_motion = {"dropped": 4, "recorded_before": 0}
+    assert describe_live_frames(live.summary() | without_motion) == []
+
+
+def test_frames_that_newer_ones_overtake_are_counted_and_stated(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Recording.open(scan)
+    snapshots = [Snapshot(whole.slice(0.0, 0.003), None, 0.0), Snapshot(whole, "closed", 0.0)]
+    monkeypatch.setattr("recon.follow.poll_recording", lambda *_: iter(snapshots))
+    live = follow_recording(scan, tmp_path / "out", Options(pixels=(50, 50)), frame_time=0.004, quiet=True)
+    assert (live.frames, live.dropped, live.overtaken, live.recorded_before) == (1, 4, 4, 0)
+    (note,) = describe_live_frames(live.summary())
+    assert "4 of 5, because newer ones had arrived" in note
 
 
 def test_the_readout_error_is_measured_ever_more_rarely_and_never_stops() -> None:
