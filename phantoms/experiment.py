@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from phantoms.forward import Plan, Scene, simulate
+from phantoms.forward import Plan, Scene, check_plan, simulate
 from phantoms.optics import Detector, blur_by_spot
 from phantoms.targets import make_target
 from phantoms.waveforms import Sine, Waveform
@@ -66,24 +66,16 @@ class Experiment:
                 raise BadInput(f"is {change:g}", channel="drift", hint="give a relative change above -1")
 
 
-def simulate_experiment(
-    experiment: Experiment, seed: int = 0, nominal: Device | None = None
-) -> tuple[Recording, dict[str, object]]:
-    """Return the recording of an experiment and its truth.
+def plan_experiment(experiment: Experiment) -> tuple[Plan, Scene]:
+    """Return what the simulation of an experiment takes, after all checks that need no simulation.
 
     Args:
         experiment: device, drives, drift, target, spot and detector.
-        seed: of all random noise; the same seed gives the same samples.
-        nominal: the device that the recording states, if its calibration differs from the true device.
-
-    Returns:
-        The recording, and the truth as ``Recording.write`` takes it: that of ``phantoms.forward.simulate``, and
-        ``spot_sd``, the standard deviation of the spot as a fraction of the field's width.
 
     Raises:
         DeviceInvalid: the device has no field of view, a single axis, or lacks a value that the simulation needs.
-        BadInput: the target is neither a known name nor a picture file, its pixels are too coarse for the spot, or the
-            spot is too wide for the field.
+        BadInput: the target is neither a known name nor a picture file, its pixels are too coarse for the spot, the
+            spot is too wide for the field, or duration and sample rate cannot be simulated.
     """
     for name in AXES:
         experiment.device.axis(name)
@@ -102,7 +94,29 @@ def simulate_experiment(
         drift={axis: Drift(exponential(change, experiment.drift_tau)) for axis, change in experiment.drift.items()},
         references=("angle",) if experiment.angles else (),
     )
-    recording, truth = simulate(experiment.device, plan, Scene(light, experiment.detector), seed, nominal=nominal)
+    check_plan(experiment.device, plan)
+    return plan, Scene(light, experiment.detector)
+
+
+def simulate_experiment(
+    experiment: Experiment, seed: int = 0, nominal: Device | None = None
+) -> tuple[Recording, dict[str, object]]:
+    """Return the recording of an experiment and its truth.
+
+    Args:
+        experiment: device, drives, drift, target, spot and detector.
+        seed: of all random noise; the same seed gives the same samples.
+        nominal: the device that the recording states, if its calibration differs from the true device.
+
+    Returns:
+        The recording, and the truth as ``Recording.write`` takes it: that of ``phantoms.forward.simulate``, and
+        ``spot_sd``, the standard deviation of the spot as a fraction of the field's width.
+
+    Raises:
+        BadInput: as :func:`plan_experiment`; or the drives sustain no motion, or one without limit.
+    """
+    plan, scene = plan_experiment(experiment)
+    recording, truth = simulate(experiment.device, plan, scene, seed, nominal=nominal)
     return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}
 
 

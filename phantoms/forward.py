@@ -257,6 +257,23 @@ def _motion_pieces(
     yield {name: path.from_step(first) for name, path in paths.items()}
 
 
+def check_plan(device: Device, plan: Plan, settles: bool = True) -> None:
+    """Check what can be checked without a simulation.
+
+    Args:
+        device: the true device.
+        plan: drives, duration and rates.
+        settles: whether the drives run before the recording starts.
+
+    Raises:
+        BadInput: the plan holds less than two samples or too many, its steps do not resolve the motion, or the device
+            lacks mechanics or a readout that can be simulated.
+    """
+    _check_samples(device, plan, settles)
+    _check_steps(device, plan)
+    sense_channels(device)
+
+
 def _check_samples(device: Device, plan: Plan, settles: bool) -> None:
     """Check the number of samples that are held in memory; with terms, those of the settling are too.
 
@@ -321,8 +338,7 @@ def simulate(
     Returns:
         the recording and the content of its ``/truth``: ``angle_x``, ``angle_y`` at every sample, and ``scene``.
     """
-    _check_samples(device, plan, start is None)
-    _check_steps(device, plan)
+    check_plan(device, plan, start is None)
     rng = np.random.default_rng(seed)
     parts: dict[str, list[Array]] = {}
     lead: dict[str, AxisTrajectory] = {}

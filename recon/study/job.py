@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from phantoms.experiment import Experiment, simulate_experiment
+from phantoms.experiment import Experiment, plan_experiment, simulate_experiment
 from phantoms.forward import Plan, simulate
 from phantoms.optics import Detector
 from phantoms.waveforms import Sine, Waveform
@@ -54,13 +54,32 @@ def run_job(job: Job) -> list[dict[str, Any]]:
     return [finite(each) for each in records]
 
 
+def check_scenarios(scenarios: Iterable[Scenario]) -> None:
+    """Check recordings before the first one is simulated; those that differ in noise only once.
+
+    Raises:
+        BadInput: one cannot be simulated, whatever its noise.
+    """
+    distinct = {(each.phantom, each.design.name, each.drift): each for each in scenarios}
+    for scenario in distinct.values():
+        plan_experiment(_experiment(scenario, _device(scenario.design)))
+
+
 def simulate_scenario(scenario: Scenario) -> tuple[Recording, dict[str, object]]:
     """Simulate the recording of a scenario; return it with its truth."""
-    device = Device.from_toml(scenario.design.device, source=scenario.design.name)
+    device = _device(scenario.design)
     if scenario.snr_db is not None:
         device = with_noise(device, sense_rms(scenario.design, scenario.recording.sample_rate), scenario.snr_db)
+    return simulate_experiment(_experiment(scenario, device), scenario.seed)
+
+
+def _device(design: StudyDesign) -> Device:
+    return Device.from_toml(design.device, source=design.name)
+
+
+def _experiment(scenario: Scenario, device: Device) -> Experiment:
     conditions = scenario.recording
-    experiment = Experiment(
+    return Experiment(
         device=device,
         target=scenario.phantom,
         drives=_drive_waveforms(scenario.design),
@@ -72,7 +91,6 @@ def simulate_scenario(scenario: Scenario) -> tuple[Recording, dict[str, object]]
         spot_um=conditions.spot_um,
         detector=Detector(gain=1.0 / conditions.photons, photons_per_sample=conditions.photons, bits=12),
     )
-    return simulate_experiment(experiment, scenario.seed)
 
 
 @lru_cache(maxsize=16)

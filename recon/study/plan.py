@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from estimation.estimators import estimators
 from estimation.estimators import registered as registered_estimators
 from phantoms.targets import TARGETS, TISSUES
+from recon.imaging.picture import Grid
 from scanner import devices
 from scanner.device_toml import FINITE, NOT_NEGATIVE, POSITIVE, WHOLE, check_values, checked_number
 from scanner.errors import BadInput
@@ -103,6 +104,8 @@ class Study:
                 known = ", ".join((*TARGETS, *TISSUES))
                 hint = f"give a file or one of {known}"
                 raise BadInput(f"no target and no file is called {name!r}", channel="phantoms", hint=hint)
+        for side in self.pixels:
+            Grid(side, side, 1.0, 1.0)
         names = [design.name for design in self.designs]
         if len(set(names)) < len(names):
             raise BadInput("two have one name", channel="designs", hint="give each its own")

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from recon.executors import open_executor, picklable_task
 from recon.io.output import check_folder, finite, replacing_folder, write_json
 from recon.report.conclusions import conclude_study
-from recon.study.job import run_job
+from recon.study.job import check_scenarios, run_job
 from recon.study.plan import Job, cell_key, plan_jobs, read_study, remaining_jobs
 from recon.study.table import estimator_statistics, require_parquet, table_columns, table_rows, write_csv, write_parquet
 from scanner.errors import BadInput
@@ -59,6 +59,7 @@ def run_study(
     if parquet:
         require_parquet()
     all_jobs = list(plan_jobs(study))
+    check_scenarios(job.scenario for job in all_jobs)
     # The pool comes first: a scheduler that does not answer must not cause an empty folder.
     pool = open_executor(scheduler, workers)
     with _explain_interruption(output), pool as executor, _journal(_create_folder(output) / JOURNAL) as (file, done):

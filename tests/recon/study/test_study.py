@@ -170,9 +170,9 @@ def test_a_second_run_in_the_same_folder_is_refused(finished_study: Path, capsys
 
 
 def test_a_study_of_which_no_cell_was_computed_is_not_done(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    path = small_study(tmp_path, "drifts = [0.0, -0.001]", "drifts = [-1.5]")
+    path = small_study(tmp_path, "27680.0, 30.0, 30.0", "27680.0, 3.0, 3.0")
     assert main(["blur-study", str(path), "-o", str(tmp_path / "out"), "--workers", "1"]) == 2
-    assert "drift: is -1.5" in capsys.readouterr().out
+    assert "does not sustain a motion" in capsys.readouterr().out
 
 
 def test_a_failed_reconstruction_is_a_record_of_the_study(tmp_path: Path) -> None:
@@ -218,6 +218,12 @@ BAD_STUDIES = {
     "empty list": ("drifts = [0.0, -0.001]", "drifts = []", ["drifts", "is empty"]),
     "recording's unknown key": ("duration", "length", ["recording.length"]),
     "no TOML": ("name =", "name", ["is not TOML"]),
+    "a drift that no stiffness has": ("-0.001]", "-1.5]", ["drift: is -1.5", "above -1"]),
+    "too few samples": ("1e6", "1e4", ["too few for x, of a resonance of"]),
+    "too many samples": ("duration = 0.004", "duration = 1e5", ["1e+11 samples"]),
+    "a spot wider than the field": ("[recording]", "[recording]\nspot_um = 200.0", ["too wide for a field"]),
+    "too many photons": ("[recording]", "[recording]\nphotons = 1e30", ["photons_per_sample is 1e+30"]),
+    "a picture that no memory holds": ("[100]", "[50000]", ["a picture of 50000x50000 pixels"]),
     "estimators that are no list": ('["constant", "tracker"]', '"tracker"', ["estimators", "list of names"]),
 }
 
