@@ -30,7 +30,7 @@ from estimation.identification.reference_angle import ReferenceAngle, find_refer
 from estimation.identification.sweep import SweptRecord
 from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
 from estimation.reference import drive_reference
-from estimation.slow.response import Response, frequency_responses
+from estimation.slow.response import Response, ResponseFit, frequency_responses
 from estimation.slow.response_selection import select_effects
 from scanner.arrays import Array
 from scanner.clock import on_clock
@@ -63,12 +63,14 @@ class Identification:
             ``amplitude_over_theta0``. The intervals include the uncertainty of the torque.
         used: axis -> recordings and how each was used.
         notes: parameters that could not be determined, and the recording that would determine them.
+        responses: axis -> frequency responses, each with its fit.
     """
 
     device: Device
     values: Mapping[str, Mapping[str, IdentifiedValue]]
     used: Mapping[str, Sequence[str]]
     notes: Sequence[str]
+    responses: Mapping[str, Sequence[tuple[Response, ResponseFit]]]
 
     def __repr__(self) -> str:
         lines = [f"Identified {self.device.name!r}"]
@@ -83,7 +85,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
     Raises:
         BadInput: no recording determines a parameter of any axis, or one cannot be used.
     """
-    axes, values, used, notes = dict(device.axes), {}, {}, []
+    axes, values, used, notes, responses = dict(device.axes), {}, {}, [], {}
     if any("sense" in recording for recording in recordings):
         notes.append(
             "sense: the electrode is shared by both axes, so that capacitances and readout are not identified and keep "
@@ -97,6 +99,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         notes += result.notes
         if result.values:
             axes[name], values[name], used[name] = result.device_axis(), result.marginal(), result.used
+            responses[name] = result.responses
     if not values:
         what = "no recording shows a rest, a free decay, steady tones or a driven motion with a reference angle"
         names = ", ".join(sorted({name for recording in recordings for name in recording.channels}))
@@ -104,7 +107,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         if notes:
             what, hint = "the recordings determine no constant", "; ".join(notes)
         raise BadInput(what, file=recordings[0].path if recordings else None, hint=hint)
-    return Identification(replace(device, axes=axes), values, used, notes)
+    return Identification(replace(device, axes=axes), values, used, notes, responses)
 
 
 class _AxisIdentification:
@@ -115,6 +118,7 @@ class _AxisIdentification:
         self.values: dict[str, IdentifiedValue] = {}
         self.used: list[str] = []
         self.notes: list[str] = []
+        self.responses: list[tuple[Response, ResponseFit]] = []
         self.driven: list[DrivenRecord] = []
         self.swept: list[SweptRecord] = []
         self.gain_tolerance = 0.0  # of the reference angle of driven motion
@@ -126,7 +130,9 @@ class _AxisIdentification:
         responses = frequency_responses(recording, Device("", {self.name: self.axis}))
         if responses:
             self.used.append(f"{recording.name}: frequency response")
-            self.values = combine_values([self.values, fit_steady_tones(responses[0])])
+            fit = select_effects(responses[0])
+            self.responses.append((responses[0], fit))
+            self.values = combine_values([self.values, values_of_mode(fit)])
             self.notes.append(f"{self.name}: J is the nominal one; steady tones determine only k/J and b/J")
             return
         kind = classify_recording(recording, self.name)
@@ -302,9 +308,8 @@ class _AxisIdentification:
         return replace(axis, tolerance=tolerance)
 
 
-def fit_steady_tones(response: Response) -> dict[str, IdentifiedValue]:
+def values_of_mode(fit: ResponseFit) -> dict[str, IdentifiedValue]:
     """k/J and b/J from the first mode of a frequency response."""
-    fit = select_effects(response)
     (frequency, quality), (frequency_sd, quality_sd) = fit.modes[0], fit.mode_sd[0]
     rate, floor = 2.0 * np.pi * float(frequency), np.finfo(float).tiny
     relative = float(np.hypot(frequency_sd / frequency, quality_sd / quality))

@@ -75,7 +75,8 @@ def identify_files(
     with replacing_folder(output, device, *paths) as folder:
         (folder / "device.toml").write_text(identification.device.to_toml(), encoding="utf-8")
         write_json(folder / "summary.json", summary)
-        page = identification_report(summary, nominal, [path.name for path in paths])
+        names = [path.name for path in paths]
+        page = identification_report(summary, nominal, names, identification.responses)
         (folder / "report.html").write_text(page, encoding="utf-8")
     return summary
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 
 def format_uncertain(value: float, sd: float | None, unit: str = "") -> str:
@@ -46,6 +47,15 @@ def format_interval(value: float, low: float, high: float, unit: str = "") -> st
     if sd > 0.0 and math.isfinite(sd) and abs(high + low - 2.0 * value) > 0.25 * (high - low):
         return _with_unit(f"{format_value(value)} ({format_value(low)} to {format_value(high)})", unit)
     return format_uncertain(value, sd, unit)
+
+
+def format_range(low: float, high: float) -> str:
+    """Both ends of an interval, with two significant digits of its width."""
+    width, largest = high - low, max(abs(low), abs(high))
+    if not (math.isfinite(width) and width > 0.0):
+        return f"{format_value(low)} to {format_value(high)}"
+    digits = math.floor(math.log10(largest)) - math.floor(math.log10(width)) + 2
+    return " to ".join(format_value(end, min(digits, sys.float_info.dig)) for end in (low, high))
 
 
 def readable_unit(value: float, unit: str) -> tuple[float, str]:
