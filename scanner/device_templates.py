@@ -290,7 +290,7 @@ def _frequencies(scanner: ScannerKind, known: Mapping[str, KnownAxis]) -> list[s
 def _drive_frequency(known: KnownAxis, filled: KnownAxis) -> str:
     comment = "Hz; only used where no drive was recorded"
     if known.drive_frequency is None:
-        return f"# frequency = {filled.drive_frequency:.8g}  # {comment}"
+        return f"# frequency = {filled.drive_frequency:.8g}  # {comment}; left out, `simulate` drives at the resonance"
     return f"frequency = {known.drive_frequency!r}  # {comment}"
 
 
