@@ -92,8 +92,8 @@ def diagnose_files(
         with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
             diagnosis = diagnose_with_optics(recordings, nominal, bar.set_description_str, measure_reference_phase)
             bar.set_description_str("report")
-            page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
-        content = diagnosis.to_json()
+            conclusion, page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
+        content = diagnosis.to_json() | {"conclusion": conclusion}
         with replacing_folder(output, device, *paths) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
             (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
@@ -123,10 +123,9 @@ def _format_plan(summary: dict[str, Any]) -> str:
 
 
 def _format_diagnosis(summary: dict[str, Any]) -> str:
-    from recon.report.conclusions import conclude_diagnosis
     from recon.report.numbers import format_interval, format_probability
 
-    lines = [conclude_diagnosis(summary), f"{summary['output']}: {summary['verdict']}"]
+    lines = [summary["conclusion"], f"{summary['output']}: {summary['verdict']}"]
     for finding in summary["findings"]:
         heldout = finding["heldout"]
         lines.append(

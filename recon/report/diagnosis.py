@@ -38,8 +38,8 @@ UNITS = {"sense": "V", "angle": "rad", "velocity": "rad/s", "acceleration": "rad
 """Unit of a channel by its kind."""
 
 
-def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
-    """One diagnosis as a page.
+def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> tuple[str, str]:
+    """Return the conclusion of a diagnosis, and its page, which begins with it.
 
     Args:
         diagnosis: of the recordings.
@@ -56,7 +56,8 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> str:
         sections += _motion_sections(diagnosis, search, errors)
     sections += [_optics_section(table) for table in diagnosis.optics]
     conclusion = conclude_diagnosis(diagnosis.to_json(), blur)
-    return render(f"Diagnosis of {diagnosis.device.name}", conclusion, sections, subject=f"From {', '.join(names)}.")
+    heading, subject = f"Diagnosis of {diagnosis.device.name}", f"From {', '.join(names)}."
+    return conclusion, render(heading, conclusion, sections, subject=subject)
 
 
 def _overview(diagnosis: Diagnosis) -> Section:

@@ -270,6 +270,8 @@ def test_diagnose_and_predict_write_the_documented_files_and_keys(
     written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert written["schema"] == "lissajous-diagnosis/1"
     assert written["verdict"] == answer["verdict"] == "mismatch"
+    assert written["conclusion"].startswith("The nominal device lacks cubic-stiffness in the mechanics of axis x")
+    assert written["conclusion"].split(". ")[0] in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     (finding,) = written["findings"]
     assert set(finding) >= {
         "axis",

@@ -191,7 +191,7 @@ def test_the_improved_device_restores_the_picture() -> None:
         == {"intensity-delay", "bleaching"}
         == set(device.axis("x").terms)
     )
-    assert "not detectable here" in diagnosis_report(diagnosis, ["scan"])
+    assert "not detectable here" in diagnosis_report(diagnosis, ["scan"])[1]
     assert intensity_delay(device, 1 / SAMPLE_RATE_HZ) == pytest.approx(2e-6, rel=0.1)
 
     grid = Grid(80, 80, HALF_ANGLE_RAD, HALF_ANGLE_RAD)
