@@ -8,6 +8,7 @@ together, as their recordings would be.
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -222,7 +223,8 @@ def plan_files(
 
     check_folder(output)
     planned = {path: read_excitation(path) for path in paths if path.suffix == ".toml"}
-    with ExitStack() as stack, tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
+    bar_format, hidden = "{elapsed} {desc}", quiet or None  # None shows it on a terminal only
+    with ExitStack() as stack, tqdm(file=sys.stderr, disable=hidden, bar_format=bar_format, leave=False) as bar:
         recorded = {path: stack.enter_context(open_any(path, mapping)) for path in paths if path.suffix != ".toml"}
         nominal = devices.find(device) if device is not None else None
         nominal = nominal or next((each.device for each in recorded.values() if each.device is not None), None)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,7 +90,7 @@ def diagnose_files(
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = devices.find(device) if device is not None else None
-        with tqdm(disable=quiet, bar_format="{elapsed} {desc}", leave=False) as bar:
+        with tqdm(file=sys.stderr, disable=quiet or None, bar_format="{elapsed} {desc}", leave=False) as bar:
             diagnosis = diagnose_with_optics(recordings, nominal, bar.set_description_str, measure_reference_phase)
             bar.set_description_str("report")
             conclusion, page = diagnosis_report(diagnosis, [recording.name for recording in recordings])

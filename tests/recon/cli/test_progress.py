@@ -1,0 +1,22 @@
+"""Progress on stderr does not run into what follows it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.cli import main
+from scanner.recording import Recording
+
+
+@pytest.mark.parametrize("option", [[], ["--plan"]])
+def test_an_error_is_the_only_line_where_stderr_is_no_terminal(
+    option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Recording.from_arrays({"sense_x": (np.arange(100.0), "V", 1e3)}).write(tmp_path / "scan.h5")
+    arguments = [*option, str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out")]
+    assert main(["diagnose", *arguments]) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith("lissajous diagnose: ")
+    assert shown.count("\n") == 1
+    assert "\r" not in shown
