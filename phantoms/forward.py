@@ -14,9 +14,9 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from phantoms.drift_term import drift_terms
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.waveforms import Waveform
 from scanner.active_terms import ActiveTerm, stated_terms
@@ -33,12 +33,10 @@ from scanner.forward_model import (
     simulate_axis,
     simulate_coupled,
 )
-from scanner.integrator.abi import TORQUE_LAW
 from scanner.integrator.nodes import to_nodes
 from scanner.optics import apply_intensity_terms, beam_position
 from scanner.recording import Recording
 from scanner.stages import Amdm, MotionSensor, Readout, without_noise
-from scanner.terms import Term
 
 CHUNK_S = 0.01
 """Length integrated at a time [s]: 2 MB an axis at 10 MHz, so memory does not grow with the recording."""
@@ -50,9 +48,6 @@ some percent of that of Q = 100."""
 START_ANGLE_RAD = 0.15
 """Angle from which a driven motion starts [rad]. The large branch of a parametric resonance is reached only from an
 angle near it; the scanners of the papers have amplitudes of 0.1 to 0.2 rad."""
-
-DRIFT_STEP_S = 2e-6
-"""Spacing of the table of a drift [s]: far below the time constant of any drift, and small enough for memory."""
 
 MAX_SAMPLES = 1e8
 """Most samples that are simulated: with 150 bytes each, as measured, they take 15 GB of memory."""
@@ -115,33 +110,6 @@ def drive_inputs(axis: Axis, plan: Plan, t0: float, t1: float) -> DriveInput:
     time = t0 + 0.5 * step * np.arange(2 * n + 1, dtype=np.float64)
     voltage = plan.drives[axis.name](time) * plan.drift.get(axis.name, Drift()).drive(time)
     return DriveInput(to_nodes(voltage), step, t0)
-
-
-def drift_terms(drift: Drift, t0: float, t1: float) -> tuple[ActiveTerm, ...]:
-    """Return a drift of stiffness and damping from ``t0`` to ``t1`` [s] as a term; no term where nothing drifts.
-
-    The parameters of the term are a table, so a device file cannot state it.
-    """
-    knots = np.linspace(t0, t1, max(2, round((t1 - t0) / DRIFT_STEP_S) + 1))
-    table = np.stack([drift.stiffness(knots) - 1.0, drift.damping(knots) - 1.0], axis=1)
-    if not table.any():
-        return ()
-    return (ActiveTerm(_DRIFT, (t0, (t1 - t0) / (knots.size - 1), float(knots.size), *table.ravel().tolist())),)
-
-
-@njit(TORQUE_LAW, cache=True)
-def _drift_torque(t, theta, omega, other, volt, z0, z1, p, nominal):  # type: ignore[no-untyped-def]
-    start, step, knots = p[0], p[1], int(p[2])
-    position = (t - start) / step
-    knot = min(max(int(position), 0), knots - 2)
-    i, u = 3 + 2 * knot, position - knot
-    stiffness, damping = p[i] + u * (p[i + 2] - p[i]), p[i + 1] + u * (p[i + 3] - p[i + 1])
-    return -stiffness * nominal.k * theta - damping * nominal.b * omega, 0.0, 0.0
-
-
-_DRIFT = Term(
-    "drift", "mechanics", "J θ'' + b(t) θ' + k(t) θ = τ", (), "drift of a simulation plan", torque=_drift_torque
-)
 
 
 def simulate_motion(
