@@ -25,7 +25,7 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
     """
     import h5py
 
-    from scanner.recording import FORMAT
+    from scanner.recording_file import FORMAT
 
     if not isinstance(path, str):
         return None

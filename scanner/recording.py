@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
+from scanner.channel import Channel, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Device
 from scanner.devices import find
@@ -26,13 +26,18 @@ from scanner.edges import EDGE_CHANNELS, Edges, make_edges
 from scanner.errors import BadInput, ChannelMissing
 from scanner.files import replacing
 from scanner.hdf5 import attributes, child, new_hdf5, open_hdf5, undamaged
+from scanner.recording_file import (
+    FORMAT,
+    VERSIONS,
+    check_format,
+    check_texts,
+    device_text,
+    open_channel,
+    open_edges,
+    write_channel,
+)
 from scanner.truth import Truth, write_truth
 from scanner.wording import counted
-
-FORMAT = "lissajous-recording"
-VERSIONS = (1,)
-TEXT_ATTRIBUTES = ("name", "notes", "acquired")
-"""Attributes of the file that are texts; a number is accepted as one."""
 
 # A sample less than this fraction of a sample before a cut belongs to the part after it: rounding of times moved it.
 _ROUNDING = 1e-6
@@ -81,14 +86,14 @@ class Recording:
         try:
             with undamaged(path):
                 attrs = attributes(file)
-                _check_format(attrs.pop("format", None), attrs.pop("version", None), path)
-                _check_texts(attrs, path)
+                check_format(attrs.pop("format", None), attrs.pop("version", None), path)
+                check_texts(attrs, path)
                 group = child(file, "channels", h5py.Group)
                 if group is None or not len(group):
                     raise BadInput("holds no channels", file=path, hint="store signals under /channels")
-                channels = {name: _open_channel(group, name, path) for name in group if name not in EDGE_CHANNELS}
-                edges = {name: _open_edges(group, name, path) for name in group if name in EDGE_CHANNELS}
-                text = _device_text(file, path)
+                channels = {name: open_channel(group, name, path) for name in group if name not in EDGE_CHANNELS}
+                edges = {name: open_edges(group, name, path) for name in group if name in EDGE_CHANNELS}
+                text = device_text(file, path)
         except BaseException:
             file.close()
             raise
@@ -266,7 +271,7 @@ class Recording:
             file.attrs.update({**self.attrs, "format": FORMAT, "version": VERSIONS[-1]})
             group = file.create_group("channels")
             for channel in self.channels.values():
-                _write_channel(group, channel)
+                write_channel(group, channel)
             for edges in self.edges.values():
                 group.create_dataset(edges.name, data=edges.times).attrs.update(edges.attributes)
             if self.device_toml is not None:
@@ -282,56 +287,12 @@ def _edges_from_tuple(name: str, given: object) -> Edges:
     return make_edges(name, _as_numbers(given[0], name), {"unit": given[1], **given[2]})
 
 
-def _open_edges(group: h5py.Group, name: str, path: Path) -> Edges:
-    dataset = child(group, name, h5py.Dataset)
-    if dataset is None:
-        raise BadInput("is listed and not there", file=path, channel=name, hint="copy the file again")
-    return make_edges(name, dataset[...], attributes(dataset), str(path))
-
-
 def _as_numbers(values: ArrayLike, name: str) -> NDArray[Any]:
     """The values as an array, masked ones as NaN; BadInput where rows differ in length, so that they form none."""
     try:
         return np.ma.filled(np.ma.array(values, float), np.nan) if np.ma.is_masked(values) else np.asarray(values)
     except ValueError:
         raise BadInput("is no array: its rows differ in length", channel=name, hint="give shape (n,)") from None
-
-
-def _check_format(name: object, version: object, path: Path) -> None:
-    if name != FORMAT:
-        what = "states no format" if name is None else f"is of format {name!r}"
-        hint = f"a recording has the attribute format = {FORMAT!r}; make one with `lissajous convert`"
-        raise BadInput(what, file=path, hint=hint)
-    if version not in VERSIONS:
-        what = "states no version" if version is None else f"is a recording of version {version!r}"
-        raise BadInput(what, file=path, hint=f"versions read here: {', '.join(map(str, VERSIONS))}")
-
-
-def _check_texts(attrs: Mapping[str, Any], path: Path) -> None:
-    for key in TEXT_ATTRIBUTES:
-        if not isinstance(attrs.get(key, ""), (str, int, float)):
-            hint = f"store {key} as one text, or remove it"
-            raise BadInput(f"attribute {key} is {type(attrs[key]).__name__}, not text", file=path, hint=hint)
-
-
-def _device_text(file: h5py.File, path: Path) -> str | None:
-    group = child(file, "device", h5py.Group)
-    text = None if group is None else attributes(group).get("toml")
-    if text is not None and not isinstance(text, str):
-        raise BadInput("attribute toml is not text", file=path, channel="/device", hint="store the device as TOML text")
-    return text
-
-
-def _open_channel(group: h5py.Group, name: str, path: Path) -> Channel:
-    dataset = child(group, name, h5py.Dataset)
-    if dataset is None:
-        raise BadInput("is listed and not there", file=path, channel=name, hint="copy the file again")
-    stated = attributes(dataset)
-    required = {key: stated.get(key) for key in ("unit", "sample_rate")}
-    optional = {
-        key: stated[key] for key in ("start", "gain", "offset", "detectors", "reference", "level") if key in stated
-    }
-    return make_channel(name, dataset, file=str(path), **required, **optional)
 
 
 def _cut(channel: Channel, t0: float, t1: float) -> Channel:
@@ -343,23 +304,3 @@ def _cut(channel: Channel, t0: float, t1: float) -> Channel:
     high = max(index(t1), low)
     start = channel.start + low / channel.sample_rate
     return replace(channel, start=start, first=channel.first + low, stop=channel.first + high)
-
-
-def _write_channel(group: h5py.Group, channel: Channel) -> None:
-    whole = channel.raw.dtype.kind in "iu"
-    plain = channel.gain == 1.0 and channel.offset == 0.0
-    dtype = channel.raw.dtype if whole or plain else np.float64
-    dataset = group.create_dataset(channel.name, channel.shape, dtype)
-    for first in range(0, channel.size, READ_CHUNK_SAMPLES):
-        stop = min(first + READ_CHUNK_SAMPLES, channel.size)
-        if whole or plain:
-            dataset[first:stop] = channel.raw[channel.first + first : channel.first + stop]
-        else:
-            dataset[first:stop] = channel.read(first, stop)
-    dataset.attrs.update({"unit": channel.unit, "sample_rate": channel.sample_rate, "start": channel.start})
-    if channel.reference is not None:
-        dataset.attrs["reference"] = channel.reference
-    if channel.detectors:
-        dataset.attrs["detectors"] = list(channel.detectors)
-    if whole and not plain:
-        dataset.attrs.update({"gain": channel.gain, "offset": channel.offset})

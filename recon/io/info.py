@@ -11,7 +11,7 @@ from recon.io.readers.column_names import TIME_NAMES
 from recon.io.readers.contents import Variable
 from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS
 from scanner.hdf5 import attributes, check_ends, is_hdf5, open_hdf5
-from scanner.recording import FORMAT
+from scanner.recording_file import FORMAT
 
 HEADING = f"""\
 # A suggestion to edit: name each channel by what it is, remove the others, state what is commented out.
