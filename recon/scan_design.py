@@ -12,7 +12,7 @@ to be met at the worst phase.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,30 +20,18 @@ import numpy as np
 from recon.imaging.coverage import largest_gap, time_for_fill
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
+from recon.lissajous_figure import PHASES, FrequencyRange, LissajousFigure, enumerate_figures
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.parametric import sine_drive, steady_state, stiffness_modulation, threshold, tongue_edges
 from scanner.stages import Scan
 
-FrequencyRange = tuple[float, float]
-"""Lowest and highest frequency [Hz]."""
-
-MAX_RATE_EXCESS = 0.1
-"""Fraction by which a figure may repeat faster than required: few pairs meet a frame rate exactly."""
-
 MAX_EVALUATED_FIGURES = 12
 """Figures whose fill is computed, those nearest to the frame rate. It bounds the cost, a second for each."""
 
 MAX_PICTURE_SAMPLES = 5e7
 """Most samples of one picture, which take 4 GB of memory: 10 s at 5 MHz."""
-
-MAX_WINDINGS = 20_000
-"""Most cycles of an axis in one picture. It bounds the pairs that are compared to some millions, a few seconds, and
-the beam's path over 400 pixels to the samples of ``MAX_PICTURE_SAMPLES``."""
-
-PHASES = ("best", "worst")
-"""Phases between the axes at which a figure is evaluated: of the finest and of the coarsest mesh."""
 
 _TONGUE_STEPS = 12
 """Steps of the drive's frequency across the instability tongue."""
@@ -150,55 +138,6 @@ def _crossing_frequency(frequency: Array, amplitude: Array, level: float) -> flo
 
 
 @dataclass(frozen=True)
-class LissajousFigure:
-    """A closed Lissajous figure.
-
-    Attributes:
-        windings: cycles of x and of y in one picture, n_x and n_y.
-        frame_rate: pictures per second [Hz].
-        amplitude: of x and of y [rad].
-    """
-
-    windings: tuple[int, int]
-    frame_rate: float
-    amplitude: tuple[float, float]
-
-    @property
-    def phase_best_to_worst(self) -> tuple[float, float]:
-        """Difference between the best and the worst phase, of x and of y [rad]."""
-        n_x, n_y = self.windings
-        return 0.5 * math.pi / n_y, 0.5 * math.pi / n_x
-
-    def angles(self, rate: float, phase: str) -> tuple[Array, Array]:
-        """Return the angles of one picture, shape (samples per picture,) [rad].
-
-        The figure runs into a corner where both motions reverse at once: n_y phi_x - n_x phi_y = (n_y - n_x) pi/2,
-        modulo pi. That is the "worst" phase. The "best" phase, of the finest mesh, is half way to the next worst one.
-        It is symmetric, as the pixels are, so lines may share pixels: a phase nearby can fill a few per cent more.
-
-        Args:
-            rate: samples per second [Hz].
-            phase: one of ``PHASES``.
-        """
-        n_x, n_y = self.windings
-        turn = 2.0 * np.pi * self.frame_rate * np.arange(round(rate / self.frame_rate)) / rate
-        phi_x = 0.5 * math.pi * (n_y - n_x + (phase == "best")) / n_y
-        return self.amplitude[0] * np.sin(n_x * turn + phi_x), self.amplitude[1] * np.sin(n_y * turn)
-
-    def mesh_diameter(self, grid: Grid) -> float:
-        """Return the diameter of the largest disc in the middle rhombus at the best phase [px]."""
-        across = 0.5 * math.pi * grid.width * self.amplitude[0] / grid.half_angle_x / self.windings[1]
-        high = 0.5 * math.pi * grid.height * self.amplitude[1] / grid.half_angle_y / self.windings[0]
-        return across * high / math.hypot(across, high)
-
-    def path_rate(self, grid: Grid) -> float:
-        """Return the sample rate [Hz] at which the beam moves half a pixel per sample at most, on each axis."""
-        x = self.windings[0] * self.amplitude[0] / grid.half_angle_x * grid.width
-        y = self.windings[1] * self.amplitude[1] / grid.half_angle_y * grid.height
-        return 2.0 * math.pi * self.frame_rate * max(x, y)
-
-
-@dataclass(frozen=True)
 class ScanCandidate:
     """A figure with its drive and its performance, by ``PHASES`` where it depends on the phase between the axes.
 
@@ -274,29 +213,6 @@ def find_sustained_band(axis: Axis, amplitude: float, offset: float) -> Sustaine
     drive, reached = np.array(sorted(points)).T
     finer = np.linspace(drive[0], drive[-1], 401)
     return SustainedBand(axis.name, finer, PchipInterpolator(drive, reached)(finer), 2)
-
-
-def enumerate_figures(
-    x: FrequencyRange, y: FrequencyRange, frame_rate: float
-) -> Iterator[tuple[tuple[int, int], float]]:
-    """Yield windings and frame rate [Hz] of each figure that repeats at ``frame_rate`` or slightly faster.
-
-    Args:
-        x, y: lowest and highest frequency of the motions [Hz].
-        frame_rate: pictures per second [Hz].
-
-    Raises:
-        BadInput: a picture would take more than ``MAX_WINDINGS`` cycles.
-    """
-    if max(x[1], y[1]) > MAX_WINDINGS * frame_rate:
-        what = f"a picture at {frame_rate:g} Hz takes {max(x[1], y[1]) / frame_rate:.3g} cycles"
-        raise BadInput(what, hint=f"give a frame rate of {max(x[1], y[1]) / MAX_WINDINGS:.2g} Hz or more")
-    most = frame_rate * (1.0 + MAX_RATE_EXCESS)
-    for n_x in range(max(1, math.ceil(x[0] / most)), math.floor(x[1] / frame_rate) + 1):
-        for n_y in range(max(1, math.ceil(y[0] / most)), math.floor(y[1] / frame_rate) + 1):
-            slowest = max(frame_rate, x[0] / n_x, y[0] / n_y)
-            if math.gcd(n_x, n_y) == 1 and slowest <= min(most, x[1] / n_x, y[1] / n_y):
-                yield (n_x, n_y), slowest
 
 
 def design(

@@ -9,10 +9,11 @@ import numpy as np
 
 from recon.imaging.coverage import fill_against_time, gap_against_time
 from recon.imaging.gridding import map_samples
+from recon.lissajous_figure import PHASES
 from recon.report.figures import COLOURS, figure_uri, new_figure, use_plain_ticks
 from recon.report.page import Figure, Section, Table, render
 from recon.report.reconstruction import coverage_figure, scale_bar
-from recon.scan_design import PHASES, ScanCandidate, ScanRequirements, SustainedBand
+from recon.scan_design import ScanCandidate, ScanRequirements, SustainedBand
 
 SHOWN_CANDIDATES = 3
 """Candidates in the plots over time: six curves can be distinguished."""

@@ -16,15 +16,8 @@ from recon.cli import main
 from recon.imaging.coverage import fill_against_time, gap_against_time, largest_gap
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
-from recon.scan_design import (
-    MAX_RATE_EXCESS,
-    LissajousFigure,
-    ScanRequirements,
-    SustainedBand,
-    design,
-    enumerate_figures,
-    find_sustained_band,
-)
+from recon.lissajous_figure import MAX_RATE_EXCESS, LissajousFigure, enumerate_figures
+from recon.scan_design import ScanRequirements, SustainedBand, design, find_sustained_band
 from scanner import devices
 from scanner.errors import BadInput
 from scanner.stages import Drive
