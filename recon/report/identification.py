@@ -51,7 +51,7 @@ def identification_report(
     for axis, result in summary["axes"].items():
         rows = [
             [
-                LABELS[name],
+                LABELS.get(name, name),
                 format_interval(value["value"], value["ci95"][0], value["ci95"][1], value["unit"]),
                 format_range(*value["ci95"]),
                 *_compare_with_nominal(value["value"], nominal_value(nominal, axis, name)),
