@@ -81,6 +81,8 @@ def fit_readout_curve(layout: BlockLayout, observations: BlockObservations, stat
         return None
     samples = [_block_samples(layout, observations, states, k) for k in blocks]
     signal = np.concatenate([h for _, h, _ in samples])
+    if signal.size == 0:  # a track that diverged, or blocks without a sample between the rails
+        return None
     low, high = np.quantile(signal, TAIL_FRACTIONS), np.quantile(signal, 1.0 - TAIL_FRACTIONS)
     equations = _BlockEquations(
         *(np.stack(part) for part in zip(*(_project(*each, low, high) for each in samples), strict=True))

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from estimation.estimate import check_finite, estimate
+from recon.pipeline import reconstruct
 from recon.preparation import prepare
+from recon.reconstruction import Options
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
+from tests.support.simulated import imaging, with_sense
 
 RATE = 1e5
 TIME = np.arange(20_000) / RATE
@@ -100,3 +103,10 @@ def test_an_estimator_that_diverges_is_refused_in_one_line() -> None:
     motion = AxisMotion(TIME[:3], unknown, unknown, unknown, unknown, SampledAngle(unknown, RATE))
     with pytest.raises(BadInput, match="tracker diverges: the signal of x does not fit the device; check units"):
         check_finite(Motion({"x": motion}, "tracker"), scan(2000.0, 835.0))
+
+
+def test_a_signal_of_both_axes_in_the_wrong_unit_is_refused_in_one_line() -> None:
+    """The track diverges before a curve of the readout is sought."""
+    millivolts = with_sense(imaging()[0], lambda values: 1000.0 * values)
+    with pytest.raises(BadInput, match="tracker diverges: the signal of x does not fit the device; check units"):
+        reconstruct(millivolts, Options(), quiet=True)
