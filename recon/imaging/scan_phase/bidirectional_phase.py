@@ -256,7 +256,8 @@ def _estimate_phase_errors(
     """Phase errors, standard errors and parts as in ``_Fit``, each at the cell size with the least standard error, the
     slow gain, and the factors for a common shift, shape (slices, 2)."""
     part = samples.block // BLOCKS_PER_SLICE
-    if np.bincount(part, minlength=slices).min() < 4 * BLOCKS_PER_SLICE:
+    filled = np.bincount(part, minlength=slices) >= 4 * BLOCKS_PER_SLICE  # others lie in a gap and determine nothing
+    if not filled.any():
         nothing = np.full((slices, 2), np.nan), np.full((slices, 2), np.inf)
         return *nothing, _undetermined_parts(slices), None, np.ones((slices, 2))
     inside = (2.0 * np.abs(samples.x) < grid.width) & (2.0 * np.abs(samples.y) < grid.height)
@@ -266,10 +267,12 @@ def _estimate_phase_errors(
     )
     gain = _slow_gain(samples.select(inside), grid, finest, slices)
     samples = samples._replace(intensity=samples.intensity / gain.at(_slice_time(samples)))
-    start = np.array([search_phase_errors(samples.select(part == s)) for s in range(slices)])
+    unknown = np.full(2, np.nan)
+    start = np.array([search_phase_errors(samples.select(part == s)) if filled[s] else unknown for s in range(slices)])
     clear = np.isfinite(start)
     start = np.where(clear, start, 0.0)
-    groups = _blocks_of_a_period(samples.dx, slices), _blocks_of_a_period(samples.dy, slices)
+    covered = int(filled.sum())
+    groups = _blocks_of_a_period(samples.dx, covered), _blocks_of_a_period(samples.dy, covered)
     best, limit = start, np.full_like(start, SEARCH_RESOLUTION_RAD)
     best_parts, factor, coarser = _undetermined_parts(slices), np.ones_like(start), None
     for cell in (4 * finest, 2 * finest, finest):  # noisy pictures need large cells, fine detail small ones

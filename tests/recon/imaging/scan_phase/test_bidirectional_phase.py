@@ -180,3 +180,14 @@ def test_an_axis_that_does_not_move_has_no_phase_error() -> None:
     still = np.zeros_like(y)
     samples = RegistrationSamples(still, y, still, np.ones_like(y), np.cos(y), np.zeros(y.size, np.int64))
     assert np.isnan(search_phase_errors(samples)).all()
+
+
+def test_a_slice_without_samples_leaves_the_others_determined():
+    """A gap of the intensity or of the known angle that is longer than a slice."""
+    theta_x, theta_y, intensity = scan(*np.radians((0.3, -0.1)))
+    intensity[75_000:150_000] = np.nan
+    value, sd = registered(theta_x, theta_y, intensity, slices=4)
+    others = [0, 2, 3]
+    assert np.isnan(value[1]).all()
+    assert np.isinf(sd[1]).all()
+    assert_allclose(value[others], np.tile([0.3, -0.1], (3, 1)), atol=0.04)
