@@ -134,6 +134,9 @@ def evaluate_axis(axis: AxisMotion, angle: Array, rate: float, start: float) -> 
     block = slow_clock_block(frequency, track.sample_rate, CYCLES_PER_PHASE, last - first)
     time, estimated = block_phasors(track_angle[first:last], track.sample_rate, begin, frequency, block)
     _, true = block_phasors(angle[first:last], track.sample_rate, begin, frequency, block)
+    known = np.isfinite(estimated) & np.isfinite(true)
+    if known.any():  # the angle may be unknown within the recording too
+        time, estimated, true = time[known], estimated[known], true[known]
     mirrored = bool(np.sum((np.conj(estimated) * true).real) < 0.0)
     sign = -1.0 if mirrored else 1.0
     return AxisEvaluation(

@@ -14,7 +14,7 @@ from recon.imaging.scan_phase.doubled_frequency import describe_doubled_axes
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment
-from recon.quality.defects import Defect, describe_clipped_positions
+from recon.quality.defects import Defect, describe_clipped_positions, describe_held_signals
 from recon.quality.detector_gaps import describe_detector_gaps
 from recon.sample_ranges import SampleRanges
 from scanner.channel import Channel
@@ -68,6 +68,7 @@ def describe_limits(
     sums = describe_running_sums(intensity)
     return [
         *describe_clipped_positions(defects, beam, intensity.size / intensity.sample_rate),
+        *describe_held_signals(defects, beam),
         *(sums or describe_doubled_axes(beam, intensity) or describe_contradictions(beam, intensity)),
         *describe_saturation(intensity),
         *describe_lower_rail(intensity),

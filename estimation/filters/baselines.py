@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
 
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
+from estimation.held_samples import find_held_runs
 from estimation.initial import fit_initial_motion
 from estimation.lock_in_channels import lock_in_angle
 from estimation.reference import (
@@ -101,7 +103,8 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     reference = reference_of_any_waveform(recording, device, name, channel)
     if reference.kind in ("drive", "half-drive") and channel.sample_rate < MIN_SAMPLES_PER_PERIOD * reference.frequency:
         raise sampled_too_slowly(channel, "a motion", reference.frequency)
-    return axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel))
+    held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
+    return axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel), held)
 
 
 def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[Channel, float, float, float | None]:
@@ -155,7 +158,12 @@ def reference_of_any_waveform(recording: Recording, device: Device, name: str, c
 
 
 def axis_motion_from_angle(
-    angle: Array, channel: Channel, reference: PhaseReference, noise_sd: float | None, clock: tuple[float, float, int]
+    angle: Array,
+    channel: Channel,
+    reference: PhaseReference,
+    noise_sd: float | None,
+    clock: tuple[float, float, int],
+    held: Sequence[tuple[int, int]] = (),
 ) -> AxisMotion:
     """The motion of one axis from its measured angle.
 
@@ -163,6 +171,7 @@ def axis_motion_from_angle(
         angle: at the samples of ``channel``, shape (n,) [rad].
         noise_sd: white noise of the sensor, per sample [rad]; measured where None.
         clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
+        held: ranges of samples at which the sensor was stopped; the angle in the result is not known there (NaN).
 
     Raises:
         BadInput: the channel is shorter than two blocks.
@@ -181,6 +190,10 @@ def axis_motion_from_angle(
     if noise_sd is None:
         noise_sd = white_noise_sd(angle[:NOISE_SAMPLES])
     phase = reference.relative_phase(time, phasors)
+    resampled = resample_to_clock(angle, channel, clock).copy()
+    for first, stop in held:
+        begin, end = (round((channel.start + at / rate - clock[1]) * clock[0]) for at in (first, stop))
+        resampled[max(begin, 0) : max(end, 0)] = np.nan
     return AxisMotion(
         time=time,
         phase=phase,
@@ -189,7 +202,7 @@ def axis_motion_from_angle(
         phase_sd=np.minimum(
             noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block), UNIFORM_PHASE_SD
         ),
-        angle=SampledAngle(resample_to_clock(angle, channel, clock), clock[0], clock[1]),
+        angle=SampledAngle(resampled, clock[0], clock[1]),
         reference=reference.kind,
         sign=f"known: {channel.name}",
     )

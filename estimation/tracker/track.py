@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimation.held_samples import without_held_samples
 from estimation.reference import PhaseReference
 from estimation.signals import SenseChannel, intensity_clock, is_capacitive, phase_reference, sense_channels
 from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noise, expand_clipped_blocks, track_blocks
@@ -87,6 +88,8 @@ def track(
             for name, frequency in zip(sense.axes, frequencies, strict=True)
         }
         _check_resonant(sense, device, references)
+        slowest = min(reference.frequency for reference in references.values())
+        sense = replace(sense, channel=without_held_samples(sense.channel, slowest))
         curves = list(end.tuning.curves) if end else []
         for curve in curves:
             sense = replace(sense, channel=straightened_channel(sense.channel, curve))

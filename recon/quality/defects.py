@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true, to_sample_ranges
+from estimation.held_samples import find_held_runs, slowest_motions
+from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true, subtract_ranges, to_sample_ranges
 from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, READ_CHUNK_SAMPLES, Channel
+from scanner.device import Device
 from scanner.motion import Motion, SampledAngle
 from scanner.recording import Recording
 
@@ -31,10 +33,16 @@ MAX_CLIPPED_SHARE = 0.01
 """Share of clipped samples of a position signal from which the picture is wrong. A sine that is clipped at both peaks
 for so long loses 1.2e-4 of its amplitude, 0.02 of 400 pixels."""
 
+ESTIMATORS_WITHOUT_GAPS = ("ekf", "ukf", "hyb", "acm", "sine-ukf", "constant")
+"""Estimators that follow a sense signal sample by sample. The others leave held samples out."""
+
 PHASE_JUMP = "leap"
 """Kind of a phase jump. summary.json contains this text, and programs that read it depend on it."""
 
-KIND_NAMES = {PHASE_JUMP: "phase jump"}
+HELD = "held"
+"""Kind of an interval in which a signal of the motion stands at one value for a period or longer."""
+
+KIND_NAMES = {PHASE_JUMP: "phase jump", HELD: "held at one value"}
 """Names of kinds in messages, where they differ from the text in summary.json."""
 
 
@@ -44,9 +52,9 @@ class Defect:
 
     Attributes:
         channel: name of the channel.
-        kind: ``"gap"`` (samples that are not finite), ``"clipped"``, ``"missing"`` (the channel begins later or ends
-            earlier than the intensity) or ``PHASE_JUMP`` (see :mod:`recon.quality.clock_jumps`; of the intensity, see
-            :mod:`recon.quality.dropped_samples`).
+        kind: ``"gap"`` (samples that are not finite), ``HELD``, ``"clipped"``, ``"missing"`` (the channel begins later
+            or ends earlier than the intensity) or ``PHASE_JUMP`` (see :mod:`recon.quality.clock_jumps`; of the
+            intensity, see :mod:`recon.quality.dropped_samples`).
         start, stop: [s] on the recording's clock.
         fraction: of the samples in the interval that are affected.
     """
@@ -58,23 +66,27 @@ class Defect:
     fraction: float = 1.0
 
 
-def find_defects(recording: Recording) -> list[Defect]:
-    """Return gaps, clipping and missing parts of the channels that a picture is made of.
+def find_defects(recording: Recording, device: Device) -> list[Defect]:
+    """Return gaps, held values, clipping and missing parts of the channels that a picture is made of.
 
     Args:
         recording: with an intensity.
+        device: of the recording; it states how long a signal of the motion can stand at one value.
 
     Returns:
         The defects channel by channel, those of one kind in order of time.
     """
     intensity = recording["intensity"]
     defects: list[Defect] = []
+    slowest = slowest_motions(recording, device)
     for name, channel in recording.channels.items():
         if name.startswith(("sense", "drive_", "angle_")) or name == "intensity":
             defects += _find_missing_ends(channel, intensity)
             defects += _as_defects(channel, "gap", _find_gaps(channel))
+            held = find_held_runs(channel, slowest[name]) if name in slowest else []
+            defects += _as_defects(channel, HELD, held)
             if name.startswith("sense"):
-                defects += _as_defects(channel, "clipped", _find_clipped_runs(channel))
+                defects += _as_defects(channel, "clipped", subtract_ranges(_find_clipped_runs(channel), held))
     return defects
 
 
@@ -148,6 +160,27 @@ def describe_clipped_positions(defects: Sequence[Defect], motion: Motion, durati
         "is wrong beyond that angle; lower the amplifier's gain, or use --estimator tracker, which needs the mechanics"
         for name, share in shares.items()
         if share > MAX_CLIPPED_SHARE
+    ]
+
+
+def describe_held_signals(defects: Sequence[Defect], motion: Motion) -> list[str]:
+    """A line for each held signal of the motion whose estimator does not leave the held samples out.
+
+    Args:
+        defects: of the recording.
+        motion: with the estimator's name.
+    """
+    if motion.estimator not in ESTIMATORS_WITHOUT_GAPS:
+        return []
+    held: dict[str, list[Defect]] = {}
+    for each in defects:
+        if each.kind == HELD:
+            held.setdefault(each.channel, []).append(each)
+    return [
+        f"{name}: stands at one value for {1e3 * sum(each.stop - each.start for each in same):.4g} ms, the first time "
+        f"at {same[0].start:.6g} s, as a sensor or a converter that was stopped; the estimator {motion.estimator} "
+        "takes the value for the motion, and the picture is wrong there; use --estimator tracker, or cut the recording"
+        for name, same in held.items()
     ]
 
 

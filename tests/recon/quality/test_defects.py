@@ -24,7 +24,9 @@ from recon.quality.defects import Defect, describe_defects, find_defects
 from recon.quality.dropped_samples import first_late_slice, slice_delays
 from recon.reconstruction import Options, Reconstruction
 from recon.sample_ranges import subtract_ranges, to_sample_ranges
+from scanner.device import Device
 from scanner.recording import Recording
+from tests.support import two_axis_scan
 from tests.support.simulated import imaging, separate_electrodes
 
 SAMPLE_RATE_HZ = 5e6
@@ -48,6 +50,11 @@ def with_gap(name: str, first: int, stop: int, value: float = np.nan) -> np.ndar
     signal = values(name)
     signal[first:stop] = value
     return signal
+
+
+def defects_of(recording: Recording) -> list[Defect]:
+    assert recording.device is not None
+    return find_defects(recording, recording.device)
 
 
 def reconstruct_scan(recording: Recording) -> Reconstruction:
@@ -86,7 +93,7 @@ def test_single_missing_samples_are_stated_with_their_share() -> None:
     """They are closer than the merged gap, so they are one interval, of which few samples are missing."""
     signal = damaged()["intensity"].read()
     signal[::50] = np.nan
-    (defect,) = find_defects(damaged(intensity=signal))
+    (defect,) = defects_of(damaged(intensity=signal))
     assert defect.fraction == pytest.approx(0.02, rel=1e-3)
     (line,) = describe_defects([defect])
     assert line.endswith("0.02 of the samples there")
@@ -102,6 +109,35 @@ def test_a_gap_in_the_sense_signal_is_bridged_and_its_pixels_marked(whole: Recon
         assert np.degrees(result.evaluation[axis].phase_rmse) < np.degrees(whole.evaluation[axis].phase_rmse) + 0.1
 
 
+@pytest.mark.parametrize("value", ["last", "rail", "zero"])
+def test_a_held_sense_signal_is_bridged_as_a_gap(whole: Reconstruction, value: str) -> None:
+    """A converter that repeats a sample, an amplifier at its rail, and a cable that came off."""
+    signal = values("sense")
+    number = {"last": signal[40_000], "rail": signal.max(), "zero": 0.0}[value]
+    result = reconstruct_scan(damaged(sense=with_gap("sense", 40_000, 50_000, number)))  # 2 ms of 20
+    (defect,) = result.defects
+    assert (defect.channel, defect.kind) == ("sense", "held")
+    assert (defect.start, defect.stop) == pytest.approx((0.008, 0.01), abs=1e-6)
+    assert any("sense: held at one value for 2 ms" in note for note in result.notes)
+    for axis in "xy":
+        assert np.degrees(result.evaluation[axis].phase_rmse) < np.degrees(whole.evaluation[axis].phase_rmse) + 0.1
+
+
+def test_a_held_position_maps_no_samples_and_leads_the_conclusion_where_it_is_used() -> None:
+    channels = {**two_axis_scan.sensors(772002), "intensity": (two_axis_scan.light(772002), "V", two_axis_scan.RATE_HZ)}
+    position = channels["sense_x"][0]
+    position[10_000:20_000] = position[10_000]  # 10 ms of 40
+    device = Device.from_toml("[x]\n[y]\n" + two_axis_scan.READOUTS + two_axis_scan.FIELD)
+    held = Recording.from_arrays(channels, device)
+    result = reconstruct(held, Options(pixels=(80, 80)), quiet=True)
+    assert result.motion.estimator == "sensor"
+    assert 10_000 <= result.unlocated_samples < 13_000
+    assert result.limits == []
+    assert any("sense_x: held at one value for 10 ms" in note for note in result.notes)
+    taken = reconstruct(held, Options(pixels=(80, 80), estimator="sine-ukf", allow_outside=True), quiet=True)
+    assert any(line.startswith("sense_x: stands at one value for 10 ms") for line in taken.limits)
+
+
 def test_gaps_in_a_drive_do_not_change_the_phase(whole: Reconstruction) -> None:
     result = reconstruct_scan(damaged(drive_x=with_gap("drive_x", 30_000, 33_000)))
     assert [each.channel for each in result.defects] == ["drive_x"]
@@ -115,7 +151,7 @@ def test_clipping_of_the_sense_signal_is_reported_with_its_time() -> None:
     clipped[50_000:70_000] = np.minimum(signal[50_000:70_000], top)
     clipped[:50_000] = np.where(signal[:50_000] > top, top - 0.01, signal[:50_000])
     clipped[70_000:] = np.where(signal[70_000:] > top, top - 0.01, signal[70_000:])
-    (defect,) = find_defects(damaged(sense=clipped))
+    (defect,) = defects_of(damaged(sense=clipped))
     assert (defect.channel, defect.kind) == ("sense", "clipped")
     assert 0.0099 < defect.start < defect.stop < 0.0141
 

@@ -1,0 +1,95 @@
+"""Segments in which a signal of a resonant motion stands at one value: a sensor or a converter that was stopped.
+
+A converter that repeats its last sample, a cable that came off and an amplifier at its rail give equal samples. A
+motion at resonance passes its whole range within a period, so that equal samples for a period do not show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.reference import tone_frequency
+from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, READ_CHUNK_SAMPLES, Channel, LazySamples
+from scanner.device import Axis, Device
+from scanner.errors import BadInput
+from scanner.recording import Recording
+from scanner.stages import Position
+
+
+def slowest_motions(recording: Recording, device: Device) -> dict[str, float]:
+    """Frequency of the slowest motion that each sense and angle channel shows [Hz], by channel.
+
+    A channel of an axis whose frequency neither a drive nor the device nor a position signal shows is left out.
+    """
+    frequencies = {
+        name: frequency
+        for name, axis in device.axes.items()
+        if (frequency := next(_frequencies(recording, axis, name), None)) is not None
+    }
+    slowest = {f"{kind}_{name}": frequency for name, frequency in frequencies.items() for kind in ("sense", "angle")}
+    if len(frequencies) == len(device.axes):
+        slowest["sense"] = min(frequencies.values())
+    return {name: frequency for name, frequency in slowest.items() if name in recording}
+
+
+def _frequencies(recording: Recording, axis: Axis, name: str) -> Iterator[float]:
+    """Frequencies of the motion of an axis [Hz], the best one first."""
+    drive = axis.drive
+    if drive is not None and f"drive_{name}" in recording:
+        with suppress(BadInput):
+            yield drive.motion_per_drive * tone_frequency(recording[f"drive_{name}"])
+    if drive is not None and drive.frequency is not None:
+        yield drive.motion_per_drive * drive.frequency
+    if axis.mechanics is not None:
+        yield axis.resonance
+    positions = ("angle", "sense") if isinstance(axis.readout, Position) else ("angle",)
+    for channel in (f"{kind}_{name}" for kind in positions if f"{kind}_{name}" in recording):
+        with suppress(BadInput):
+            yield tone_frequency(recording[channel])
+
+
+def find_held_runs(channel: Channel, frequency: float) -> list[tuple[int, int]]:
+    """Runs of equal samples that last for a period or longer.
+
+    Args:
+        channel: of shape (n,).
+        frequency: of the slowest motion that the channel shows [Hz].
+
+    Returns:
+        Ranges of samples (first, stop), increasing and disjoint. Samples that are not finite are in none.
+    """
+    shortest = max(MIN_CLIPPED_RUN_SAMPLES, ceil(channel.sample_rate / frequency))
+    runs: list[tuple[int, int]] = []
+    begin, last = 0, np.nan  # of the run in which the chunk before ended
+    for first in range(0, channel.size, READ_CHUNK_SAMPLES):
+        values = channel.stored(first, first + READ_CHUNK_SAMPLES)
+        changes = first + 1 + np.flatnonzero(values[1:] != values[:-1])
+        edges = np.concatenate([[begin], [first] if values[0] != last else [], changes]).astype(np.int64)
+        long = np.flatnonzero(np.diff(edges) >= shortest)
+        runs += [(int(edges[i]), int(edges[i + 1])) for i in long]
+        begin, last = int(edges[-1]), values[-1]
+    if channel.size - begin >= shortest:
+        runs.append((begin, channel.size))
+    return runs
+
+
+def without_held_samples(channel: Channel, frequency: float) -> Channel:
+    """Return a channel whose held samples are missing (NaN); arguments as for :func:`find_held_runs`."""
+    runs = find_held_runs(channel, frequency)
+    if not runs:
+        return channel
+
+    def fetch(first: int, stop: int) -> NDArray[np.float64]:
+        values = channel.read(first, stop)
+        for begin, end in runs:
+            values[max(begin - first, 0) : max(end - first, 0)] = np.nan
+        return values
+
+    raw = LazySamples((channel.size,), np.dtype(np.float64), fetch)
+    return replace(channel, raw=raw, first=0, stop=channel.size, gain=1.0, offset=0.0)

@@ -1,0 +1,43 @@
+"""Segments in which a signal of a resonant motion stands at one value are found, whatever the type and the chunks."""
+
+import numpy as np
+import pytest
+
+from estimation.held_samples import find_held_runs, without_held_samples
+from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
+
+RATE_HZ, FREQUENCY_HZ = 1e6, 1e3
+SAMPLES = 3 * READ_CHUNK_SAMPLES
+RUNS = [(0, 1_000), (READ_CHUNK_SAMPLES - 600, READ_CHUNK_SAMPLES + 600), (SAMPLES - 1_500, SAMPLES)]
+
+
+def held(dtype: type = np.float64) -> Channel:
+    """A sine of 1000 samples a period that stands still three times, and once for less than a period."""
+    values = np.round(1000.0 * np.sin(2.0 * np.pi * FREQUENCY_HZ / RATE_HZ * (np.arange(SAMPLES) + 0.3)))
+    for first, stop in [*RUNS, (50_000, 50_999)]:
+        values[first:stop] = 3000.0
+    return make_channel("sense_x", values.astype(dtype), unit="V", sample_rate=RATE_HZ, gain=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16])
+def test_runs_of_a_period_are_found_also_across_chunks_and_at_both_ends(dtype: type) -> None:
+    channel = held(dtype)
+    assert find_held_runs(channel, FREQUENCY_HZ) == RUNS
+    missing = np.isnan(without_held_samples(channel, FREQUENCY_HZ).read())
+    assert np.flatnonzero(np.diff(missing, prepend=False, append=False)).reshape(-1, 2).tolist() == [
+        list(run) for run in RUNS
+    ]
+    part = without_held_samples(channel, FREQUENCY_HZ).read(READ_CHUNK_SAMPLES, READ_CHUNK_SAMPLES + 1_000)
+    assert np.isnan(part[:600]).all()
+    np.testing.assert_array_equal(part[600:], channel.read(READ_CHUNK_SAMPLES + 600, READ_CHUNK_SAMPLES + 1_000))
+
+
+def test_missing_samples_are_no_held_ones() -> None:
+    channel = make_channel("sense_x", np.full(5_000, np.nan), unit="V", sample_rate=RATE_HZ)
+    assert find_held_runs(channel, FREQUENCY_HZ) == []
+
+
+def test_a_channel_that_moves_is_returned_as_it_is() -> None:
+    values = np.sin(2.0 * np.pi * FREQUENCY_HZ / RATE_HZ * np.arange(5_000))
+    channel = make_channel("sense_x", values, unit="V", sample_rate=RATE_HZ)
+    assert without_held_samples(channel, FREQUENCY_HZ) is channel
