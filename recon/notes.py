@@ -13,7 +13,7 @@ from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
 from recon.imaging.scan_phase.doubled_frequency import describe_doubled_axes
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions
 from recon.preparation import PreparedRecording
-from recon.quality.clock_jumps import longest_segment
+from recon.quality.clock_jumps import longest_segment, separate_jump
 from recon.quality.defects import Defect, describe_clipped_positions, describe_held_signals
 from recon.quality.detector_gaps import describe_detector_gaps
 from recon.sample_ranges import SampleRanges
@@ -270,8 +270,16 @@ def describe_fast_axes(motion: Motion, intensity: Channel) -> list[str]:
 
 
 def describe_clock_jumps(recording: Recording, prepared: PreparedRecording) -> str:
-    """The note on a recording of which only the longest segment between clock jumps is used."""
+    """The note on a recording of which only a segment between clock jumps is used."""
     begin, end = longest_segment(recording, prepared.clock_jumps)
+    separate = separate_jump(prepared.clock_jumps)
+    if separate is not None:
+        return (
+            f"the phase of {separate.channel} jumps at {separate.start:.6g} s and that of its drive does not, as if "
+            f"{separate.channel} alone lost samples: later it is not on the clock of the other channels, and the "
+            f"segment from {begin:.6g} s to {end:.6g} s is used; to use the rest, cut it and state start of "
+            f"{separate.channel}"
+        )
     return (
         f"a phase jumps as if samples were lost: the longest segment between such jumps is used, {begin:.6g} s to "
         f"{end:.6g} s; cut the recording at the jumps to reconstruct the rest"

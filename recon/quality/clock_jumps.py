@@ -1,7 +1,7 @@
 """Clock jumps: samples that were lost without a gap in the time base show as a jump of a line's phase.
 
 The phase of a drive runs evenly, and the phase of a resonant mirror cannot jump, so a jump shows that the channel's
-clock jumped. A phase gives the number of lost samples only up to whole periods, so nothing is repaired: the segment
+clock jumped. A phase gives the number of lost samples only up to whole periods, so nothing is repaired: a segment
 between jumps is used.
 """
 
@@ -75,13 +75,32 @@ def detect_clock_jumps(recording: Recording) -> list[Defect]:
 
 
 def longest_segment(recording: Recording, jumps: Sequence[Defect]) -> tuple[float, float]:
-    """Return begin and end [s] of the longest segment without a jump."""
+    """Return begin and end [s] of the longest segment without a jump in which all channels have one clock."""
     intervals = jump_intervals(jumps)
     begins, ends = (
         [recording.start, *(stop for _, stop in intervals)],
         [*(start for start, _ in intervals), recording.end],
     )
-    return max(zip(begins, ends, strict=True), key=lambda segment: segment[1] - segment[0])
+    separate = separate_jump(jumps)
+    last = recording.end if separate is None else separate.start
+    segments = [(begin, end) for begin, end in zip(begins, ends, strict=True) if end <= last]
+    return max(segments, key=lambda segment: segment[1] - segment[0])
+
+
+def separate_jump(jumps: Sequence[Defect]) -> Defect | None:
+    """Return the first jump of a sense signal at which no drive jumps; None if there is none.
+
+    Samples that all channels lost shift the line of the drive in the drive too. Here the sense signal alone lost
+    samples, so that from then on it is not on the clock of the other channels.
+    """
+    drives = [jump for jump in jumps if jump.channel.startswith("drive_")]
+    separate = [
+        jump
+        for jump in jumps
+        if jump.channel.startswith("sense")
+        and not any(drive.start < jump.stop and jump.start < drive.stop for drive in drives)
+    ]
+    return min(separate, key=lambda jump: jump.start, default=None)
 
 
 def jump_intervals(jumps: Sequence[Defect]) -> list[tuple[float, float]]:

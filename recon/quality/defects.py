@@ -133,12 +133,15 @@ def describe_defects(defects: Sequence[Defect]) -> Iterator[str]:
     """Yield a line of text for each channel and kind of defect."""
     for (channel, kind), group in groupby(defects, lambda defect: (defect.channel, defect.kind)):
         same = list(group)
-        total = sum(defect.stop - defect.start for defect in same)
-        places = "one interval" if len(same) == 1 else f"{len(same)} intervals"
+        # A sense signal of two axes may jump at both of their lines at one time.
+        intervals = merge_ranges(sorted((defect.start, defect.stop) for defect in same), 0.0)
+        total = sum(stop - start for start, stop in intervals)
+        places = "one interval" if len(intervals) == 1 else f"{len(intervals)} intervals"
         name = KIND_NAMES.get(kind, kind)
-        fraction = sum(defect.fraction * (defect.stop - defect.start) for defect in same) / total
+        fraction = sum(defect.fraction * (defect.stop - defect.start) for defect in same)
+        fraction /= sum(defect.stop - defect.start for defect in same)
         share = "" if fraction > MAX_STATED_FRACTION else f", {fraction:.2g} of the samples there"
-        yield f"{channel}: {name} for {1e3 * total:.4g} ms in {places}, the first at {same[0].start:.6g} s{share}"
+        yield f"{channel}: {name} for {1e3 * total:.4g} ms in {places}, the first at {intervals[0][0]:.6g} s{share}"
 
 
 def describe_clipped_positions(defects: Sequence[Defect], motion: Motion, duration: float) -> list[str]:

@@ -209,6 +209,23 @@ def test_continuous_motion_has_no_clock_jump() -> None:
         assert detect_clock_jumps(Recording.from_arrays(channels)) == []
 
 
+def test_a_sense_signal_that_alone_lost_samples_is_used_up_to_the_loss(whole: Reconstruction) -> None:
+    """The longer segment after the loss has the sense signal early by the lost samples."""
+    result = reconstruct_scan(without_samples(("sense",), 40_000, 30))
+    (note,) = (note for note in result.notes if "as if sense alone lost samples" in note)
+    assert "and that of its drive does not" in note
+    assert result.motion.axes["x"].angle.start == 0.0
+    assert result.picture.coverage.sum() <= 40_000
+    for axis in "xy":
+        assert np.degrees(result.evaluation[axis].phase_rmse) < np.degrees(whole.evaluation[axis].phase_rmse) + 0.1
+
+
+def test_jumps_of_two_lines_at_one_time_are_one_interval() -> None:
+    jumps = [Defect("sense", "leap", 0.02, 0.03), Defect("sense", "leap", 0.021, 0.028)]
+    (line,) = describe_defects(jumps)
+    assert line == "sense: phase jump for 10 ms in one interval, the first at 0.02 s"
+
+
 def test_the_longest_segment_between_clock_jumps_is_reconstructed(whole: Reconstruction) -> None:
     first, lost = 30_000, 100
     result = reconstruct_scan(without_samples(CHANNELS, first, lost))
