@@ -36,6 +36,7 @@ from recon.notes import (
 )
 from recon.phase_and_drift import correct_phase_and_drift
 from recon.preparation import PreparedRecording, prepare, prepare_segment
+from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
 from recon.quality.dropped_samples import find_timing_break, restore_timing, slices_aligned
@@ -210,6 +211,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         limits=[
             *describe_overflows(prepared.uncorrected),
             *describe_limits(*samples, prepared.defects),
+            *describe_centre_motion(prepared.recording, prepared.device, motion, estimated.grid, options.p),
             *(estimate.limits or describe_unstructured(gridded.picture, intensity)),
         ],
         notes=[

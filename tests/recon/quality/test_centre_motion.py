@@ -1,0 +1,57 @@
+"""A centre of a resonant motion that moves in a position signal without a torque leads the conclusion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
+from scanner.device import Device
+from scanner.device_templates import KnownAxis, new_device
+from scanner.recording import Recording
+
+RATE_HZ = 2e5
+TIME_S = np.arange(20_000) / RATE_HZ
+DEVICE = Device.from_toml(new_device("electromagnetic", {"x": KnownAxis(2000.0), "y": KnownAxis(835.0)}))
+
+
+def scan(hum_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5) -> list[str]:
+    """Limits of a scan from rest, of amplitudes that fill the field; hum in the sensor and a slow drive are in x."""
+    assert DEVICE.scan is not None
+    rng, channels, angles = np.random.default_rng(5), {}, []
+    for name, frequency, half_angle in (
+        ("x", 2000.0, DEVICE.scan.half_angle_x),
+        ("y", 835.0, DEVICE.scan.half_angle_y),
+    ):
+        axis = DEVICE.axis(name)
+        assert axis.mechanics is not None
+        assert axis.drive is not None
+        m, torque = axis.mechanics, axis.drive.torque_per_volt
+        assert torque is not None
+        volts = half_angle * m.b * 2 * np.pi * frequency / torque * np.sin(2 * np.pi * frequency * TIME_S)
+        if name == "x":
+            volts = volts + slow_drive * half_angle * m.k / torque * np.sin(2 * np.pi * 30.0 * TIME_S)
+        system = cont2discrete(([1 / m.J], [1, m.b / m.J, m.k / m.J]), 1 / RATE_HZ)
+        angle = lfilter(system[0].ravel(), system[1], torque * volts)
+        angles.append(angle / half_angle)
+        hum = hum_rad * np.sin(2 * np.pi * 50.0 * TIME_S) if name == "x" else 0.0
+        noise = rng.normal(0.0, noise_rad, TIME_S.size)
+        channels |= {f"drive_{name}": (volts, "V", RATE_HZ), f"angle_{name}": (angle + hum + noise, "rad", RATE_HZ)}
+    x, y = angles
+    light = 1.0 + 0.5 * np.sin(9.0 * x + 2.0) * np.cos(7.0 * y) + 0.3 * x
+    recording = Recording.from_arrays({**channels, "intensity": (rng.poisson(500 * light) / 500, "V", RATE_HZ)}, DEVICE)
+    return reconstruct(recording, Options(estimator="sensor", pixels=(80, 80), allow_outside=True), quiet=True).limits
+
+
+def test_hum_in_a_position_signal_is_stated_with_its_size() -> None:
+    assert DEVICE.scan is not None
+    hum = 3.0 * 2.0 * DEVICE.scan.half_angle_x / 80  # three pixels
+    (line,) = (line for line in scan(hum_rad=hum) if "centre" in line)
+    assert line.startswith("x: the centre of the motion moves by ±3 pixels, most at 50")
+
+
+@pytest.mark.parametrize("change", [{}, {"slow_drive": 0.3}, {"noise_rad": 5e-3}])
+def test_a_start_from_rest_a_slow_drive_and_noise_are_no_error_of_the_sensor(change: dict[str, float]) -> None:
+    assert not any("centre" in line for line in scan(**change))
