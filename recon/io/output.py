@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from errno import ENOSPC
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -75,6 +77,8 @@ def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
     except OSError as error:
         # The error names no file, or one in the temporary folder; name the file that the user asked for.
         error.filename = str(error.filename or folder).replace(str(temporary), str(folder))
+        if error.errno is None and shutil.disk_usage(temporary).free == 0:  # as NumPy raises it after a partial write
+            error.strerror = os.strerror(ENOSPC)
         raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -1,6 +1,7 @@
 """Files for other programs: TIFF with pixel sizes, and the frames of a scan as OME-TIFF."""
 
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,7 +20,7 @@ from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.device import Device
-from scanner.errors import BadInput
+from scanner.errors import BadInput, line_of
 from tests.support.simulated import imaging
 
 GRID = Grid(80, 60, 0.18, 0.15)
@@ -162,3 +163,12 @@ def test_no_new_file_replaces_an_input(tmp_path: Path) -> None:
     with replacing_folder(tmp_path, device, other) as folder:
         (folder / "report.html").write_text("found", encoding="utf-8")
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == "found"
+
+
+def test_a_disk_that_fills_during_a_write_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy states how much it wrote, in an error without a number."""
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=0))
+    with pytest.raises(OSError, match="No space left on device") as caught, replacing_folder(tmp_path / "out"):
+        raise OSError("160000 requested and 102312 written")
+    assert line_of(caught.value, "output") == f"{tmp_path / 'out'}: No space left on device"
