@@ -21,6 +21,9 @@ from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.stages import Position
 
+GRID_SAMPLES_PER_RUN = 16
+"""Samples of a run that are compared first: fewer than all, and so many that few other segments have equal ones."""
+
 
 def slowest_motions(recording: Recording, device: Device) -> dict[str, float]:
     """Frequency of the slowest motion that each sense and angle channel shows [Hz], by channel.
@@ -66,6 +69,8 @@ def find_held_runs(channel: Channel, frequency: float) -> list[tuple[int, int]]:
     """
     shortest = max(MIN_CLIPPED_RUN_SAMPLES, ceil(channel.sample_rate / frequency))
     runs: list[tuple[int, int]] = []
+    if not _may_be_held(channel, shortest):
+        return runs
     begin, last = 0, np.nan  # of the run in which the chunk before ended
     for first in range(0, channel.size, READ_CHUNK_SAMPLES):
         values = channel.stored(first, first + READ_CHUNK_SAMPLES)
@@ -77,6 +82,18 @@ def find_held_runs(channel: Channel, frequency: float) -> list[tuple[int, int]]:
     if channel.size - begin >= shortest:
         runs.append((begin, channel.size))
     return runs
+
+
+def _may_be_held(channel: Channel, shortest: int) -> bool:
+    """Whether samples on a coarse grid allow a run of ``shortest`` equal ones. It saves the search in most channels."""
+    step = max(1, shortest // GRID_SAMPLES_PER_RUN)
+    parts = [
+        channel.stored(first, first + READ_CHUNK_SAMPLES)[-first % step :: step]
+        for first in range(0, channel.size, READ_CHUNK_SAMPLES)
+    ]
+    grid = np.concatenate(parts)
+    changes = np.flatnonzero(grid[1:] != grid[:-1])
+    return int(np.diff(changes, prepend=-1, append=grid.size - 1).max(initial=0)) >= shortest // step
 
 
 def without_held_samples(channel: Channel, frequency: float) -> Channel:
