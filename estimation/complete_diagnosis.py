@@ -15,6 +15,7 @@ from estimation.diagnosis.diagnose import Diagnosis, diagnose, nominal_device
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.selection import Progress
 from estimation.diagnosis.undriven import steady_without_drive
+from estimation.held_samples import held_while_driven
 from estimation.slow.diagnose import diagnose_decays, slow_decays
 from estimation.slow.diagnose_response import diagnose_responses
 from estimation.slow.response import frequency_responses
@@ -151,6 +152,12 @@ def _diagnose_motion(
         if not pictures:
             raise BadInput(steady, file=recordings[0].path, hint="record the drive, or correct J and b of the device")
         return _without_motion(nominal, steady)
+    for recording in recordings:
+        if held := held_while_driven(recording, nominal):
+            name, begin, end = held
+            what = f"stands at one value from {begin:.6g} to {end:.6g} s while the axis is driven"
+            hint = "diagnose a part without it (Recording.slice): a sensor or converter was stopped there"
+            raise BadInput(what, file=recording.path, channel=name, hint=hint)
     responses = [frequency_responses(recording, nominal) for recording in recordings]
     if any(responses):
         if len(recordings) > 1:

@@ -84,6 +84,31 @@ def find_held_runs(channel: Channel, frequency: float) -> list[tuple[int, int]]:
     return runs
 
 
+def held_while_driven(recording: Recording, device: Device) -> tuple[str, float, float] | None:
+    """The first signal that is held while a drive of its axes changes; None if there is none.
+
+    A free decay ends below the resolution of its converter, where equal samples are right.
+
+    Returns:
+        Name of the channel, begin and end of the run [s].
+    """
+    for name, frequency in slowest_motions(recording, device).items():
+        channel, axes = recording[name], [name.partition("_")[2]] if "_" in name else list(device.axes)
+        drives = [recording[f"drive_{axis}"] for axis in axes if f"drive_{axis}" in recording]
+        for run in find_held_runs(channel, frequency):
+            begin, end = (channel.start + at / channel.sample_rate for at in run)
+            if any(_changes(drive, begin, end) for drive in drives):
+                return name, begin, end
+    return None
+
+
+def _changes(channel: Channel, begin: float, end: float) -> bool:
+    """Whether a channel takes several values from ``begin`` to ``end`` [s]."""
+    first, stop = (round((time - channel.start) * channel.sample_rate) for time in (begin, end))
+    values = channel.stored(max(first, 0), max(min(stop, channel.size), 0))
+    return bool(values.size) and bool(np.any(values != values[0]))
+
+
 def _may_be_held(channel: Channel, shortest: int) -> bool:
     """Whether samples on a coarse grid allow a run of ``shortest`` equal ones. It saves the search in most channels."""
     step = max(1, shortest // GRID_SAMPLES_PER_RUN)

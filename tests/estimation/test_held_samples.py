@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from estimation.held_samples import find_held_runs, without_held_samples
+from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.held_samples import find_held_runs, held_while_driven, without_held_samples
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
+from scanner.device import Axis, Device
+from scanner.errors import BadInput
+from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
 
 RATE_HZ, FREQUENCY_HZ = 1e6, 1e3
 SAMPLES = 3 * READ_CHUNK_SAMPLES
@@ -41,3 +46,26 @@ def test_a_channel_that_moves_is_returned_as_it_is() -> None:
     values = np.sin(2.0 * np.pi * FREQUENCY_HZ / RATE_HZ * np.arange(5_000))
     channel = make_channel("sense_x", values, unit="V", sample_rate=RATE_HZ)
     assert without_held_samples(channel, FREQUENCY_HZ) is channel
+
+
+def lever_recording(drive_V: float) -> Recording:
+    """A lever at its resonance of 1 kHz whose sensor stands still for 2 ms."""
+    rate = 2.0 * np.pi * FREQUENCY_HZ
+    mechanics = Mechanics(1e-10, 1e-10 * rate / 50.0, 1e-10 * rate**2)
+    lever = Axis(mechanics, drive=Drive("linear", 1e-8), readout=Position(1.0, 1e-3), name="x")
+    time = np.arange(20_000) / RATE_HZ
+    sensed = np.sin(rate * time)
+    sensed[8_000:10_000] = sensed[8_000]
+    channels = {"drive_x": (drive_V * np.cos(rate * time), "V", RATE_HZ), "sense_x": (sensed, "V", RATE_HZ)}
+    return Recording.from_arrays(channels, Device("lever", {"x": lever}))
+
+
+def test_a_signal_that_stands_still_under_a_drive_is_not_diagnosed() -> None:
+    with pytest.raises(BadInput, match=r"sense_x.*stands at one value from 0.008 to 0.01 s while the axis is driven"):
+        diagnose_with_optics([lever_recording(1.0)])
+
+
+def test_equal_values_without_a_drive_are_those_of_a_motion_below_the_resolution() -> None:
+    recording = lever_recording(0.0)
+    assert recording.device is not None
+    assert held_while_driven(recording, recording.device) is None
