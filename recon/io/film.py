@@ -108,7 +108,8 @@ def open_film(path: Path) -> Film:
         raise BadInput(f"cannot be read: {error.strerror}", file=path, hint="name a film (TIFF)") from None
     except (tifffile.TiffFileError, ValueError, IndexError, KeyError, AttributeError) as error:
         reason = " ".join(str(error).split())
-        raise BadInput(f"is no TIFF file that can be read: {reason}", file=path, hint="name a film (TIFF)") from None
+        hint = "name a film (TIFF); tifffile.imwrite makes one of an array"
+        raise BadInput(f"is no TIFF file that can be read: {reason}", file=path, hint=hint) from None
     if colour:
         hint = (
             "give the detectors as channels (axis C), not as RGB; tifffile.imwrite needs photometric='minisblack' for "
