@@ -94,8 +94,13 @@ def misfit(fit: Fit) -> float:
 
 def nominal_values_are_improbable(fit: Fit, probability: float = MIN_PULL_PROBABILITY) -> bool:
     """Whether the nominal values lie so far from the stated ones, in tolerances, that they have absorbed a misfit."""
-    pulls = fit.x[[f.kind == "nominal" for f in fit.model.parameters]]
+    pulls = fit.x[fit.model.indices("nominal")]
     return bool(chi2_distribution.sf(pulls @ pulls, pulls.size) < probability)
+
+
+def stated_values(model: Model, x: Array) -> Array:
+    """Parameters with the nominal values as stated, shape (p,)."""
+    return np.where([f.kind == "nominal" for f in model.parameters], 0.0, x)
 
 
 def held_out_samples(size: int, guard: tuple[int, int] = (0, 0)) -> Mask:

@@ -165,6 +165,14 @@ class Model:
         """Index in x of one parameter, None if the model does not have it."""
         return self._indices.get((kind, owner, name, run))
 
+    def indices(self, kind: str, owner: str | None = None) -> list[int]:
+        """Indices in x of all parameters of a kind, of one owner or of all."""
+        return [i for i, f in enumerate(self.parameters) if f.kind == kind and owner in (None, f.owner)]
+
+    def with_candidates(self, candidates: Sequence[Candidate]) -> Model:
+        """The model of the same recordings, device and mains with other added terms."""
+        return Model(self.runs, self.device, candidates, self.mains)
+
     def scales(self, axis: str) -> NaturalScales:
         """Natural scales of an axis, from the first recording that contains it."""
         return next(run.scales[axis] for run in self.runs if axis in run.scales)

@@ -98,8 +98,7 @@ def fit_anchor(
     while reached + 1 < len(early) and residual_ratio(likelihood, early[reached + 1], stops[reached + 1]) < limit:
         reached += 1
     for terms in groups:
-        with_terms = [*nominal.model.candidates, *terms]
-        model = Model(nominal.model.runs, nominal.model.device, with_terms, nominal.model.mains)
+        model = nominal.model.with_candidates([*nominal.model.candidates, *terms])
         start = model.map_parameters_from(early[reached].model, early[reached].x)
         fits.append(fit_growing(likelihood, model, start, stops[reached], max(limit, MAX_CORRECTABLE_RATIO)))
         if residual_ratio(likelihood, fits[-1]) < limit:

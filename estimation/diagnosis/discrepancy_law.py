@@ -92,7 +92,7 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
     """
     candidate = fit.model.candidates[-1]
     scales = fit.model.scales(candidate.axis)
-    indices = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
+    indices = fit.model.indices("term", candidate.key)
     names = [fit.model.parameters[i].name for i in indices]
     scale_factors = np.array([p.value(1.0, scales) for p in candidate.term.free_parameters])
 

@@ -53,8 +53,7 @@ def _effect_signal(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Ar
     amplitudes = amplitude_indices(fit.model, candidate)
     if amplitudes:
         return np.asarray(fit.jacobian[:, amplitudes] @ fit.x[amplitudes])
-    remaining = [other for other in fit.model.candidates if other is not candidate]
-    without = Model(fit.model.runs, fit.model.device, remaining, fit.model.mains)
+    without = fit.model.with_candidates([other for other in fit.model.candidates if other is not candidate])
     return fit.residual - likelihood.residual(without, without.map_parameters_from(fit.model, fit.x))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.device_fit.data import Output
-from estimation.device_fit.fit import Fit, Likelihood, linearise_at, nominal_values_are_improbable
+from estimation.device_fit.fit import Fit, Likelihood, linearise_at, nominal_values_are_improbable, stated_values
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, flat_psd, make_whitener
 from estimation.device_fit.parameters import Candidate
@@ -51,10 +51,9 @@ def determined_parameters(fit: Fit) -> Array:
     Returns:
         shape of ``fit.x``.
     """
-    nominal = [i for i, f in enumerate(fit.model.parameters) if f.kind == "nominal"]
     if _has_absorbed_misfit(fit):
-        return np.where(np.isin(np.arange(fit.x.size), nominal), 0.0, fit.x)
-    covariance = fit.covariance
+        return stated_values(fit.model, fit.x)
+    nominal, covariance = fit.model.indices("nominal"), fit.covariance
     variance, directions = np.linalg.eigh(covariance[np.ix_(nominal, nominal)])
     fixed = directions[:, variance > MAX_POSTERIOR_VARIANCE].T
     if not fixed.size:

@@ -8,7 +8,6 @@ from typing import Any
 
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import Fit, fit_model, misfit
-from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
@@ -107,10 +106,10 @@ def fit_static_law(result: SelectionResult) -> Fit:
 
     See ``measured_law_table``.
     """
-    model, discrepancy = result.final.model, result.final.model.candidates[-1]
+    model = result.final.model
+    *others, discrepancy = model.candidates
     static = STATIC_PARAMETERS.get(discrepancy.term.effect, ())
-    candidates = [*model.candidates[:-1], *([with_free_parameters(discrepancy, static)] if static else [])]
-    reduced = Model(model.runs, model.device, candidates, model.mains)
+    reduced = model.with_candidates([*others, *([with_free_parameters(discrepancy, static)] if static else [])])
     return fit_model(result.likelihood, reduced, reduced.map_parameters_from(model, result.final.x))
 
 

@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, nominal_values_are_improbable
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, nominal_values_are_improbable, stated_values
 from estimation.device_fit.initial import window_schedule
-from estimation.device_fit.model import Model, uncertain
+from estimation.device_fit.model import uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_growing
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
@@ -18,8 +18,8 @@ from estimation.diagnosis.linear_model import Effects, LinearModel, LinearTerm
 from estimation.diagnosis.screening import (
     ScoreTest,
     all_candidates,
+    amplitude_indices,
     damped_start,
-    is_amplitude,
     is_linear,
     score_candidate_starts,
     set_amplitudes,
@@ -49,8 +49,9 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
     residual = fit.residual - fit.jacobian[:, base] @ fit.x[base]
     blocks: list[_Block] = []
     for candidate in filter(is_linear, uncertain(fit.model)):
-        columns, part = _part_of_fit(fit, candidate)
-        residual = residual - part
+        amplitudes = amplitude_indices(fit.model, candidate)
+        columns = fit.jacobian[:, amplitudes]
+        residual = residual - columns @ fit.x[amplitudes]
         blocks.append((candidate, columns, None, _shape_cost(fit, candidate)))
     return _project_out(fit, base, [*blocks, *_blocks_beside(likelihood, fit, candidates)], residual)
 
@@ -108,23 +109,10 @@ def _linear_starts(tests: Sequence[ScoreTest]) -> list[ScoreTest]:
     return sorted(with_effect, key=lambda test: -test.predicted_gain)[:most]
 
 
-def _part_of_fit(fit: Fit, candidate: Candidate) -> tuple[Array, Array]:
-    """Sensitivities to the amplitudes of a term of a fit, shape (N, q), and its part of the residual, shape (N,)."""
-    at = [
-        i
-        for i, f in enumerate(fit.model.parameters)
-        if f.owner == candidate.key and f.parameter is not None and is_amplitude(candidate, f.parameter)
-    ]
-    return fit.jacobian[:, at], fit.jacobian[:, at] @ fit.x[at]
-
-
 def _shape_cost(fit: Fit, candidate: Candidate) -> float:
     """-2 log of posterior over prior volume of the parameters of a term that are no amplitude."""
-    at = [
-        i
-        for i, f in enumerate(fit.model.parameters)
-        if f.owner == candidate.key and f.parameter is not None and not is_amplitude(candidate, f.parameter)
-    ]
+    amplitudes = amplitude_indices(fit.model, candidate)
+    at = [i for i in fit.model.indices("term", candidate.key) if i not in amplitudes]
     return -float(np.linalg.slogdet(fit.covariance[np.ix_(at, at)])[1]) if at else 0.0
 
 
@@ -147,16 +135,17 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
     at = np.array([column for term in terms for column in term.columns], int)
     estimates = linear.estimate(terms)
     kept = [candidate for candidate in fit.model.candidates if not is_linear(candidate)]
-    model = Model(fit.model.runs, fit.model.device, [*kept, *(term.candidate for term in terms)], fit.model.mains)
+    model = fit.model.with_candidates([*kept, *(term.candidate for term in terms)])
     start = fit.x.copy()
     start[common_parameters(fit)] = -(linear.profile[:, at] @ estimates + linear.profile[:, -1])
     x = model.map_parameters_from(fit.model, start)
     without = model.map_parameters_from(fit.model, fit.x)
     ends = np.cumsum([0, *(term.columns.size for term in terms)])
     for term, (low, high) in zip(terms, pairwise(ends), strict=True):
-        for i, f in enumerate(model.parameters):
-            if term.test is not None and f.kind == "term" and f.owner == term.candidate.key:
-                x[i] = without[i] = term.test.x[term.test.model.index("term", f.owner, f.name)]
+        if term.test is not None:
+            key = term.candidate.key
+            at_term = model.indices("term", key)
+            x[at_term] = without[at_term] = term.test.x[term.test.model.indices("term", key)]
         set_amplitudes(x, model, term.candidate, estimates[low:high])
     if nominal_values_are_improbable(fit):
         stated = fit_growing(likelihood, model, stated_values(model, x), window_schedule(model)[0])
@@ -167,11 +156,6 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
     if residual @ residual < MAX_CHI2_RATIO * fit.chi2:
         return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
     return fit_growing(likelihood, model, x, window_schedule(model)[0])
-
-
-def stated_values(model: Model, x: Array) -> Array:
-    """Parameters with the nominal values as stated, shape (p,)."""
-    return np.where([f.kind == "nominal" for f in model.parameters], 0.0, x)
 
 
 def fit_laws(

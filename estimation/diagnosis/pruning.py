@@ -30,12 +30,11 @@ error."""
 def prune_by_evidence(likelihood: Likelihood, fit: Fit) -> Fit | None:
     """Refit with the required amplitudes of the last term, a discrepancy term; None if none is required."""
     candidate = fit.model.candidates[-1]
-    indices = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
-    required = _required_parameters(fit, indices)
+    required = _required_parameters(fit, fit.model.indices("term", candidate.key))
     if not required:
         return None
     pruned = with_free_parameters(candidate, {fit.model.parameters[i].name for i in required})
-    model = Model(fit.model.runs, fit.model.device, [*fit.model.candidates[:-1], pruned], fit.model.mains)
+    model = fit.model.with_candidates([*fit.model.candidates[:-1], pruned])
     return fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
 
 
@@ -101,6 +100,5 @@ def fit_to_convergence(likelihood: Likelihood, model: Model, x: Array) -> Fit:
 
 def refit_without(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Fit:
     """The fit refitted with one of its terms taken out."""
-    kept = [other for other in fit.model.candidates if other is not candidate]
-    model = Model(fit.model.runs, fit.model.device, kept, fit.model.mains)
+    model = fit.model.with_candidates([other for other in fit.model.candidates if other is not candidate])
     return fit_to_convergence(likelihood, model, model.map_parameters_from(fit.model, fit.x))

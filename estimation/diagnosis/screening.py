@@ -110,9 +110,9 @@ def score_candidate_starts(
 def _score_starts(
     likelihood: Likelihood, base: Fit, candidate: Candidate, profiled: ProfiledLinearModel, stop: float
 ) -> list[ScoreTest]:
-    model = Model(base.model.runs, base.model.device, (*base.model.candidates, candidate), base.model.mains)
-    indices = [i for i, f in enumerate(model.parameters) if f.kind == "term" and f.owner == candidate.key]
-    amplitudes, hidden_states = amplitude_indices(model, candidate), hidden_state_indices(model, candidate)
+    model = base.model.with_candidates((*base.model.candidates, candidate))
+    indices = model.indices("term", candidate.key)
+    amplitudes, hidden_states = amplitude_indices(model, candidate), model.indices("hidden", candidate.key)
     points, scores = [], []
     for grid, seed in product(
         start_points(candidate), candidate.term.initial_seeds or ((0.0,) * len(candidate.term.hidden_state_scales),)
@@ -147,7 +147,7 @@ def set_amplitudes(x: Array, model: Model, candidate: Candidate, estimate: Array
 
     Hidden states without an estimate, those of a candidate that the fit already contains, keep their values.
     """
-    amplitudes, hidden_states = amplitude_indices(model, candidate), hidden_state_indices(model, candidate)
+    amplitudes, hidden_states = amplitude_indices(model, candidate), model.indices("hidden", candidate.key)
     x[amplitudes] = estimate[: len(amplitudes)]
     states = estimate[len(amplitudes) :]
     if states.size and x[amplitudes[0]]:
@@ -161,11 +161,6 @@ def amplitude_indices(model: Model, candidate: Candidate) -> list[int]:
         for i, f in enumerate(model.parameters)
         if f.parameter is not None and f.owner == candidate.key and is_amplitude(candidate, f.parameter)
     ]
-
-
-def hidden_state_indices(model: Model, candidate: Candidate) -> list[int]:
-    """Indices in x of the initial hidden states of a candidate, of all recordings."""
-    return [i for i, f in enumerate(model.parameters) if f.kind == "hidden" and f.owner == candidate.key]
 
 
 def damped_start(likelihood: Likelihood, base: Fit, model: Model, x: Array, step: Array) -> Array:

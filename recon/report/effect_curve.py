@@ -58,7 +58,7 @@ def effect_curve(fit: Fit, candidate: Candidate, bins: int = CURVE_BINS) -> Effe
     if term.effect in DISCREPANCY_TERMS or term.hidden_state_scales:
         return None
     scales = fit.model.scales(candidate.axis)
-    indices = [i for i, f in enumerate(fit.model.parameters) if f.kind == "term" and f.owner == candidate.key]
+    indices = fit.model.indices("term", candidate.key)
 
     def values(x: Array) -> tuple[float, ...]:
         return term.values([float(v) for v in x[indices]], scales)

@@ -8,7 +8,7 @@ from benchmarks.blind.generator import Case, generate_recording, write
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.screening import amplitude_indices, hidden_state_indices, set_amplitudes
+from estimation.diagnosis.screening import amplitude_indices, set_amplitudes
 from scanner.recording import Recording
 from scanner.terms import catalogue
 
@@ -20,7 +20,7 @@ def test_hidden_states_without_an_estimate_keep_their_values(tmp_path: Path) -> 
         run, device = prepare_run(recording, recording.device), recording.device
     candidate = Candidate(catalogue()["second-mode"], "x", "sense")
     model = Model([run], device, [candidate])
-    amplitudes, states = amplitude_indices(model, candidate), hidden_state_indices(model, candidate)
+    amplitudes, states = amplitude_indices(model, candidate), model.indices("hidden", candidate.key)
     x = np.zeros(len(model.parameters))
     x[states] = [0.3, -0.2]
     set_amplitudes(x, model, candidate, np.array([0.5]))
