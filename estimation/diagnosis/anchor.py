@@ -126,11 +126,16 @@ def fit_growing(
     """
     stop = reached
     while True:
-        fit = fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=WINDOW_TOLERANCE, fixed=fixed)
+        fit = fit_window(likelihood, model, x, stop, fixed)
         if stop >= 1.0:
             return fit
         lost = stop > reached and residual_ratio(likelihood, fit, stop) > limit
         x, stop = fit.x, 1.0 if lost else _next_window(likelihood, fit, stop, limit)
+
+
+def fit_window(likelihood: Likelihood, model: Model, x: Array, stop: float, fixed: Sequence[int] = ()) -> Fit:
+    """The fit over one window, which a fit over a longer one continues."""
+    return fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=WINDOW_TOLERANCE, fixed=fixed)
 
 
 def _next_window(likelihood: Likelihood, fit: Fit, stop: float, limit: float) -> float:

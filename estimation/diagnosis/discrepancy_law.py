@@ -23,6 +23,9 @@ MIN_CHI2_PER_TERM = 12.0
 """Rise of chi-square, if a part of the formula is removed, from which the part remains. Of fifty parts without any true
 contribution, one exceeds it in a recording out of forty."""
 
+MAX_PARTS = 4
+"""Parts of the formula, which has to be read at a glance."""
+
 LENGTH = "T: duration of the recording"
 STATE = "x = θ/A, y = θ'/(A ω)"
 VARIABLES = {
@@ -118,7 +121,7 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
         "unit": section.unit,
         "columns": [section.x_label, section.label, "sd"],
         "points": points,
-        "formula": formula(fit, indices),
+        "formula": _formula(fit, indices),
     }
 
 
@@ -189,22 +192,21 @@ def _symbol(effect: str, name: str) -> str:
     if name in POLYNOMIALS.get(effect, {}):
         return POLYNOMIALS[effect][name]
     if effect == "free-mechanics" and letter == "f":
-        parts = [base + POWER[int(n)] for base, n in zip("xy", number, strict=True) if n != "0"]
-        return " ".join(parts)
+        return " ".join(base + POWER[int(n)] for base, n in zip("xy", number, strict=True) if n != "0")
     if letter == "c":
         return f"hat(x − {MAPPING_KNOTS[int(number)]:.2g})".replace("− -", "+ ")
     wave = "" if number == "0" else f"cos({number} π t/T)".replace("(1 ", "(")
     return COSINE_FACTORS[letter] + wave
 
 
-def formula(fit: Fit, indices: list[int], max_parts: int = 4) -> str:
+def _formula(fit: Fit, indices: list[int]) -> str:
     """Formula of the last term of a fit, a discrepancy term, reduced to its largest parts by backward elimination.
 
-    Parts are removed until each raises chi-square by ``MIN_CHI2_PER_TERM`` if it is removed.
+    Parts are removed until at most ``MAX_PARTS`` remain, each of which raises chi-square by ``MIN_CHI2_PER_TERM`` if it
+    is removed.
 
     Args:
         indices: of the term's parameters in ``fit.x``.
-        max_parts: of the formula.
     """
     candidate = fit.model.candidates[-1]
     information = np.linalg.inv(fit.covariance[np.ix_(indices, indices)])
@@ -215,7 +217,7 @@ def formula(fit: Fit, indices: list[int], max_parts: int = 4) -> str:
         values = np.linalg.solve(inner, score[selected])
         chi2_rise = values**2 / np.diag(np.linalg.inv(inner))
         weakest = int(np.argmin(chi2_rise))
-        if chi2_rise[weakest] > MIN_CHI2_PER_TERM and len(selected) <= max_parts:
+        if chi2_rise[weakest] > MIN_CHI2_PER_TERM and len(selected) <= MAX_PARTS:
             break
         selected.pop(weakest)
         values = np.delete(values, weakest)

@@ -6,11 +6,17 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit, nominal_values_are_improbable
+from estimation.device_fit.fit import (
+    Fit,
+    Likelihood,
+    fit_model,
+    misfit,
+    nominal_values_are_improbable,
+    stated_values,
+)
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import WINDOW_ITERATIONS, WINDOW_TOLERANCE, fit_growing
-from estimation.diagnosis.linearisation import stated_values
+from estimation.diagnosis.anchor import WINDOW_TOLERANCE, fit_growing, fit_window
 from estimation.diagnosis.screening import ScoreTest, is_linear, score_candidate_starts
 from estimation.diagnosis.significance import DETECTION_THRESHOLD, MAX_HELD_OUT_CHI2, residual_is_noise
 from scanner.arrays import Array
@@ -34,7 +40,7 @@ def fit_from_stated_values(likelihood: Likelihood, nominal: Fit, terms: Sequence
     Args:
         first: end of the first window, as a fraction of the recordings.
     """
-    model = Model(nominal.model.runs, nominal.model.device, [*nominal.model.candidates, *terms], nominal.model.mains)
+    model = nominal.model.with_candidates([*nominal.model.candidates, *terms])
     start = stated_values(model, model.map_parameters_from(nominal.model, nominal.x))
     fit = fit_growing(likelihood, model, start, first)
     if nominal_values_are_improbable(fit):
@@ -42,9 +48,9 @@ def fit_from_stated_values(likelihood: Likelihood, nominal: Fit, terms: Sequence
     return fit
 
 
-def fit_with_stated_values(likelihood: Likelihood, model: Model, start: Array, first: float) -> Fit:
-    """The fit over growing windows whose nominal values keep those of ``start``."""
-    return fit_growing(likelihood, model, start, first, fixed=_nominal_indices(model))
+def fit_with_stated_values(likelihood: Likelihood, model: Model, x: Array, first: float) -> Fit:
+    """The fit over growing windows from ``x`` with the nominal values kept as stated."""
+    return fit_growing(likelihood, model, stated_values(model, x), first, fixed=model.indices("nominal"))
 
 
 def fit_nonlinear_law(
@@ -61,8 +67,8 @@ def fit_nonlinear_law(
     """
     model, stated = nominal.model, stated_values(nominal.model, nominal.x)
     for stop in reversed(stops[:-1]):
-        kept = _fit_window(likelihood, model, stated, stop, fixed=_nominal_indices(model))
-        free = _fit_window(likelihood, model, kept.x, stop)
+        kept = fit_window(likelihood, model, stated, stop, fixed=model.indices("nominal"))
+        free = fit_window(likelihood, model, kept.x, stop)
         if _leaves_noise(free):
             continue
         starts = [nonlinear_starts(likelihood, fit, pool, stop) for fit in (kept, free)]
@@ -96,11 +102,10 @@ def _best_of_each_sign(starts: Sequence[ScoreTest]) -> list[ScoreTest]:
     """The first starts with each sign of the law's signed parameters."""
     by_sign: dict[tuple[float, ...], list[ScoreTest]] = {}
     for start in starts:
-        signed = [
-            i
-            for i, f in enumerate(start.model.parameters)
-            if f.owner == start.candidate.key and f.parameter is not None and f.parameter.kind in AMPLITUDE_KINDS
-        ]
+        of_term = zip(
+            start.model.indices("term", start.candidate.key), start.candidate.term.free_parameters, strict=True
+        )
+        signed = [i for i, parameter in of_term if parameter.kind in AMPLITUDE_KINDS]
         by_sign.setdefault(tuple(np.sign(start.x[signed])), []).append(start)
     return [start for of_sign in by_sign.values() for start in of_sign[:MAX_WINDOW_STARTS]]
 
@@ -108,12 +113,8 @@ def _best_of_each_sign(starts: Sequence[ScoreTest]) -> list[ScoreTest]:
 def _fit_law_first(likelihood: Likelihood, start: ScoreTest, stop: float) -> Fit:
     """The fit over a window of a law beside the stated values, then of all."""
     model = start.model
-    law = _fit_window(likelihood, model, stated_values(model, start.x), stop, fixed=_nominal_indices(model))
-    return _fit_window(likelihood, model, law.x, stop)
-
-
-def _fit_window(likelihood: Likelihood, model: Model, x: Array, stop: float, fixed: Sequence[int] = ()) -> Fit:
-    return fit_model(likelihood, model, x, stop, WINDOW_ITERATIONS, tolerance=WINDOW_TOLERANCE, fixed=fixed)
+    law = fit_window(likelihood, model, stated_values(model, start.x), stop, fixed=model.indices("nominal"))
+    return fit_window(likelihood, model, law.x, stop)
 
 
 def _leaves_noise(fit: Fit) -> bool:
@@ -125,7 +126,3 @@ def _different(fits: Iterable[Fit]) -> list[Fit]:
     """Fits that ended in different minima, the best first."""
     ranked = sorted(fits, key=misfit)
     return [fit for i, fit in enumerate(ranked) if i == 0 or misfit(fit) - misfit(ranked[i - 1]) > WINDOW_TOLERANCE]
-
-
-def _nominal_indices(model: Model) -> list[int]:
-    return [i for i, parameter in enumerate(model.parameters) if parameter.kind == "nominal"]

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from math import erfc, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimation.device_fit.data import Output
 from estimation.device_fit.fit import Fit, Likelihood, linearise_at, nominal_values_are_improbable, stated_values
@@ -105,13 +104,17 @@ def detectability(likelihood: Likelihood, fit: Fit, terms: Iterable[Term]) -> li
     """
     present = {candidate.key for candidate in fit.model.candidates}
     candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in present]
-    blocks = candidate_sensitivities(likelihood, fit, candidates)
     linearisations = [
-        (candidate, block) for candidate, of_candidate in zip(candidates, blocks, strict=True) for block in of_candidate
+        (candidate, block[likelihood.rows])
+        for candidate, blocks in zip(candidates, candidate_sensitivities(likelihood, fit, candidates), strict=True)
+        for block in blocks
     ]
     if not linearisations:
         return []
-    sizes, distances = discrimination_distances(fit, [block for _, block in linearisations], likelihood.rows)
+    blocks = [block for _, block in linearisations]
+    signals = np.stack([block @ np.full(block.shape[1], block.shape[1] ** -0.5) for block in blocks], axis=1)
+    nominal = fit.jacobian[likelihood.rows]
+    sizes, distances = unexplained_norms(nominal, fit.model.precision, signals, blocks)
     keys = np.array([candidate.key for candidate, _ in linearisations])
     effects = np.array([candidate.term.effect for candidate, _ in linearisations])
     results = []
@@ -146,19 +149,6 @@ def candidate_sensitivities(likelihood: Likelihood, fit: Fit, candidates: Sequen
                 blocks.append(columns - hidden @ np.linalg.lstsq(hidden[rows], columns[rows], rcond=None)[0])
         sensitivities.append(blocks)
     return sensitivities
-
-
-def discrimination_distances(fit: Fit, blocks: Sequence[Array], rows: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Sizes and distances of effects of their natural size.
-
-    Args:
-        blocks: sensitivities to each, shape (N, q).
-
-    Returns:
-        (size [sigma], shape (n,); distance of effect i to effect j [sigma], shape (n, n)).
-    """
-    signals = np.stack([block[rows] @ np.full(block.shape[1], block.shape[1] ** -0.5) for block in blocks], axis=1)
-    return unexplained_norms(fit.jacobian[rows], fit.model.precision, signals, [block[rows] for block in blocks])
 
 
 def unexplained_norms(nominal: Array, precision: Array, signals: Array, blocks: Sequence[Array]) -> tuple[Array, Array]:

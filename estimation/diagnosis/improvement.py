@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,11 +57,14 @@ def improve(result: SelectionResult) -> Improvement:
     nominal = open_loop(runs, stated)
     while True:
         unnamed = any(is_discrepancy(step.candidate) for step in result.steps)
-        device = improved_device(fit_static_law(result) if unnamed else result.final)
+        device = improved_device(_fit_static_law(result) if unnamed else result.final)
         improved = open_loop(runs, device)
         if unnamed or not any(step.candidate.term.free_parameters for step in result.steps):
-            options = [device, *([_without_discrepancy(result)] if unnamed and len(result.steps) > 1 else [])]
-            better = next((one for one in options if all(_is_better([run], stated, one) for run in runs)), stated)
+            options = [device]
+            if unnamed and len(result.steps) > 1:  # the device with the named laws alone
+                *_, discrepancy = result.final.model.candidates
+                options.append(improved_device(refit_without(result.likelihood, result.final, discrepancy)))
+            better = next((one for one in options if all(_is_better(run, stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
         if residual_is_noise(result.final):
             if not is_worse(nominal, improved):
@@ -90,18 +93,13 @@ def _settled(result: SelectionResult) -> SelectionResult:
     return replace(result, final=fit, steps=tuple(replace(step, after=fit) for step in result.steps))
 
 
-def _without_discrepancy(result: SelectionResult) -> Device:
-    """The device with the named laws alone."""
-    return improved_device(refit_without(result.likelihood, result.final, result.final.model.candidates[-1]))
-
-
-def _is_better(runs: Sequence[Run], stated: Device, device: Device) -> bool:
-    """Whether ``device`` predicts every channel of the runs with an error at most that of the stated device."""
-    nominal, improved = open_loop(runs, stated), open_loop(runs, device)
+def _is_better(run: Run, stated: Device, device: Device) -> bool:
+    """Whether ``device`` predicts every channel of a run with an error at most that of the stated device."""
+    nominal, improved = open_loop([run], stated), open_loop([run], device)
     return all(improved[name].error <= loop.error for name, loop in nominal.items())
 
 
-def fit_static_law(result: SelectionResult) -> Fit:
+def _fit_static_law(result: SelectionResult) -> Fit:
     """Refit the final model with only the static part of its discrepancy term, which a device file can state.
 
     See ``measured_law_table``.

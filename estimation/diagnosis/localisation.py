@@ -8,29 +8,31 @@ from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.parameters import Candidate
 from scanner.arrays import Array
 
+TIME_BINS, MAX_HARMONIC = 40, 8
+"""Intervals of time, and the highest multiple of the motion's frequency, by which a misfit is located."""
+
 
 def chi2_reduction_by_channel(likelihood: Likelihood, before: Fit, after: Fit) -> dict[str, float]:
     """Fall of chi-square from ``before`` to ``after`` in each channel, over fitted and held-out samples."""
     keep = likelihood.rows | likelihood.validation_rows
     fall = np.where(keep, before.residual**2 - after.residual**2, 0.0)
-    names = [output.name for run in likelihood.runs for output in run.outputs]
     total: dict[str, float] = {}
-    for i, name in enumerate(names):
-        total[name] = total.get(name, 0.0) + float(fall[likelihood.channel == i].sum())
+    for i, output in enumerate(output for run in likelihood.runs for output in run.outputs):
+        total[output.name] = total.get(output.name, 0.0) + float(fall[likelihood.channel == i].sum())
     return total
 
 
-def chi2_reduction_by_time(likelihood: Likelihood, before: Fit, after: Fit, bins: int = 40) -> Array:
-    """Fall of the mean squared whitened residual in intervals of equal duration, shape (bins,)."""
+def _chi2_reduction_by_time(likelihood: Likelihood, before: Fit, after: Fit) -> Array:
+    """Fall of the mean squared whitened residual in ``TIME_BINS`` intervals of equal duration, shape (bins,)."""
     keep = likelihood.rows | likelihood.validation_rows
-    slot = np.minimum((likelihood.time * bins).astype(int), bins - 1)[keep]
+    slot = np.minimum((likelihood.time * TIME_BINS).astype(int), TIME_BINS - 1)[keep]
     fall = (before.residual**2 - after.residual**2)[keep]
-    return np.bincount(slot, fall, bins) / np.maximum(np.bincount(slot, minlength=bins), 1)
+    return np.bincount(slot, fall, TIME_BINS) / np.maximum(np.bincount(slot, minlength=TIME_BINS), 1)
 
 
-def chi2_reduction_by_harmonic(likelihood: Likelihood, before: Fit, after: Fit, count: int = 8) -> dict[int, float]:
-    """Share of the fall of chi-square around each multiple of the motion's frequency, over all channels."""
-    reduction: dict[int, float] = {}
+def _chi2_reduction_by_harmonic(likelihood: Likelihood, before: Fit, after: Fit) -> dict[int, float]:
+    """Share of the fall of chi-square around multiples 0 to ``MAX_HARMONIC`` of the motion's frequency."""
+    reduction = dict.fromkeys(range(MAX_HARMONIC + 1), 0.0)
     first = 0
     for run, whiteners in zip(likelihood.runs, likelihood.whiteners, strict=True):
         for output, whiten in zip(run.outputs, whiteners, strict=True):
@@ -40,8 +42,8 @@ def chi2_reduction_by_harmonic(likelihood: Likelihood, before: Fit, after: Fit, 
             frequency = np.arange(power.size) / (output.data.size * output.step)
             motion = run.scales[output.axes[0]].rate / (2 * np.pi)
             nearest = np.rint(frequency / motion).astype(int)
-            for n in range(count + 1):
-                reduction[n] = reduction.get(n, 0.0) + float(power[nearest == n].sum())
+            for n in reduction:
+                reduction[n] += float(power[nearest == n].sum())
     total = sum(max(v, 0.0) for v in reduction.values()) or 1.0
     return {n: max(v, 0.0) / total for n, v in reduction.items()}
 
@@ -55,10 +57,10 @@ def describe_localisation(likelihood: Likelihood, candidate: Candidate, before: 
         pulls = before.penalty - after.penalty
         return f"{place}: not in the residual; chi-square of the nominal values' deviations falls by {pulls:.0f}"
     shares = ", ".join(f"{name} {max(v, 0.0) / total:.0%}" for name, v in sorted(channels.items(), key=lambda i: -i[1]))
-    by_time = np.maximum(chi2_reduction_by_time(likelihood, before, after), 0.0)
+    by_time = np.maximum(_chi2_reduction_by_time(likelihood, before, after), 0.0)
     centre = float(by_time @ (np.arange(by_time.size) + 0.5) / by_time.size / max(by_time.sum(), 1e-300))
     when = "throughout" if 0.35 < centre < 0.65 else "mostly early" if centre < 0.5 else "mostly late"
-    harmonics = chi2_reduction_by_harmonic(likelihood, before, after)
+    harmonics = _chi2_reduction_by_harmonic(likelihood, before, after)
     top = sorted(harmonics.items(), key=lambda item: -item[1])[:3]
     around = ", ".join(f"{n}f {share:.0%}" for n, share in top if share > 0.05)
     return f"{place}: {shares} of the misfit, {when} (centre at {centre:.0%}), around {around}"

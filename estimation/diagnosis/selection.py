@@ -35,7 +35,7 @@ from estimation.diagnosis.from_stated_values import (
 )
 from estimation.diagnosis.law_selection import choose_laws
 from estimation.diagnosis.linear_model import RivalFit
-from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model, stated_values
+from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.diagnosis.necessity import NO_LAWS, Need, least_explained, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import all_candidates, damped_start
@@ -231,7 +231,7 @@ def _choose_from_stated_values(
     if selected is not None and nominal_values_are_improbable(selected.fit):
         # They have absorbed a further effect, which is visible beside these laws at the stated values only.
         fit = selected.fit
-        kept = fit_with_stated_values(likelihood, fit.model, stated_values(fit.model, fit.x), stops[0])
+        kept = fit_with_stated_values(likelihood, fit.model, fit.x, stops[0])
         selected = _choose_laws(kept, nominal, pool, progress)
     return selected if selected is not None and _is_answer(selected) else None
 
