@@ -64,6 +64,12 @@ def estimate_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
     return whiteners
 
 
+def refit_under_own_noise(fit: Fit) -> tuple[Likelihood, Fit]:
+    """The likelihood under the noise that a fit leaves, and the fit continued under it."""
+    likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
+    return likelihood, fit_model(likelihood, fit.model, fit.x)
+
+
 def _lines_overlap(output: Output, lines: Array, width: float, motion: float) -> bool:
     """Whether lines, as those of a multisine, exclude more than 80 % of the bins around the motion."""
     frequency = np.arange(output.bins) / (output.data.size * output.step)

@@ -7,11 +7,12 @@ the fit without it shows that it is needed; then laws are only added to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
-from estimation.device_fit.initial import estimate_whiteners
+from estimation.device_fit.initial import refit_under_own_noise
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.linear_model import (
@@ -23,8 +24,8 @@ from estimation.diagnosis.linear_model import (
     LinearModel,
     RivalFit,
 )
-from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_laws, linear_model
-from estimation.diagnosis.necessity import Need, need_of_laws
+from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
+from estimation.diagnosis.necessity import NO_LAWS, Need, need_of_laws
 from estimation.diagnosis.significance import satisfies_sign_constraints
 from estimation.parallel import map_fits
 
@@ -36,42 +37,70 @@ MAX_ALTERNATIVES = 6
 sensitivities do not rank them well, and near rivals of selected laws. Each costs a fit."""
 
 
-class Choice(NamedTuple):
-    """Named laws that explain a recording but for a small remainder.
+@dataclass(frozen=True)
+class SelectedTerms:
+    """Selected terms of a device.
 
     Attributes:
         likelihood: under the noise that they leave.
-        before, fit: of the nominal device, and of the device with them.
+        nominal, fit: without them, and with them.
         rivals: other laws in the place of each, by its key.
         need: whether they are the answer beside free corrections.
+        without: fits without one of several terms, by its key.
     """
 
     likelihood: Likelihood
-    before: Fit
+    nominal: Fit
     fit: Fit
-    rivals: dict[str, tuple[RivalFit, ...]]
-    need: Need
+    rivals: Mapping[str, tuple[RivalFit, ...]] = field(default_factory=dict)
+    need: Need = NO_LAWS
+    without: Mapping[str, Fit] = field(default_factory=dict)
 
 
-class _Selection(NamedTuple):
-    """Where the selection ended.
+class _Centre(NamedTuple):
+    """A fit around which laws are selected.
 
     Attributes:
         likelihood: under the noise that the fit leaves.
-        linear: the linear model around the fit.
-        fit: with the selected laws.
-        compared: groups of fits that were compared under the same noise.
+        fit: with any laws or a discrepancy term.
+        linear: the linear model around it.
+        laws: of the fit, as indices of ``linear.laws``.
     """
 
     likelihood: Likelihood
-    linear: LinearModel
     fit: Fit
-    compared: list[dict[Effects, Fit]]
+    linear: LinearModel
+    laws: tuple[int, ...]
+
+    @classmethod
+    def around(cls, fit: Fit, candidates: Sequence[Candidate]) -> _Centre:
+        """The centre at a fit that is continued under its own noise."""
+        likelihood, fit = refit_under_own_noise(fit)
+        linear = linear_model(likelihood, fit, candidates)
+        return cls(likelihood, fit, linear, tuple(i for i, law in enumerate(linear.laws) if law.test is None))
+
+    @property
+    def effects(self) -> Effects:
+        """Axis and name of the laws of the fit."""
+        return self.linear.effects(self.laws)
+
+    def hypothesis(self) -> Hypothesis:
+        """The laws of the fit beside a small discrepancy."""
+        return self.linear.hypothesis(self.laws, max_scale=MAX_SCALE_BESIDE)
+
+    def leaves_noise(self) -> bool:
+        """Whether corrections beside the laws of the fit gain no more than a law has to."""
+        alone = self.linear.without_discrepancy(self.laws)
+        return alone.neg2_log_evidence - self.hypothesis().neg2_log_evidence <= MIN_SCORE_GAIN
+
+    def is_followed_by(self, other: Fit) -> bool:
+        """Whether another fit has possible signs and has not lost the motion, which this one has."""
+        return satisfies_sign_constraints(other) and other.chi2 < MAX_CHI2_RATIO * self.fit.chi2
 
 
 def choose_laws(
     anchor: Fit, nominal: Fit, candidates: Sequence[Candidate], progress: Callable[[str], None]
-) -> Choice | None:
+) -> SelectedTerms | None:
     """The named laws that take the bulk of a misfit, None where none do.
 
     Args:
@@ -80,133 +109,116 @@ def choose_laws(
         candidates: named laws and discrepancy terms.
         progress: called with one line of text at every step.
     """
-    end = _iterate_selection(anchor, candidates, progress)
+    end, compared = _iterate_selection(anchor, candidates, progress)
     if end is None:
         return None
-    likelihood, linear, fit = end.likelihood, end.linear, end.fit
-    present = _present_laws(linear)
-    before = fit_model(likelihood, nominal.model, nominal.x)
-    alone = linear.hypothesis(()).neg2_log_evidence
+    before = fit_model(end.likelihood, nominal.model, nominal.x)
+    alone = end.linear.hypothesis(()).neg2_log_evidence
     if any(map(is_discrepancy, anchor.model.candidates)):
-        alone = min(alone, _evidence_of_discrepancy(likelihood, anchor, candidates))
-    need = need_of_laws(linear, present, misfit(before) - misfit(fit), alone)
+        around = fit_model(end.likelihood, anchor.model, anchor.x)
+        corrections = linear_model(end.likelihood, around, list(filter(is_discrepancy, candidates)))
+        alone = min(alone, corrections.hypothesis(()).neg2_log_evidence)
+    need = need_of_laws(end.linear, end.laws, misfit(before) - misfit(end.fit), alone)
     if not need.possible:
         return None
-    hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
-    linear_rivals = {linear.laws[i].candidate.key: linear.rivals(hypothesis, i) for i in present}
-    rivals = {key: _with_fitted_rivals(key, of_law, fit, end.compared) for key, of_law in linear_rivals.items()}
-    return Choice(likelihood, before, fit, rivals, need)
+    hypothesis = end.hypothesis()
+    linear_rivals = {end.linear.laws[i].candidate.key: end.linear.rivals(hypothesis, i) for i in end.laws}
+    rivals = {key: _with_fitted_rivals(key, of_law, end.fit, compared) for key, of_law in linear_rivals.items()}
+    return SelectedTerms(end.likelihood, before, end.fit, rivals, need)
 
 
 def _iterate_selection(
     anchor: Fit, candidates: Sequence[Candidate], progress: Callable[[str], None]
-) -> _Selection | None:
-    """Select laws around a fit and fit them until the selection no longer changes; None where no law is selected."""
-    fit, fitted, centres = anchor, dict[Effects, Fit](), set[Effects]()
+) -> tuple[_Centre | None, list[dict[Effects, Fit]]]:
+    """Select laws around a fit and fit them until the selection no longer changes.
+
+    Returns:
+        where the selection ended, None where no law is selected; groups of fits that were compared under one noise.
+    """
+    start, fitted, centres = anchor, dict[Effects, Fit](), set[Effects]()
     compared, returned, needed = list[dict[Effects, Fit]](), False, Effects()
     for _ in range(MAX_LINEARISATIONS):
-        likelihood = Likelihood(fit.model.runs, estimate_whiteners(fit.model, fit.x))
-        fit = fit_model(likelihood, fit.model, fit.x)
-        linear = linear_model(likelihood, fit, candidates)
-        present = _present_laws(linear)
-        centres.add(linear.effects(present))
-        if returned and not _leaves_noise(
-            linear.without_discrepancy(present), linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
-        ):
-            break  # several laws take parts of what no law describes
-        kept = present if needed == linear.effects(present) else ()
-        proposed = [present] if returned else _propose_laws(linear, fit, kept, first=not fitted)
+        centre = _Centre.around(start, candidates)
+        linear, present = centre.linear, centre.effects
+        centres.add(present)
+        if returned and not centre.leaves_noise():
+            return centre, compared  # several laws take parts of what no law describes
+        kept = centre.laws if needed == present else ()
+        proposed = [centre.laws] if returned else _propose_laws(centre, kept, first=not fitted)
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, proposed)))
         options = {linear.effects(laws): laws for laws in proposed if laws}
         if not options:
-            return None
-        if list(options) != [linear.effects(present)]:
-            fits = _fit_options(linear, likelihood, fit, options, fitted)
-            if not fits and present:
-                break
-            if not fits:
-                return None
-            compared.append(fits)
-            effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
-            with_laws = fits[effects]
-            removes = effects < linear.effects(present)
-            if effects == linear.effects(present) or (removes and _is_needed(linear, present, fit, with_laws)):
-                needed = linear.effects(present)
-                fitted[needed] = fit
-                continue
-            returned, is_worse = effects in centres, with_laws.neg2_log_evidence > fit.neg2_log_evidence
-            if present and is_worse and (returned or len(effects) > len(present)):
-                break
-            fitted[effects] = fit = with_laws
-            continue
-        exchanged, near = _exchange_near_rival(linear, likelihood, fit, present, candidates, fitted)
-        compared.append(near)
-        if exchanged is None:
             break
-        fit = exchanged
-    else:
-        return None
-    return _Selection(likelihood, linear, fit, compared)
+        if list(options) == [present]:
+            exchanged, near = _exchange_near_rival(centre, candidates, fitted)
+            compared.append(near)
+            if exchanged is None:
+                return centre, compared
+            start = exchanged
+            continue
+        fits = _fit_sets(centre, options, fitted)
+        if not fitted and present:
+            fits[present] = centre.fit
+        fits = {effects: fit for effects, fit in fits.items() if centre.is_followed_by(fit)}
+        if not fits:
+            return centre if present else None, compared
+        compared.append(fits)
+        effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
+        best = fits[effects]
+        if effects == present or (effects < present and _is_needed(centre, best)):
+            needed = present
+            fitted[needed] = start = centre.fit
+            continue
+        returned, is_worse = effects in centres, best.neg2_log_evidence > centre.fit.neg2_log_evidence
+        if present and is_worse and (returned or len(effects) > len(present)):
+            return centre, compared
+        fitted[effects] = start = best
+    return None, compared
 
 
-def _present_laws(linear: LinearModel) -> tuple[int, ...]:
-    """Laws of the fit around which a model is linear."""
-    return tuple(i for i, law in enumerate(linear.laws) if law.test is None)
-
-
-def _leaves_noise(alone: Hypothesis, beside: Hypothesis) -> bool:
-    """Whether corrections gain no more than a law has to: ``beside`` laws that are also compared ``alone``."""
-    return alone.neg2_log_evidence - beside.neg2_log_evidence <= MIN_SCORE_GAIN
-
-
-def _propose_laws(linear: LinearModel, fit: Fit, kept: tuple[int, ...], first: bool) -> list[tuple[int, ...]]:
+def _propose_laws(centre: _Centre, kept: tuple[int, ...], first: bool) -> list[tuple[int, ...]]:
     """Sets of laws to be fitted, selected in the linear model around a fit.
 
     Args:
         kept: laws of the fit, where they are known to be needed.
         first: whether no selected laws have been fitted.
     """
-    present = _present_laws(linear)
+    linear = centre.linear
     if not first:
-        return [linear.select(present, max_moves=1, kept=kept).laws]
-    if any(map(is_discrepancy, fit.model.candidates)):
+        return [linear.select(centre.laws, max_moves=1, kept=kept).laws]
+    if any(map(is_discrepancy, centre.fit.model.candidates)):
         alone = linear.strongest(MAX_ALTERNATIVES)
-    elif len({axis for axis, _ in linear.effects(present)}) > 1:  # each alone leaves the other axis as it is
-        alone = linear.strongest(len(present))
+    elif len({axis for axis, _ in centre.effects}) > 1:  # each alone leaves the other axis as it is
+        alone = linear.strongest(len(centre.laws))
     else:
-        alone = [(law,) for law in present]
+        alone = [(law,) for law in centre.laws]
     return [linear.select().laws, linear.strongest_together(), *alone]
 
 
-def _fit_options(
-    linear: LinearModel,
-    likelihood: Likelihood,
-    fit: Fit,
-    options: dict[Effects, tuple[int, ...]],
-    fitted: dict[Effects, Fit],
+def _fit_sets(
+    centre: _Centre, sets: Mapping[Effects, tuple[int, ...]], fitted: Mapping[Effects, Fit]
 ) -> dict[Effects, Fit]:
-    """Fits of selected laws, and at first the one around which they were selected, that follow the recording."""
-    of_laws = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), options.values(), likelihood.steps)
-    fits = dict(zip(options, of_laws, strict=True))
-    present = _present_laws(linear)
-    if not fitted and present:
-        fits[linear.effects(present)] = fit
-    limit = MAX_CHI2_RATIO * fit.chi2
-    return {effects: one for effects, one in fits.items() if satisfies_sign_constraints(one) and one.chi2 < limit}
+    """Fits of sets of laws, each from an earlier one of the same effects where there is one."""
+
+    def fit(laws: tuple[int, ...]) -> Fit:
+        earlier = fitted.get(centre.linear.effects(laws))
+        if earlier is not None:
+            return fit_model(centre.likelihood, earlier.model, earlier.x)
+        return fit_terms(centre.linear, centre.likelihood, centre.fit, [centre.linear.laws[i] for i in laws])
+
+    return dict(zip(sets, map_fits(fit, sets.values(), centre.likelihood.steps), strict=True))
 
 
-def _is_needed(linear: LinearModel, present: tuple[int, ...], fit: Fit, reduced: Fit) -> bool:
+def _is_needed(centre: _Centre, reduced: Fit) -> bool:
     """Whether the misfit without some laws is higher by more than corrections beside all of them take.
 
     The linear model removes a law whose part corrections or other laws seem to take; far from the fit without that law
     it may be wrong.
 
     Args:
-        linear: around ``fit``.
-        present: its laws.
-        fit, reduced: with all of these laws, and without some.
+        reduced: fit with some of the laws of the centre.
     """
-    return misfit(reduced) - misfit(fit) > linear.gain_of_discrepancy(present)
+    return misfit(reduced) - misfit(centre.fit) > centre.linear.gain_of_discrepancy(centre.laws)
 
 
 def _with_fitted_rivals(
@@ -237,20 +249,8 @@ def _with_fitted_rivals(
     return tuple(sorted(best.values(), key=lambda rival: rival.evidence_gap))
 
 
-def _evidence_of_discrepancy(likelihood: Likelihood, anchor: Fit, candidates: Sequence[Candidate]) -> float:
-    """-2 log evidence of discrepancies of all stages around the fit of one."""
-    fit = fit_model(likelihood, anchor.model, anchor.x)
-    around = linear_model(likelihood, fit, list(filter(is_discrepancy, candidates)))
-    return around.hypothesis(()).neg2_log_evidence
-
-
 def _exchange_near_rival(
-    linear: LinearModel,
-    likelihood: Likelihood,
-    fit: Fit,
-    present: tuple[int, ...],
-    candidates: Sequence[Candidate],
-    fitted: dict[Effects, Fit],
+    centre: _Centre, candidates: Sequence[Candidate], fitted: dict[Effects, Fit]
 ) -> tuple[Fit | None, dict[Effects, Fit]]:
     """The fit with one law exchanged that has a better evidence around itself; None where there is none.
 
@@ -262,25 +262,20 @@ def _exchange_near_rival(
     Returns:
         that fit, and all fits that were compared under the same noise.
     """
-    hypothesis = linear.hypothesis(present, max_scale=MAX_SCALE_BESIDE)
-    alone = linear.without_discrepancy(present)
-    leaves_noise = _leaves_noise(alone, hypothesis)
+    hypothesis, leaves_noise = centre.hypothesis(), centre.leaves_noise()
     discrepancies = [] if leaves_noise else list(filter(is_discrepancy, candidates))
-    best, lowest = None, (alone if leaves_noise else hypothesis).neg2_log_evidence - MIN_EXCHANGE_GAIN
-    compared = {linear.effects(present): fit}
-    rivals = _near_rivals(linear, hypothesis, fitted)
-    fits = map_fits(lambda laws: fit_laws(linear, likelihood, fit, laws, fitted), rivals.values(), likelihood.steps)
-    for effects, other in zip(rivals, fits, strict=True):
-        fitted[effects] = other
-        if not satisfies_sign_constraints(other) or other.chi2 > MAX_CHI2_RATIO * fit.chi2:
-            continue
-        compared[effects] = other
-        around = linear_model(likelihood, other, discrepancies)
+    present = centre.linear.without_discrepancy(centre.laws) if leaves_noise else hypothesis
+    best, lowest = None, present.neg2_log_evidence - MIN_EXCHANGE_GAIN
+    rivals = _fit_sets(centre, _near_rivals(centre.linear, hypothesis, fitted), fitted)
+    fitted |= rivals
+    compared = {effects: fit for effects, fit in rivals.items() if centre.is_followed_by(fit)}
+    for fit in compared.values():
+        around = linear_model(centre.likelihood, fit, discrepancies)
         laws = range(len(around.laws))
         score = around.hypothesis(tuple(laws), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
         if score < lowest:
-            best, lowest = other, score
-    return best, compared
+            best, lowest = fit, score
+    return best, {centre.effects: centre.fit, **compared}
 
 
 def _near_rivals(

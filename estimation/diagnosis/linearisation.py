@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +14,7 @@ from estimation.device_fit.model import uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_growing
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
-from estimation.diagnosis.linear_model import Effects, LinearModel, LinearTerm
+from estimation.diagnosis.linear_model import LinearModel, LinearTerm
 from estimation.diagnosis.screening import (
     ScoreTest,
     all_candidates,
@@ -156,17 +156,3 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
     if residual @ residual < MAX_CHI2_RATIO * fit.chi2:
         return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
     return fit_growing(likelihood, model, x, window_schedule(model)[0])
-
-
-def fit_laws(
-    linear: LinearModel,
-    likelihood: Likelihood,
-    fit: Fit,
-    laws: Sequence[int],
-    fitted: Mapping[Effects, Fit],
-) -> Fit:
-    """The fit with laws, from an earlier one of the same effects where there is one."""
-    earlier = fitted.get(linear.effects(laws))
-    if earlier is not None:
-        return fit_model(likelihood, earlier.model, earlier.x)
-    return fit_terms(linear, likelihood, fit, [linear.laws[i] for i in laws])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import (
@@ -16,9 +16,9 @@ from estimation.device_fit.fit import (
 )
 from estimation.device_fit.hum import fit_hum_variants, min_entropy_whiteners, select_mains_hum
 from estimation.device_fit.initial import (
-    estimate_whiteners,
     fit_progressively,
     flat_whiteners,
+    refit_under_own_noise,
     window_schedule,
 )
 from estimation.device_fit.interference import with_interference_line
@@ -33,10 +33,10 @@ from estimation.diagnosis.from_stated_values import (
     fit_with_stated_values,
     nonlinear_starts,
 )
-from estimation.diagnosis.law_selection import choose_laws
+from estimation.diagnosis.law_selection import SelectedTerms, choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
-from estimation.diagnosis.necessity import NO_LAWS, Need, least_explained, need_of_laws
+from estimation.diagnosis.necessity import least_explained, need_of_laws
 from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
 from estimation.diagnosis.screening import all_candidates, damped_start
 from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
@@ -105,23 +105,33 @@ class SelectionResult:
 
 
 @dataclass(frozen=True)
-class _Selected:
-    """Selected terms.
+class _Search:
+    """What terms are selected from.
 
     Attributes:
-        likelihood: under the noise that they leave.
-        nominal, fit: without them, and with them.
-        without: fits without one of several terms, by its key.
-        rivals: of each by its key.
-        need: whether they are the answer beside free corrections.
+        likelihood: under the noise that the nominal device leaves.
+        nominal: fit of the nominal device over the whole recordings.
+        early: fits of the nominal device over the windows ``stops``.
+        stops: ends of growing windows as fractions of the recordings.
+        pool: named laws and discrepancy terms on all axes and channels.
+        progress: called with one line of text at every step.
     """
 
     likelihood: Likelihood
     nominal: Fit
-    fit: Fit
-    without: Mapping[str, Fit] = field(default_factory=dict)
-    rivals: Mapping[str, tuple[RivalFit, ...]] = field(default_factory=dict)
-    need: Need = NO_LAWS
+    early: Sequence[Fit]
+    stops: Sequence[float]
+    pool: Sequence[Candidate]
+    progress: Progress
+
+    @property
+    def discrepancies(self) -> list[Candidate]:
+        """The discrepancy terms among the candidates."""
+        return list(filter(is_discrepancy, self.pool))
+
+    def of_effects(self, effects: Collection[str]) -> list[Candidate]:
+        """The candidates with these effects."""
+        return [candidate for candidate in self.pool if candidate.term.effect in effects]
 
 
 def select_terms(
@@ -149,120 +159,96 @@ def select_terms(
     named = [term for term in terms.values() if term.effect not in certain]
     pool = all_candidates(device, nominal.model, [*named, *DISCREPANCY_TERMS.values()])
     progress(counted(len(pool), "candidate"))
-    selected = _choose_terms(likelihood, nominal, early, stops, pool, progress)
+    selected = _choose_terms(_Search(likelihood, nominal, early, stops, pool, progress))
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
     return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps, selected.need.remaining)
 
 
-def _choose_terms(
-    likelihood: Likelihood,
-    nominal: Fit,
-    early: Sequence[Fit],
-    stops: Sequence[float],
-    pool: Sequence[Candidate],
-    progress: Progress,
-) -> _Selected:
+def _choose_terms(search: _Search) -> SelectedTerms:
     """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
-    of_effects = ([c for c in pool if c.term.effect in effects] for effects in ANCHOR_EFFECTS)
-    groups = [group for group in of_effects if group]
+    likelihood, nominal = search.likelihood, search.nominal
+    groups = [group for effects in ANCHOR_EFFECTS if (group := search.of_effects(effects))]
     # Where the first group leaves only noise, it takes a thirtieth of the time of fits from the stated values.
-    anchor, tried = fit_anchor(likelihood, nominal, early, stops, groups[:1])
+    anchor, tried = fit_anchor(likelihood, nominal, search.early, search.stops, groups[:1])
     explained = anchor is not nominal and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)
     if not explained:
-        from_stated_values = _choose_from_stated_values(likelihood, nominal, early, stops, pool, progress)
+        from_stated_values = _choose_from_stated_values(search)
         if from_stated_values is not None:
-            return _with_nonlinear_term(from_stated_values, nominal, pool, stops[0], progress)
+            return _with_nonlinear_term(search, from_stated_values)
         if anchor is nominal:
-            anchor, others = fit_anchor(likelihood, nominal, early, stops, groups[1:])
+            anchor, others = fit_anchor(likelihood, nominal, search.early, search.stops, groups[1:])
             tried += others
-    selected = _choose_laws(anchor, nominal, pool, progress)
+    selected = _choose_laws(search, anchor)
     if selected is not None:
-        selected = _with_nonlinear_term(selected, nominal, pool, stops[0], progress)
+        selected = _with_nonlinear_term(search, selected)
         if selected.need.certain:
             return selected
-    progress("discrepancy terms")
-    of_discrepancy = [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])]
-    discrepancy = _choose_discrepancy(anchor, of_discrepancy, nominal, pool)
-    if discrepancy is None:
-        return _with_nonlinear_term(_Selected(likelihood, nominal, nominal), nominal, pool, stops[0], progress)
-    laws = _choose_laws(discrepancy.fit, nominal, pool, progress)
-    return _with_nonlinear_term(laws if laws and laws.need.certain else discrepancy, nominal, pool, stops[0], progress)
+    search.progress("discrepancy terms")
+    selected = _choose_discrepancy(search, anchor, [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])])
+    if selected is not None:
+        laws = _choose_laws(search, selected.fit)
+        selected = laws if laws and laws.need.certain else selected
+    return _with_nonlinear_term(search, selected or SelectedTerms(likelihood, nominal, nominal))
 
 
-def _choose_from_stated_values(
-    likelihood: Likelihood,
-    nominal: Fit,
-    early: Sequence[Fit],
-    stops: Sequence[float],
-    pool: Sequence[Candidate],
-    progress: Progress,
-) -> _Selected | None:
+def _choose_from_stated_values(search: _Search) -> SelectedTerms | None:
     """Named laws around a fit from the stated values, where nominal values have absorbed a misfit.
 
     It is that with the drifts of ``ABSORBED_EFFECTS`` that have the best evidence or, where all drifts leave more than
     noise, with a law that is linear in no amplitude and leaves but noise. None where nominal values have absorbed
     nothing, where drifts follow the motion neither with probable nor with improbable nominal values, or where the named
     laws are not the answer or leave improbable values too.
-
-    Args:
-        early: fits of the nominal device over the windows ``stops``.
-        stops: ends of growing windows as fractions of the recordings.
     """
-    groups = [[candidate for candidate in pool if candidate.term.effect in effects] for effects in ABSORBED_EFFECTS]
+    likelihood, nominal, first = search.likelihood, search.nominal, search.stops[0]
+    groups = [search.of_effects(effects) for effects in ABSORBED_EFFECTS]
     if not groups[0] or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
         return None
-    progress("stated values, with drifting resonances")
-    fits = map_fits(
-        lambda drifts: fit_from_stated_values(likelihood, nominal, drifts, stops[0]), groups, likelihood.steps
-    )
+    search.progress("stated values, with drifting resonances")
+    fits = map_fits(lambda drifts: fit_from_stated_values(likelihood, nominal, drifts, first), groups, likelihood.steps)
     if not any(map(residual_is_noise, fits)):
-        progress("stated values, with laws that are linear in no amplitude")
-        nonlinear = fit_nonlinear_law(likelihood, nominal, pool, stops)
+        search.progress("stated values, with laws that are linear in no amplitude")
+        nonlinear = fit_nonlinear_law(likelihood, nominal, search.pool, search.stops)
         if nonlinear is not None:
-            selected = _choose_beside_nonlinear_term(likelihood, nominal, nonlinear, nominal, pool, progress)
+            selected = _choose_beside_nonlinear_term(search, likelihood, nominal, nonlinear)
             if selected is not None and _is_answer(selected):
                 return selected
     base = min(fits, key=lambda fit: fit.neg2_log_evidence)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, base)
-    follows = residual_ratio(likelihood, base) < max_residual_ratio(likelihood, early[0], stops[0])
+    follows = residual_ratio(likelihood, base) < max_residual_ratio(likelihood, search.early[0], first)
     if not absorbed or (nominal_values_are_improbable(base) and not follows):
         return None
-    selected = _choose_laws(base, nominal, pool, progress)
+    selected = _choose_laws(search, base)
     if selected is not None and nominal_values_are_improbable(selected.fit):
         # They have absorbed a further effect, which is visible beside these laws at the stated values only.
-        fit = selected.fit
-        kept = fit_with_stated_values(likelihood, fit.model, fit.x, stops[0])
-        selected = _choose_laws(kept, nominal, pool, progress)
+        kept = fit_with_stated_values(likelihood, selected.fit.model, selected.fit.x, first)
+        selected = _choose_laws(search, kept)
     return selected if selected is not None and _is_answer(selected) else None
 
 
-def _is_answer(selected: _Selected) -> bool:
+def _is_answer(selected: SelectedTerms) -> bool:
     """Whether selected laws are the answer and have left the nominal values probable."""
     return selected.need.certain and not nominal_values_are_improbable(selected.fit)
 
 
-def _choose_laws(anchor: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress) -> _Selected | None:
-    """The named laws that take the bulk of the misfit of ``nominal``; None where none are significant."""
-    choice = choose_laws(anchor, nominal, pool, progress)
-    if choice is None:
+def _choose_laws(search: _Search, anchor: Fit) -> SelectedTerms | None:
+    """The named laws that take the bulk of the misfit of the nominal device; None where none are significant."""
+    selected = choose_laws(anchor, search.nominal, search.pool, search.progress)
+    if selected is None:
         return None
-    fit, without = drop_redundant(choice.likelihood, choice.fit)
-    if not evidence_gain(choice.likelihood, choice.before, fit):
+    fit, without = drop_redundant(selected.likelihood, selected.fit)
+    if not evidence_gain(selected.likelihood, selected.nominal, fit):
         return None
-    return _Selected(choice.likelihood, choice.before, fit, without, choice.rivals, choice.need)
+    return replace(selected, fit=fit, without=without)
 
 
-def _choose_discrepancy(
-    anchor: Fit, fitted: Sequence[Fit], nominal: Fit, pool: Sequence[Candidate]
-) -> _Selected | None:
+def _choose_discrepancy(search: _Search, anchor: Fit, fitted: Sequence[Fit]) -> SelectedTerms | None:
     """The discrepancy term with the best evidence, with the amplitudes that the recording requires; None if none is.
 
     Args:
         fitted: fits of discrepancy terms that have been made.
     """
-    likelihood = Likelihood(anchor.model.runs, estimate_whiteners(anchor.model, anchor.x))
-    anchor = fit_model(likelihood, anchor.model, anchor.x)
-    linear = linear_model(likelihood, anchor, list(filter(is_discrepancy, pool)))
+    likelihood, anchor = refit_under_own_noise(anchor)
+    linear = linear_model(likelihood, anchor, search.discrepancies)
     stages = range(len(linear.discrepancies))
     alone = {i: linear.hypothesis((), without=[j for j in stages if j != i]).neg2_log_evidence for i in stages}
     fits = map_fits(lambda fit: fit_model(likelihood, fit.model, fit.x), fitted, likelihood.steps)
@@ -274,27 +260,20 @@ def _choose_discrepancy(
     converged = [fit for fit in fits if fit.chi2 < MAX_CHI2_RATIO * anchor.chi2]
     reduced = map_fits(lambda fit: prune_by_evidence(likelihood, fit), converged, likelihood.steps)
     pruned = [fewer for fewer in reduced if fewer is not None]
-    best = min(pruned, key=lambda fit: fit.neg2_log_evidence, default=None)
-    if best is None:
+    if not pruned:
         return None
-    likelihood = Likelihood(best.model.runs, estimate_whiteners(best.model, best.x))
-    best = fit_model(likelihood, best.model, best.x)
-    before = fit_model(likelihood, nominal.model, nominal.x)
-    return _Selected(likelihood, before, best) if evidence_gain(likelihood, before, best) else None
+    likelihood, best = refit_under_own_noise(min(pruned, key=lambda fit: fit.neg2_log_evidence))
+    before = fit_model(likelihood, search.nominal.model, search.nominal.x)
+    return SelectedTerms(likelihood, before, best) if evidence_gain(likelihood, before, best) else None
 
 
-def _with_nonlinear_term(
-    selected: _Selected, nominal: Fit, pool: Sequence[Candidate], first: float, progress: Progress
-) -> _Selected:
+def _with_nonlinear_term(search: _Search, selected: SelectedTerms) -> SelectedTerms:
     """The selection with a law that is linear in no amplitude, as a clip level or a mode that grows, where one gains.
 
     The named laws are chosen again beside it. Where free corrections beside the selected laws have no evidence, such a
     law has none either; where they take the bulk of the misfit, it is sought beside them and not in their place.
-
-    Args:
-        first: end of the first window of a fit over growing windows, as a fraction of the recordings. A mode that grows
-            is determined early, while the misfit of the whole recording has several minima.
     """
+    likelihood = selected.likelihood
     if selected.need.remaining < 0.0:
         return selected
     bases = [selected.nominal]
@@ -303,48 +282,50 @@ def _with_nonlinear_term(
     scored = [
         (base, score)
         for base in bases
-        for score in nonlinear_starts(selected.likelihood, base, pool)[:MAX_NONLINEAR_STARTS]
+        for score in nonlinear_starts(likelihood, base, search.pool)[:MAX_NONLINEAR_STARTS]
     ]
-    starts = [(s.model, damped_start(selected.likelihood, base, s.model, s.x, s.step)) for base, s in scored]
+    starts = [(s.model, damped_start(likelihood, base, s.model, s.x, s.step)) for base, s in scored]
     most = misfit(selected.fit) - least_explained(selected.need)
-    fitted = fit_models(selected.likelihood, starts, abort_above=most)
-    fits = zip((base for base, _ in scored), fitted, strict=True)
+    fits = zip((base for base, _ in scored), fit_models(likelihood, starts, abort_above=most), strict=True)
     possible = [(base, fit) for base, fit in fits if satisfies_sign_constraints(fit)]
-    base, best = min(possible, key=lambda pair: pair[1].neg2_log_evidence, default=(None, None))
-    if base is None or best is None or not evidence_gain(selected.likelihood, selected.fit, best):
+    if not possible:
         return selected
-    converged = fit_to_convergence(selected.likelihood, best.model, best.x)
-    best = min(converged, fit_growing(selected.likelihood, best.model, converged.x, first), key=misfit)
+    base, best = min(possible, key=lambda pair: pair[1].neg2_log_evidence)
+    if not evidence_gain(likelihood, selected.fit, best):
+        return selected
+    converged = fit_to_convergence(likelihood, best.model, best.x)
+    # A mode that grows is determined early, while the misfit of the whole recording has several minima.
+    growing = fit_growing(likelihood, best.model, converged.x, search.stops[0])
+    best = min(converged, growing, key=misfit)
     if misfit(best) > most:
         return selected
-    return _choose_beside_nonlinear_term(selected.likelihood, base, best, nominal, pool, progress) or selected
+    return _choose_beside_nonlinear_term(search, likelihood, base, best) or selected
 
 
 def _choose_beside_nonlinear_term(
-    likelihood: Likelihood, base: Fit, with_law: Fit, nominal: Fit, pool: Sequence[Candidate], progress: Progress
-) -> _Selected | None:
+    search: _Search, likelihood: Likelihood, base: Fit, with_law: Fit
+) -> SelectedTerms | None:
     """A law that is linear in no amplitude and named laws beside it; None where corrections do not need it.
 
     Args:
-        base, with_law: fits without and with it.
+        base, with_law: fits without and with it, under ``likelihood``.
     """
-    discrepancies = list(filter(is_discrepancy, pool))
-    without, beside = (linear_model(likelihood, fit, discrepancies) for fit in (base, with_law))
+    without, beside = (linear_model(likelihood, fit, search.discrepancies) for fit in (base, with_law))
     laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
     need = need_of_laws(beside, laws, misfit(base) - misfit(with_law), alone)
     if not need.possible:
         return None
-    progress(f"laws beside {with_law.model.candidates[-1].key}")
-    with_laws = _choose_laws(with_law, nominal, pool, progress)
+    search.progress(f"laws beside {with_law.model.candidates[-1].key}")
+    with_laws = _choose_laws(search, with_law)
     if with_laws is not None:
         return with_laws
-    likelihood = Likelihood(with_law.model.runs, estimate_whiteners(with_law.model, with_law.x))
-    before = fit_model(likelihood, nominal.model, nominal.x)
-    fit, removed = drop_redundant(likelihood, fit_model(likelihood, with_law.model, with_law.x))
-    return _Selected(likelihood, before, fit, removed, need=need)
+    likelihood, with_law = refit_under_own_noise(with_law)
+    before = fit_model(likelihood, search.nominal.model, search.nominal.x)
+    fit, removed = drop_redundant(likelihood, with_law)
+    return SelectedTerms(likelihood, before, fit, need=need, without=removed)
 
 
-def _step(selected: _Selected, candidate: Candidate) -> SelectionStep:
+def _step(selected: SelectedTerms, candidate: Candidate) -> SelectionStep:
     """The selection step of one term."""
     fit, before = selected.fit, selected.without.get(candidate.key)
     if before is None:

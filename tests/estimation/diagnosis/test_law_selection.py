@@ -156,12 +156,13 @@ def test_beside_a_fit_that_leaves_only_noise_corrections_improve_no_rival(
         return SimpleNamespace(laws=(), hypothesis=lambda laws, max_scale: SimpleNamespace(neg2_log_evidence=score))
 
     monkeypatch.setattr(LinearModel, "beside", lambda self, laws, scales: [Hypothesis((0,), scales, beside, 0.0)])
-    monkeypatch.setattr(law_selection, "fit_laws", lambda *arguments: rival)
+    monkeypatch.setattr(law_selection, "fit_terms", lambda *arguments: rival)
     monkeypatch.setattr(law_selection, "satisfies_sign_constraints", lambda fit: True)
     monkeypatch.setattr(law_selection, "linear_model", around_rival)
     terms = [term.candidate for term in linear.discrepancies]
     likelihood = SimpleNamespace(steps=0)
-    best, _ = law_selection._exchange_near_rival(linear, likelihood, present, (1,), terms, {})  # type: ignore[arg-type]
+    centre = law_selection._Centre(likelihood, present, linear, (1,))  # type: ignore[arg-type]
+    best, _ = law_selection._exchange_near_rival(centre, terms, {})
     assert (best is rival) is exchanged
 
 
@@ -209,12 +210,12 @@ def test_the_best_single_laws_are_fitted_where_the_present_ones_belong_to_two_ax
     ]
     linear = LinearModel(np.eye(4), np.zeros((0, 4)), tuple(laws), ())
     nothing = SimpleNamespace(laws=())
-    monkeypatch.setattr(law_selection, "_present_laws", lambda linear: (0, 1))
     monkeypatch.setattr(LinearModel, "select", lambda self: nothing)
     monkeypatch.setattr(LinearModel, "strongest_together", lambda self: ())
     monkeypatch.setattr(LinearModel, "strongest", lambda self, number: [(2,), (1,), (0,)][:number])
     fit = SimpleNamespace(model=SimpleNamespace(candidates=()))
-    proposed = law_selection._propose_laws(linear, fit, (), first=True)  # type: ignore[arg-type]
+    centre = law_selection._Centre(SimpleNamespace(), fit, linear, (0, 1))  # type: ignore[arg-type]
+    proposed = law_selection._propose_laws(centre, (), first=True)
     assert set(proposed) - {()} == alone
 
 
@@ -225,9 +226,9 @@ def test_where_the_selection_alternates_between_two_laws_their_near_rivals_are_c
     """Around the spring of third order the linear model prefers that of fifth order, and the reverse."""
     exchange, compared = law_selection._exchange_near_rival, list[bool]()
 
-    def alternate(linear: LinearModel, *arguments: object, **options: object) -> list[tuple[int, ...]]:
-        laws = {law.candidate.term.effect: i for i, law in enumerate(linear.laws)}
-        cubic_is_present = linear.laws[laws["cubic-stiffness"]].test is None
+    def alternate(centre: law_selection._Centre, *arguments: object, **options: object) -> list[tuple[int, ...]]:
+        laws = {law.candidate.term.effect: i for i, law in enumerate(centre.linear.laws)}
+        cubic_is_present = laws["cubic-stiffness"] in centre.laws
         return [(laws["quintic-stiffness" if cubic_is_present else "cubic-stiffness"],)]
 
     def record(*arguments: Any) -> Any:
