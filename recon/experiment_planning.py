@@ -187,10 +187,10 @@ def predict_detectability(runs: Sequence[Run], device: Device) -> list[Detectabi
     Raises:
         BadInput: a readout states no noise.
     """
-    from estimation.device_fit.fit import Likelihood
-    from estimation.device_fit.initial import fit_initial_state, window_schedule
+    from estimation.device_fit.fit import Likelihood, linearise_simulated
+    from estimation.device_fit.initial import fit_initial_state, stated_whitener, window_schedule
     from estimation.device_fit.model import Model
-    from estimation.diagnosis.identifiability import detectability, linearise_simulated, stated_whitener
+    from estimation.diagnosis.identifiability import detectability
     from scanner.terms import catalogue
 
     whiteners = [[stated_whitener(output) for output in run.outputs] for run in runs]

@@ -7,7 +7,7 @@ whitened by the noise that was estimated before. A fifth of the samples is held 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -269,6 +269,16 @@ def linearise_at(likelihood: Likelihood, model: Model, x: Array, stop: float = 1
     for _ in range(2):  # the first Jacobian adapts the steps
         jacobian = likelihood.jacobian(model, x, residual, steps, stop)
     return _finalise_fit(likelihood, model, x, residual, jacobian, likelihood.fitted(stop))
+
+
+def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Likelihood, Fit]:
+    """Likelihood of the signals of a model at ``x`` as recordings, and the exact fit of the model to them."""
+    runs = [
+        replace(run, outputs=tuple(replace(o, data=signal) for o, signal in zip(run.outputs, signals, strict=True)))
+        for run, signals in zip(model.runs, model.outputs(x), strict=True)
+    ]
+    likelihood = Likelihood(runs, whiteners)
+    return likelihood, linearise_at(likelihood, Model(runs, model.device, model.candidates, model.mains), x)
 
 
 def _finalise_fit(likelihood: Likelihood, model: Model, x: Array, residual: Array, jacobian: Array, rows: Mask) -> Fit:

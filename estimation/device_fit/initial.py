@@ -11,6 +11,7 @@ from estimation.device_fit.fit import INITIAL_STEP, Fit, Likelihood, fit_model, 
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, flat_psd, make_whitener, near_lines, noise_psd
 from scanner.arrays import Array
+from scanner.errors import BadInput
 
 FIRST_WINDOW_PERIODS = 5
 """Periods of the motion in the first window: so few that an error of the nominal frequency within its tolerance changes
@@ -43,7 +44,27 @@ def window_schedule(model: Model) -> list[float]:
 
 def flat_whiteners(model: Model) -> list[list[Whitener]]:
     """Whiteners for white noise with the level of each channel at high frequencies."""
-    return [[make_whitener(flat_psd(o.data, o.bins), o.data.size, o.guard) for o in run.outputs] for run in model.runs]
+    return [[_flat_whitener(output) for output in run.outputs] for run in model.runs]
+
+
+def _flat_whitener(output: Output) -> Whitener:
+    return make_whitener(flat_psd(output.data, output.bins), output.data.size, output.guard)
+
+
+def stated_whitener(output: Output) -> Whitener:
+    """Whitener for the stated noise, or for that of the channel at high frequencies where none is stated.
+
+    Raises:
+        BadInput: the stated noise is zero.
+    """
+    if output.noise_sd is None:
+        return _flat_whitener(output)
+    if output.noise_sd <= 0.0:
+        hint = "state noise_var or noise_sd of the readout"
+        raise BadInput("its readout states no noise: every effect would show", channel=output.name, hint=hint)
+    thinning = output.step * output.full_rate
+    power = output.data.size * output.noise_sd**2 / thinning
+    return make_whitener(np.full(output.bins, power), output.data.size, output.guard)
 
 
 def estimate_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
@@ -94,7 +115,7 @@ def fit_initial_state(
     states: list[list[Array]] = []
     for r, run in enumerate(model.runs):
         for axis in run.inputs:
-            indices = _start_indices(model, axis, r)
+            indices = start_indices(model, axis, r)
             misfits = []
             for amplitude in np.geomspace(0.03, 1.5, grid[0]):
                 for phase in 2 * np.pi * np.arange(grid[1]) / grid[1]:
@@ -108,12 +129,12 @@ def fit_initial_state(
         best_states = iter(states)
         for r, run in enumerate(model.runs):
             for axis in run.inputs:
-                x_start[_start_indices(model, axis, r)] = next(best_states)[i]
+                x_start[start_indices(model, axis, r)] = next(best_states)[i]
     fits = fit_models(likelihood, [(model, x_start) for x_start in starts_x], stop, max_iterations=10)
     return min(fits, key=lambda fit: fit.chi2 + fit.penalty)
 
 
-def _start_indices(model: Model, axis: str, r: int) -> list[int]:
+def start_indices(model: Model, axis: str, r: int) -> list[int]:
     """Indices in x of the initial angle and rate of an axis in run ``r``."""
     return [i for i, f in enumerate(model.parameters) if (f.kind, f.owner, f.run) == ("start", axis, r)]
 

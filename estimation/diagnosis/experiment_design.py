@@ -1,14 +1,15 @@
-"""Distance of a finding from its confounders, and further measurements that would increase it."""
+"""Distance of a finding from its confounders, and further measurements that would exclude them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.fit import Fit, Likelihood, linearise_simulated
+from estimation.device_fit.initial import start_indices, stated_whitener
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener
 from estimation.device_fit.parameters import Candidate
@@ -16,8 +17,6 @@ from estimation.diagnosis.identifiability import (
     DISCRIMINATION_SIGMA,
     candidate_sensitivities,
     confusion_probability,
-    linearise_simulated,
-    stated_whitener,
     unexplained_norms,
 )
 from estimation.diagnosis.screening import amplitude_indices
@@ -57,24 +56,14 @@ def _effect_signal(likelihood: Likelihood, fit: Fit, candidate: Candidate) -> Ar
     return fit.residual - likelihood.residual(without, without.map_parameters_from(fit.model, fit.x))
 
 
-@dataclass(frozen=True)
-class CandidateExperiment:
-    """A proposed measurement: the model of all runs, its parameters, and the whiteners of all channels."""
-
-    description: str
-    model: Model
-    x: Array
-    whiteners: Sequence[Sequence[Whitener]]
-
-
 def rank_experiments(
     likelihood: Likelihood, fit: Fit, candidate: Candidate, rival: Candidate
 ) -> list[tuple[str, float]]:
     """Further measurements, each with the distance [sigma] to ``rival`` that it would give; the best first."""
     ranked = []
-    for experiment in _candidate_experiments(likelihood, fit, candidate.axis):
-        simulated = linearise_simulated(experiment.model, experiment.x, experiment.whiteners)
-        ranked.append((experiment.description, distances_to_rivals(*simulated, candidate, [rival])[0]))
+    for description, model, x, whiteners in _experiments(likelihood, fit, candidate.axis):
+        simulated = linearise_simulated(model, x, whiteners)
+        ranked.append((description, distances_to_rivals(*simulated, candidate, [rival])[0]))
     return sorted(ranked, key=lambda pair: -pair[1])
 
 
@@ -97,23 +86,34 @@ def discrimination_advice(
     return "; ".join([distance_text, *computed, *([general] if general else [])])
 
 
-def _candidate_experiments(likelihood: Likelihood, fit: Fit, axis: str) -> Iterator[CandidateExperiment]:
-    """Measurements that could be added to the runs of ``fit``: an angle channel, and a second run of each variation."""
+def _experiments(
+    likelihood: Likelihood, fit: Fit, axis: str
+) -> Iterator[tuple[str, Model, Array, Sequence[Sequence[Whitener]]]]:
+    """Measurements that could be added to the runs of ``fit``: an angle channel, and a second run of each variation.
+
+    Each is a description, the model of all runs, its parameters, and the whiteners of all channels.
+    """
     runs, whiteners = fit.model.runs, likelihood.whiteners
     index = next(i for i, run in enumerate(runs) if axis in run.inputs)
     if not any(output.name == f"angle_{axis}" for run in runs for output in run.outputs):
         with_angle = _with_angle(runs[index], axis)
         with_noise = (*whiteners[index], stated_whitener(with_angle.outputs[-1]))
-        yield _candidate_experiment(
+        yield (
             f"with its angle recorded, noise {RELATIVE_ANGLE_NOISE_SD:g} of the amplitude",
-            fit,
-            index,
-            (*runs[:index], with_angle, *runs[index + 1 :]),
+            *_with_runs(fit, (*runs[:index], with_angle, *runs[index + 1 :])),
             (*whiteners[:index], with_noise, *whiteners[index + 1 :]),
         )
     for description, run, amplitude_factor in _variations(fit.model, runs[index], axis):
-        extended = (*runs, run), (*whiteners, whiteners[index])
-        yield _candidate_experiment(f"with {description} in addition", fit, index, *extended, amplitude_factor)
+        model, x = _with_runs(fit, (*runs, run))
+        for name in run.inputs:
+            x[start_indices(model, name, len(runs))] = amplitude_factor * x[start_indices(model, name, index)]
+        yield f"with {description} in addition", model, x, (*whiteners, whiteners[index])
+
+
+def _with_runs(fit: Fit, runs: Sequence[Run]) -> tuple[Model, Array]:
+    """Model of other runs, and its parameters at the fitted ones; those of the state of an added run are zero."""
+    model = Model(runs, fit.model.device, fit.model.candidates, fit.model.mains)
+    return model, model.map_parameters_from(fit.model, fit.x)
 
 
 def _with_angle(run: Run, axis: str) -> Run:
@@ -144,23 +144,3 @@ def _scale_drive(run: Run, mean_factor: float, alternating_factor: float) -> Run
         average = drive.voltage.mean()
         inputs[name] = replace(drive, voltage=mean_factor * average + alternating_factor * (drive.voltage - average))
     return replace(run, inputs=inputs)
-
-
-def _candidate_experiment(
-    description: str,
-    fit: Fit,
-    index: int,
-    runs: Sequence[Run],
-    whiteners: Sequence[Sequence[Whitener]],
-    amplitude_factor: float = 1.0,
-) -> CandidateExperiment:
-    """Model of ``runs`` at the fitted parameters; a new run starts from the state of run ``index`` times the factor."""
-    fitted = fit.model
-    model = Model(runs, fitted.device, fitted.candidates, fitted.mains)
-    x = model.map_parameters_from(fitted, fit.x)
-    for i, parameter in enumerate(model.parameters):
-        if parameter.kind == "start" and parameter.run == len(fitted.runs):
-            fitted_start = fitted.index("start", parameter.owner, parameter.name, index)
-            assert fitted_start is not None
-            x[i] = amplitude_factor * fit.x[fitted_start]
-    return CandidateExperiment(description, model, x, whiteners)

@@ -7,20 +7,16 @@ sigma are distinguished with probability Phi(d/2): 95 % at 3.3. From 4.5 on an e
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import erfc, sqrt
 
 import numpy as np
 
-from estimation.device_fit.data import Output
-from estimation.device_fit.fit import Fit, Likelihood, linearise_at, nominal_values_are_improbable, stated_values
-from estimation.device_fit.model import Model
-from estimation.device_fit.noise import Whitener, flat_psd, make_whitener
+from estimation.device_fit.fit import Fit, Likelihood, nominal_values_are_improbable, stated_values
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
 from estimation.diagnosis.significance import residual_is_noise
 from scanner.arrays import Array
-from scanner.errors import BadInput
 from scanner.terms import Term
 
 DISCRIMINATION_SIGMA = 4.5
@@ -175,30 +171,3 @@ def unexplained_norms(nominal: Array, precision: Array, signals: Array, blocks: 
         inner = gram[part, part] + np.eye(blocks[j].shape[1])
         remaining[:, j] = size - np.einsum("ij,ij->j", overlap, np.linalg.solve(inner, overlap))
     return np.sqrt(size), np.sqrt(np.maximum(remaining, 0.0))
-
-
-def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Likelihood, Fit]:
-    """Likelihood of the signals of a model at ``x`` as recordings, and the exact fit of the model to them."""
-    runs = [
-        replace(run, outputs=tuple(replace(o, data=signal) for o, signal in zip(run.outputs, signals, strict=True)))
-        for run, signals in zip(model.runs, model.outputs(x), strict=True)
-    ]
-    simulated = Model(runs, model.device, model.candidates, model.mains)
-    likelihood = Likelihood(runs, whiteners)
-    return likelihood, linearise_at(likelihood, simulated, x)
-
-
-def stated_whitener(output: Output) -> Whitener:
-    """Whitener for the stated noise, or for that of the channel at high frequencies where none is stated.
-
-    Raises:
-        BadInput: the stated noise is zero.
-    """
-    if output.noise_sd is None:
-        return make_whitener(flat_psd(output.data, output.bins), output.data.size, output.guard)
-    if output.noise_sd <= 0.0:
-        hint = "state noise_var or noise_sd of the readout"
-        raise BadInput("its readout states no noise: every effect would show", channel=output.name, hint=hint)
-    thinning = output.step * output.full_rate
-    power = output.data.size * output.noise_sd**2 / thinning
-    return make_whitener(np.full(output.bins, power), output.data.size, output.guard)

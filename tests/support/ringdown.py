@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.fit import Fit, Likelihood, linearise_simulated
+from estimation.device_fit.initial import stated_whitener
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.identifiability import linearise_simulated, stated_whitener
 from phantoms.waveforms import Constant
 from recon.experiment_planning import Excitation, prepare_planned_run
 from scanner.terms import catalogue
@@ -23,5 +23,5 @@ def perfect_fit(effect: str | None) -> tuple[Likelihood, Fit]:
     start = model.index("start", "x", "angle", 0)
     assert start is not None
     x[start] = 1.0
-    x[[i for i, f in enumerate(model.parameters) if f.kind == "term"]] = 1.0
+    x[model.indices("term")] = 1.0
     return linearise_simulated(model, x, [[stated_whitener(output) for output in RINGDOWN.outputs]])
