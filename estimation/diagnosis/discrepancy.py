@@ -235,15 +235,18 @@ def _prior_size(i: int, j: int):  # type: ignore[no-untyped-def]
     return lambda s: 0.03
 
 
+AMPLITUDE = Parameter("A", "rad", lambda s: s.amplitude, kind="fixed")
+RATE = Parameter("W", "rad/s", lambda s: s.rate, kind="fixed")
+DURATION = Parameter("T", "s", lambda s: s.duration, kind="fixed")
+"""Scales of the motion that the laws of several terms take as parameters."""
+
 DISCREPANCY_TERMS: dict[str, Term] = {
     term.effect: term
     for term in (
         Term(
             "free-mechanics", "mechanics", "J θ'' + b θ' + k θ + f(θ, θ', t, H_s[r]) = τ",
             (
-                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
-                Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
-                Parameter("T", "s", lambda s: s.duration, kind="fixed"),
+                AMPLITUDE, RATE, DURATION,
                 *(Parameter(f"f{i}{j}", "k A", _prior_size(i, j)) for i, j in FORCE_POWERS),
                 *(Parameter(f"h{i}", "k", _prior_size(1 - i // 2, i // 2)) for i in range(4)),
                 *(
@@ -257,8 +260,7 @@ DISCREPANCY_TERMS: dict[str, Term] = {
         Term(
             "free-stiffness", "mechanics", "J θ'' + (b + δb(t)) θ' + (k + δk(t)) θ = τ",
             (
-                Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
-                Parameter("T", "s", lambda s: s.duration, kind="fixed"),
+                RATE, DURATION,
                 *(Parameter(f"k{j}", "k", lambda s: 0.01) for j in range(1, STIFFNESS_COSINES + 1)),
                 *(Parameter(f"b{j}", "k", lambda s: 0.3 * s.b * s.rate / s.k) for j in range(1, DAMPING_COSINES + 1)),
             ),
@@ -272,25 +274,22 @@ DISCREPANCY_TERMS: dict[str, Term] = {
         Term(
             "free-drive", "drive", "V + δV(V, V', t)",
             (
-                Parameter("T", "s", lambda s: s.duration, kind="fixed"),
+                DURATION,
                 Parameter("size", "V", lambda s: s.voltage_rms, kind="fixed"),
                 Parameter("rate", "rad/s", lambda s: s.drive_rate, kind="fixed"),
                 *(Parameter(f"v{i}", "1", lambda s: 0.04) for i in range(6)),
-                *(
-                    Parameter(f"{name}{j}", "1", lambda s: 0.04)
-                    for name in "go"
-                    for j in range(1, FORCE_DRIFT_COSINES + 1)
-                ),
+                *(Parameter(f"g{j}", "1", lambda s: 0.04) for j in range(1, FORCE_DRIFT_COSINES + 1)),
+                *(Parameter(f"o{j}", "1", lambda s: 0.04) for j in range(1, FORCE_DRIFT_COSINES + 1)),
             ),
             SOURCE, voltage=_drive, applies=lambda axis, scales: scales.voltage_rms > 0,
         ),
         Term(
             "free-readout", "readout", "y + δy(y, y', θ', t) + Σ m_h P_h[y]",
             (
-                Parameter("T", "s", lambda s: s.duration, kind="fixed"),
+                DURATION,
                 Parameter("size", "V", lambda s: s.sense_rms, kind="fixed"),
                 Parameter("rate", "rad/s", lambda s: s.rate, kind="fixed"),
-                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
+                AMPLITUDE,
                 *(Parameter(f"y{i}", "1", lambda s: 0.04) for i in range(3)),
                 *(Parameter(f"w{i}", "1", lambda s: 0.02) for i in range(5)),
                 *(Parameter(f"o{i}", "1", lambda s: 0.04) for i in range(1, OFFSET_COSINES + 1)),
@@ -302,9 +301,7 @@ DISCREPANCY_TERMS: dict[str, Term] = {
         Term(
             "free-timing", "timing", "y(t − δ(t, r, M_n[r]))",
             (
-                Parameter("T", "s", lambda s: s.duration, kind="fixed"),
-                Parameter("W", "rad/s", lambda s: s.rate, kind="fixed"),
-                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
+                DURATION, RATE, AMPLITUDE,
                 *(Parameter(f"r{i}", "s", lambda s: 0.05 / s.rate) for i in (2, 4)),
                 *(Parameter(f"m{i}", "s", lambda s: 0.05 / s.rate) for i in range(len(DELAY_MEMORY_PERIODS))),
                 *(Parameter(f"d{i}", "s", lambda s: 0.05 / s.rate) for i in range(DELAY_COSINES + 1)),
@@ -314,7 +311,7 @@ DISCREPANCY_TERMS: dict[str, Term] = {
         Term(
             "free-optics", "optics", "θ_ref = θ + g(θ)",
             (
-                Parameter("A", "rad", lambda s: s.amplitude, kind="fixed"),
+                AMPLITUDE,
                 *(Parameter(f"c{i}", "1", lambda s: 0.02) for i in range(MAPPING_KNOTS.size)),
             ),
             SOURCE, output=_optics, channels=("angle",),

@@ -242,40 +242,40 @@ def measured_law_table(fit: Fit) -> dict[str, Any] | None:
     None if the term has no static law that a device file can state: a delay, a capacitance, or a dependence on time
     only.
     """
-    candidate, scales = fit.model.candidates[-1], fit.model.scales(fit.model.candidates[-1].axis)
-    static = STATIC_PARAMETERS.get(candidate.term.effect, ())
-    indices = [i for i, f in enumerate(fit.model.parameters) if f.owner == candidate.key and f.name in static]
-    names = [fit.model.parameters[i].name for i in indices]
-    free_parameters = {parameter.name: parameter for parameter in candidate.term.free_parameters}
-    scale_factors = np.array([free_parameters[name].value(1.0, scales) for name in names])
-    value = dict(zip(names, (scale_factors * fit.x[indices]).tolist(), strict=True))
-    sd = dict(zip(names, (np.abs(scale_factors) * np.sqrt(np.diag(fit.covariance)[indices])).tolist(), strict=True))
-    run = next(run for run in fit.model.runs if candidate.axis in run.inputs)
-    match candidate.term.effect:
-        case "free-mechanics":
-            unit, angle, rate = scales.k * scales.amplitude, scales.amplitude, scales.amplitude * scales.rate
-            powers = [list(exponents) for exponents in FORCE_POWERS]
-            factors = [unit / (angle**i * rate**j) for i, j in FORCE_POWERS]
-            run_scales = [run.scales[candidate.axis] for run in fit.model.runs if candidate.axis in run.scales]
-            variables, centre = ["angle", "rate"], [0.0, 0.0]
-            half_width = [max(s.amplitude for s in run_scales), max(s.amplitude * s.rate for s in run_scales)]
-        case "free-readout":
+    model, candidate = fit.model, fit.model.candidates[-1]
+    term, scales = candidate.term, model.scales(candidate.axis)
+    static = STATIC_PARAMETERS.get(term.effect, ())
+    deviations, value, sd = np.sqrt(np.diag(fit.covariance)), dict.fromkeys(static, 0.0), dict.fromkeys(static, 0.0)
+    for i, parameter in zip(model.indices("term", candidate.key), term.free_parameters, strict=True):
+        if parameter.name in static:
+            size = parameter.value(1.0, scales)
+            value[parameter.name], sd[parameter.name] = size * float(fit.x[i]), abs(size) * float(deviations[i])
+    run = next(run for run in model.runs if candidate.axis in run.inputs)
+    if term.effect == "free-mechanics":
+        angle, rate = scales.amplitude, scales.amplitude * scales.rate
+        powers = [list(exponents) for exponents in FORCE_POWERS]
+        factors = [scales.k * angle / (angle**i * rate**j) for i, j in FORCE_POWERS]
+        run_scales = [run.scales[candidate.axis] for run in model.runs if candidate.axis in run.scales]
+        variables, centre = ["angle", "rate"], [0.0, 0.0]
+        half_width = [max(s.amplitude for s in run_scales), max(s.amplitude * s.rate for s in run_scales)]
+    elif static:
+        if term.effect == "free-readout":
             output = next(o for o in run.outputs if o.kind == "sense" and candidate.axis in o.axes)
-            size = scales.sense_rms
-            powers, factors = [[2], [3]], [1.0 / size, 1.0 / size**2]
-            variables, centre = ["signal"], [float(output.data.mean())]
-            half_width = [float(np.abs(output.data - output.data.mean()).max())]
-        case "free-drive":
-            voltage, size = run.inputs[candidate.axis].voltage, scales.voltage_rms
-            powers, factors = [[1], [2], [3]], [1.0, 1.0 / size, 1.0 / size**2]
-            variables, centre = ["voltage"], [float(voltage.mean())]
-            half_width = [float(np.abs(voltage - voltage.mean()).max())]
-        case _:
-            return None
-    table: dict[str, Any] = {"stage": candidate.term.stage, "variables": variables, "centre": centre}
-    table["lower"] = [c - r for c, r in zip(centre, half_width, strict=True)]
-    table["upper"] = [c + r for c, r in zip(centre, half_width, strict=True)]
-    table["powers"] = powers
-    table["coefficients"] = [value.get(key, 0.0) * factor for key, factor in zip(static, factors, strict=True)]
-    table["coefficients_sd"] = [sd.get(key, 0.0) * factor for key, factor in zip(static, factors, strict=True)]
-    return table
+            variables, signal, rms, powers = ["signal"], output.data, scales.sense_rms, [[2], [3]]
+        else:
+            signal = run.inputs[candidate.axis].voltage
+            variables, rms, powers = ["voltage"], scales.voltage_rms, [[1], [2], [3]]
+        factors = [1.0 / rms ** (power - 1) for (power,) in powers]
+        centre, half_width = [float(signal.mean())], [float(np.abs(signal - signal.mean()).max())]
+    else:
+        return None
+    return {
+        "stage": term.stage,
+        "variables": variables,
+        "centre": centre,
+        "lower": [c - r for c, r in zip(centre, half_width, strict=True)],
+        "upper": [c + r for c, r in zip(centre, half_width, strict=True)],
+        "powers": powers,
+        "coefficients": [value[name] * factor for name, factor in zip(static, factors, strict=True)],
+        "coefficients_sd": [sd[name] * factor for name, factor in zip(static, factors, strict=True)],
+    }

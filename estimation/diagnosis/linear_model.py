@@ -100,6 +100,11 @@ class LinearTerm:
     cost: float = 0.0
 
 
+def columns_of(terms: Iterable[LinearTerm]) -> NDArray[np.intp]:
+    """Columns of the triangular factor of several terms, one after the other."""
+    return np.array([column for term in terms for column in term.columns], np.intp)
+
+
 @dataclass(frozen=True)
 class Hypothesis:
     """Named laws beside the discrepancy.
@@ -138,10 +143,6 @@ class LinearModel:
     discrepancies: tuple[LinearTerm, ...]
     cost: float = 0.0
 
-    @property
-    def _groups(self) -> list[NDArray[np.intp]]:
-        return [term.columns for term in self.discrepancies]
-
     def hypothesis(self, laws: Sequence[int], scales: Array | None = None, without: Collection[int] = (),
                    max_scale: float = MAX_SCALE) -> Hypothesis:  # fmt: skip
         """The laws beside the discrepancy, its scales by maximum evidence from ``scales`` on.
@@ -151,17 +152,15 @@ class LinearModel:
             max_scale: upper bound of the scales.
         """
         used = [i for i in range(len(self.discrepancies)) if i not in without]
-        of_laws = [column for i in laws for column in self.laws[i].columns]
-        groups = [self._groups[i] for i in used]
-        at = np.concatenate([np.array(of_laws, int), *groups])
-        ends = len(of_laws) + np.cumsum([0, *(group.size for group in groups)])
+        of_laws = columns_of(self.laws[i] for i in laws)
+        sizes = np.array([self.discrepancies[i].columns.size for i in used], int)
+        at = np.concatenate([of_laws, columns_of(self.discrepancies[i] for i in used)])
+        ends = of_laws.size + np.cumsum([0, *sizes])
         reduced = triangular_factor(self.factor[:, [*at, -1]])
-        start = np.full(len(self._groups), INITIAL_SCALE**2) if scales is None else scales
+        start = np.full(len(self.discrepancies), INITIAL_SCALE**2) if scales is None else scales
         values = np.clip(start[used], MIN_SCALE**2, max_scale**2)
         for iteration in range(SCALE_ITERATIONS + 1):
-            precision = np.ones(at.size)
-            for value, (low, high) in zip(values, pairwise(ends), strict=True):
-                precision[low:high] = 1.0 / value
+            precision = np.concatenate([np.ones(of_laws.size), np.repeat(1.0 / values, sizes)])
             regression = regress(reduced[:, :-1], reduced[:, -1:], precision)
             inverse = regression.inverse_factor
             estimate = -inverse @ regression.projected[:, 0]
@@ -229,7 +228,7 @@ class LinearModel:
 
     def estimate(self, terms: Sequence[LinearTerm]) -> Array:
         """Estimates of terms without others, one after the other."""
-        at = np.array([column for term in terms for column in term.columns], int)
+        at = columns_of(terms)
         regression = regress(self.factor[:, at], self.factor[:, -1:], np.ones(at.size))
         return np.asarray(-np.linalg.solve(regression.factor, regression.projected[:, 0]))
 
@@ -272,16 +271,15 @@ class LinearModel:
 
     def _gains(self, laws: Sequence[int], scales: Array, others: Sequence[int]) -> Array:
         """Fall of -2 log evidence by each of ``others`` beside ``laws``, at fixed scales."""
-        of_laws = [column for i in laws for column in self.laws[i].columns]
-        at = np.concatenate([np.array(of_laws, int), *self._groups])
-        precision = np.concatenate(
-            [np.ones(len(of_laws)), *(np.full(g.size, 1.0 / v) for g, v in zip(self._groups, scales, strict=True))]
-        )
-        new = [c for i in others for c in self.laws[i].columns]
+        of_laws = columns_of(self.laws[i] for i in laws)
+        at = np.concatenate([of_laws, columns_of(self.discrepancies)])
+        sizes = np.array([term.columns.size for term in self.discrepancies], int)
+        precision = np.concatenate([np.ones(of_laws.size), np.repeat(1.0 / scales, sizes)])
+        new = columns_of(self.laws[i] for i in others)
         left = regress(self.factor[:, at], self.factor[:, [*new, -1]], precision).remainder
         gains, first = [], 0
         for i in others:
-            last = first + len(self.laws[i].columns)
+            last = first + self.laws[i].columns.size
             regression = regress(left[:, first:last], left[:, -1:], np.ones(last - first))
             gain = float(np.sum(regression.projected**2)) - regression.log_determinant
             gains.append(gain - self.laws[i].cost)

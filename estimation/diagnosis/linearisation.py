@@ -14,7 +14,7 @@ from estimation.device_fit.model import uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_growing
 from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
-from estimation.diagnosis.linear_model import LinearModel, LinearTerm
+from estimation.diagnosis.linear_model import LinearModel, LinearTerm, columns_of
 from estimation.diagnosis.screening import (
     ScoreTest,
     all_candidates,
@@ -132,8 +132,7 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
     Args:
         fit: around which the model is linear.
     """
-    at = np.array([column for term in terms for column in term.columns], int)
-    estimates = linear.estimate(terms)
+    at, estimates = columns_of(terms), linear.estimate(terms)
     kept = [candidate for candidate in fit.model.candidates if not is_linear(candidate)]
     model = fit.model.with_candidates([*kept, *(term.candidate for term in terms)])
     start = fit.x.copy()

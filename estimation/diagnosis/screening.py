@@ -76,11 +76,6 @@ def _changes_readout(term: Term) -> bool:
     return term.stage in ("readout", "timing") and not term.per_axis
 
 
-def start_points(candidate: Candidate) -> list[tuple[float, ...]]:
-    """Points of linearisation: zero for amplitudes, the grid of the term for other parameters."""
-    return list(product(*[(0.0,) if is_amplitude(candidate, p) else p.starts for p in candidate.term.free_parameters]))
-
-
 def is_amplitude(candidate: Candidate, parameter: Parameter) -> bool:
     """Whether the effect is linear in a parameter around zero."""
     return parameter.kind in AMPLITUDE_KINDS and not candidate.term.initial_seeds
@@ -100,11 +95,9 @@ def score_candidate_starts(
         stop: end of the window of ``base`` as a fraction of the recordings.
     """
     profiled = ProfiledLinearModel(base)
-
-    def score(candidate: Candidate) -> list[ScoreTest]:
-        return _score_starts(likelihood, base, candidate, profiled, stop)
-
-    return map_parallel(score, candidates, likelihood.steps)
+    return map_parallel(
+        lambda candidate: _score_starts(likelihood, base, candidate, profiled, stop), candidates, likelihood.steps
+    )
 
 
 def _score_starts(
@@ -113,12 +106,11 @@ def _score_starts(
     model = base.model.with_candidates((*base.model.candidates, candidate))
     indices = model.indices("term", candidate.key)
     amplitudes, hidden_states = amplitude_indices(model, candidate), model.indices("hidden", candidate.key)
-    points, scores = [], []
-    for grid, seed in product(
-        start_points(candidate), candidate.term.initial_seeds or ((0.0,) * len(candidate.term.hidden_state_scales),)
-    ):
+    term, points, scores = candidate.term, [], []
+    grid = product(*[(0.0,) if is_amplitude(candidate, p) else p.starts for p in term.free_parameters])
+    for values, seed in product(grid, term.initial_seeds or ((0.0,) * len(term.hidden_state_scales),)):
         x = model.map_parameters_from(base.model, base.x)
-        x[indices] = grid
+        x[indices] = values
         x[hidden_states] = seed * (len(hidden_states) // max(len(seed), 1))
         points.append(x)
     for first in range(0, len(points), LANES):
