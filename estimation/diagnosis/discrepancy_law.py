@@ -12,6 +12,7 @@ from estimation.diagnosis.discrepancy import (
     DELAY_MEMORY_PERIODS,
     FORCE_DEGREE,
     FORCE_POWERS,
+    GAIN_COSINES,
     MAPPING_KNOTS,
     PLAY_HALF_WIDTHS,
     apply_play,
@@ -131,8 +132,8 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
     phase = 0.5 * np.pi * (u + 1.0)
     time = s.duration * phase / np.pi
 
-    def waves(letter: str, count: int = 40) -> dict[str, Array]:
-        return {f"{letter}{j}": np.cos(j * phase) for j in range(count)}
+    def waves(letter: str) -> dict[str, Array]:
+        return {f"{letter}{j}": np.cos(j * phase) for j in range(GAIN_COSINES + 1)}  # of all terms the most
 
     match effect:
         case "free-mechanics":

@@ -114,7 +114,7 @@ def _fit_static_law(result: SelectionResult) -> Fit:
 def without_weakest(result: SelectionResult) -> SelectionResult:
     """The result of a selection without the fitted finding whose removal raises the misfit least, refitted."""
     fitted = [step for step in result.steps if step.candidate.term.free_parameters]
-    weakest = min(fitted, key=lambda step: step.before.chi2 + step.before.penalty)
+    weakest = min(fitted, key=lambda step: misfit(step.before))
     remaining = [step for step in result.steps if step is not weakest]
     final = refit_without(result.likelihood, result.final, weakest.candidate) if remaining else result.nominal
 

@@ -18,7 +18,6 @@ from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.linear_model import (
     MAX_SCALE_BESIDE,
     MIN_EXCHANGE_GAIN,
-    MIN_SCORE_GAIN,
     Effects,
     Hypothesis,
     LinearModel,
@@ -26,7 +25,7 @@ from estimation.diagnosis.linear_model import (
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.diagnosis.necessity import NO_LAWS, Need, need_of_laws
-from estimation.diagnosis.significance import satisfies_sign_constraints
+from estimation.diagnosis.significance import DETECTION_THRESHOLD, satisfies_sign_constraints
 from estimation.parallel import map_fits
 
 MAX_LINEARISATIONS = 8
@@ -91,7 +90,7 @@ class _Centre(NamedTuple):
     def leaves_noise(self) -> bool:
         """Whether corrections beside the laws of the fit gain no more than a law has to."""
         alone = self.linear.without_discrepancy(self.laws)
-        return alone.neg2_log_evidence - self.hypothesis().neg2_log_evidence <= MIN_SCORE_GAIN
+        return alone.neg2_log_evidence - self.hypothesis().neg2_log_evidence <= DETECTION_THRESHOLD
 
     def is_followed_by(self, other: Fit) -> bool:
         """Whether another fit has possible signs and has not lost the motion, which this one has."""
@@ -255,9 +254,9 @@ def _exchange_near_rival(
     """The fit with one law exchanged that has a better evidence around itself; None where there is none.
 
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
-    ``MIN_SCORE_GAIN`` are fitted, each once, the best in the place of every law first, and compared around their own
-    fits. Where corrections gain no more than that beside the laws, they have no part in the comparison: beside a fit
-    that leaves only noise, one that leaves more to corrections is not a better one.
+    ``DETECTION_THRESHOLD`` are fitted, each once, the best in the place of every law first, and compared around their
+    own fits. Where corrections gain no more than that beside the laws, they have no part in the comparison: beside a
+    fit that leaves only noise, one that leaves more to corrections is not a better one.
 
     Returns:
         that fit, and all fits that were compared under the same noise.
@@ -281,7 +280,7 @@ def _exchange_near_rival(
 def _near_rivals(
     linear: LinearModel, hypothesis: Hypothesis, fitted: Collection[Effects]
 ) -> dict[Effects, tuple[int, ...]]:
-    """Laws with one exchanged that are within ``MIN_SCORE_GAIN`` of a hypothesis and have not been fitted.
+    """Laws with one exchanged that are within ``DETECTION_THRESHOLD`` of a hypothesis and have not been fitted.
 
     The first are the best ones in the place of every law, then the second ones, up to ``MAX_ALTERNATIVES``.
     """
@@ -290,7 +289,7 @@ def _near_rivals(
         rest = tuple(law for law in hypothesis.laws if law != removed)
         best: dict[Effects, Hypothesis] = {}
         for rival in sorted(linear.beside(rest, hypothesis.scales), key=lambda one: one.neg2_log_evidence):
-            if rival.neg2_log_evidence < hypothesis.neg2_log_evidence + MIN_SCORE_GAIN:
+            if rival.neg2_log_evidence < hypothesis.neg2_log_evidence + DETECTION_THRESHOLD:
                 best.setdefault(linear.effects(rival.laws), rival)
         new = [rival for effects, rival in best.items() if effects not in fitted]
         ranked += [(rank, rival.neg2_log_evidence, rival.laws) for rank, rival in enumerate(new)]

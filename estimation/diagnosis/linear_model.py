@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import ScoreTest, is_amplitude
+from estimation.diagnosis.significance import DETECTION_THRESHOLD
 from estimation.least_squares import regress, triangular_factor
 from scanner.arrays import Array
 
@@ -50,17 +51,9 @@ two drifts, of which one was fitted beside a clock error, seemed 300 worse in -2
 SCREENED_LAWS = 4
 """Laws whose score is computed with scales of their own, of every ranking."""
 
-MIN_SCORE_GAIN = 10.0
-"""Fall of -2 log evidence from which a law is added: 150 in probability, which leaves a margin for the choice among
-the catalogue."""
-
 MAX_SCALE_BESIDE = 0.1
 """Largest scale of a discrepancy beside which laws are selected, in units of its prior: a tenth of a discrepancy that
 explains a misfit by itself."""
-
-NULL_DRAWS, NULL_SEED = 10_000, 1
-"""Draws of noise for the distribution of the largest gain in noise alone, which determine its 99.9 % quantile to 0.4,
-and the seed of them."""
 
 MIN_EXCHANGE_GAIN = 0.1
 """Decrease of -2 log evidence from which a law is exchanged: twice the tolerance of a fit."""
@@ -181,28 +174,28 @@ class LinearModel:
         all_scales[used] = values
         return Hypothesis(tuple(laws), all_scales, misfit + cost + shapes + self.cost, misfit)
 
-    def select(self, laws: Sequence[int] = (), max_moves: int | None = None, kept: Collection[int] = ()) -> Hypothesis:
+    def select(self, laws: Sequence[int] = (), max_moves: float = np.inf, kept: Collection[int] = ()) -> Hypothesis:
         """The laws beside a small discrepancy after the moves that improve them most: additions, removals, exchanges.
 
-        Each law has to gain ``MIN_SCORE_GAIN``, and a second or third law more than the discrepancy beside them still
-        gains: a law that gains less imitates what no law describes.
+        Each law has to gain ``DETECTION_THRESHOLD``, and a second or third law more than the discrepancy beside them
+        still gains: a law that gains less imitates what no law describes.
 
         Args:
             laws: to start from.
-            max_moves: None for as many as there are.
+            max_moves: largest number of moves.
             kept: laws that no move removes.
         """
         needed = self._without_imitations(tuple(laws), kept)
         best = self.hypothesis(needed, max_scale=MAX_SCALE_BESIDE)
-        if max_moves is not None and needed != tuple(laws):
+        if needed != tuple(laws):
             max_moves -= 1
-        while max_moves is None or max_moves > 0:
+        while max_moves > 0:
             limit = self._score(best) - MIN_EXCHANGE_GAIN
             moves = sorted((move for move in self._moves(best, kept) if self._score(move) < limit), key=self._score)
             better = next((move for move in moves if self._is_possible(move.laws, kept)), None)
             if better is None:
                 break
-            best, max_moves = better, None if max_moves is None else max_moves - 1
+            best, max_moves = better, max_moves - 1
         return best
 
     def _score(self, hypothesis: Hypothesis) -> float:
@@ -212,8 +205,8 @@ class LinearModel:
         """
         laws = hypothesis.laws
         without = self.without_discrepancy(laws).neg2_log_evidence
-        beside = hypothesis.neg2_log_evidence + (0.0 if laws else MIN_SCORE_GAIN)
-        return min(without, beside) + MIN_SCORE_GAIN * len(laws)
+        beside = hypothesis.neg2_log_evidence + (0.0 if laws else DETECTION_THRESHOLD)
+        return min(without, beside) + DETECTION_THRESHOLD * len(laws)
 
     def _is_possible(self, laws: tuple[int, ...], kept: Collection[int] = ()) -> bool:
         """Whether all estimates have a physically possible sign, and no law that is not kept is an imitation."""
@@ -297,7 +290,7 @@ class LinearModel:
         while len(laws) < MAX_LAWS:
             taken = self.effects(laws)
             more = [(*laws, i) for i in range(len(self.laws)) if not self.effects([i]) & taken]
-            limit = lowest - MIN_SCORE_GAIN
+            limit = lowest - DETECTION_THRESHOLD
             improved = {m: e for m in more if (e := self.without_discrepancy(m).neg2_log_evidence) < limit}
             best = next((m for m in sorted(improved, key=improved.__getitem__) if self._is_possible(m)), None)
             if best is None:
@@ -335,21 +328,6 @@ class LinearModel:
             if self.effects(rival.laws[-1:]) != self.effects([law]) and gap > -MIN_EXCHANGE_GAIN:
                 best.setdefault(candidate.key, RivalFit(gap, candidate, rival.misfit - hypothesis.misfit))
         return tuple(best.values())
-
-    def null_gain(self, probability: float) -> float:
-        """Fall of -2 log evidence that the best of all laws exceeds in noise alone with the given probability.
-
-        The misfit of noise alone is a standard normal vector in the space of the sensitivities.
-        """
-        noise = np.random.default_rng(NULL_SEED).normal(size=(self.factor.shape[0], NULL_DRAWS))
-        largest = np.full(NULL_DRAWS, -np.inf)
-        for law in self.laws:
-            columns = self.factor[:, law.columns]
-            normal = columns.T @ columns + np.eye(law.columns.size)
-            projected = columns.T @ noise
-            gain = np.einsum("id,id->d", projected, np.linalg.solve(normal, projected))
-            largest = np.maximum(largest, gain - np.linalg.slogdet(normal)[1] - law.cost)
-        return float(np.quantile(largest, 1.0 - probability)) if self.laws else 0.0
 
     def gain_of_discrepancy(self, laws: Sequence[int]) -> float:
         """Fall of the misfit by the discrepancy terms of all stages beside laws."""

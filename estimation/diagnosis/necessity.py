@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from estimation.diagnosis.linear_model import MIN_SCORE_GAIN, LinearModel
+from estimation.diagnosis.linear_model import LinearModel
+from estimation.diagnosis.significance import DETECTION_THRESHOLD
 
 MIN_EXPLAINED_RATIO = 0.1
 """Fall of the misfit by laws over that by free corrections beside them, from which laws may be the answer. Nominal
@@ -77,9 +78,9 @@ def need_of_laws(linear: LinearModel, laws: Sequence[int], explained: float, alo
     advantage = alone - min(beside.neg2_log_evidence, without.neg2_log_evidence)
     springs = [axis for axis, effect in linear.effects(laws) if effect in POLYNOMIAL_SPRINGS]
     series = len(springs) > len(set(springs))
-    takes_bulk = remaining <= MIN_SCORE_GAIN or (remainder < MAX_REMAINDER_RATIO * explained and not series)
+    takes_bulk = remaining <= DETECTION_THRESHOLD or (remainder < MAX_REMAINDER_RATIO * explained and not series)
     possible = explained >= MIN_EXPLAINED_RATIO * remainder and advantage > (
-        -MIN_SCORE_GAIN if takes_bulk else SMALL_LAW_MARGIN
+        -DETECTION_THRESHOLD if takes_bulk else SMALL_LAW_MARGIN
     )
     certain = possible and (takes_bulk or advantage > MIN_ADVANTAGE_RATIO * remainder)
     return Need(possible, certain, takes_bulk, remaining)

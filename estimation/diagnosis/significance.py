@@ -6,8 +6,8 @@ from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.slow_noise import steeper_noise_gain
 
 DETECTION_THRESHOLD = 10.0
-"""Decrease of -2 log evidence from which a term is detected: a factor of 150 in probability, with a margin for the
-choice among some fifty candidates."""
+"""Decrease of -2 log evidence from which a term is detected, and the price of each law in the selection: a factor of
+150 in probability, with a margin for the choice among some fifty candidates."""
 
 UNIQUE_NAME_THRESHOLD = 6.0
 """Difference in -2 log evidence from which a term is reported as the only explanation: a factor of 20 in probability.
