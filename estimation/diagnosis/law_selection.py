@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import cached_property
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
 from estimation.device_fit.initial import refit_under_own_noise
@@ -56,7 +56,8 @@ class SelectedTerms:
     without: Mapping[str, Fit] = field(default_factory=dict)
 
 
-class _Centre(NamedTuple):
+@dataclass(frozen=True)
+class _Centre:
     """A fit around which laws are selected.
 
     Attributes:
@@ -83,14 +84,20 @@ class _Centre(NamedTuple):
         """Axis and name of the laws of the fit."""
         return self.linear.effects(self.laws)
 
-    def hypothesis(self) -> Hypothesis:
+    @cached_property
+    def alone(self) -> Hypothesis:
+        """The laws of the fit without a discrepancy."""
+        return self.linear.without_discrepancy(self.laws)
+
+    @cached_property
+    def beside(self) -> Hypothesis:
         """The laws of the fit beside a small discrepancy."""
         return self.linear.hypothesis(self.laws, max_scale=MAX_SCALE_BESIDE)
 
+    @property
     def leaves_noise(self) -> bool:
         """Whether corrections beside the laws of the fit gain no more than a law has to."""
-        alone = self.linear.without_discrepancy(self.laws)
-        return alone.neg2_log_evidence - self.hypothesis().neg2_log_evidence <= DETECTION_THRESHOLD
+        return self.alone.neg2_log_evidence - self.beside.neg2_log_evidence <= DETECTION_THRESHOLD
 
     def is_followed_by(self, other: Fit) -> bool:
         """Whether another fit has possible signs and has not lost the motion, which this one has."""
@@ -120,8 +127,7 @@ def choose_laws(
     need = need_of_laws(end.linear, end.laws, misfit(before) - misfit(end.fit), alone)
     if not need.possible:
         return None
-    hypothesis = end.hypothesis()
-    linear_rivals = {end.linear.laws[i].candidate.key: end.linear.rivals(hypothesis, i) for i in end.laws}
+    linear_rivals = {end.linear.laws[i].candidate.key: end.linear.rivals(end.beside, i) for i in end.laws}
     rivals = {key: _with_fitted_rivals(key, of_law, end.fit, compared) for key, of_law in linear_rivals.items()}
     return SelectedTerms(end.likelihood, before, end.fit, rivals, need)
 
@@ -140,7 +146,7 @@ def _iterate_selection(
         centre = _Centre.around(start, candidates)
         linear, present = centre.linear, centre.effects
         centres.add(present)
-        if returned and not centre.leaves_noise():
+        if returned and not centre.leaves_noise:
             return centre, compared  # several laws take parts of what no law describes
         kept = centre.laws if needed == present else ()
         proposed = [centre.laws] if returned else _propose_laws(centre, kept, first=not fitted)
@@ -232,15 +238,15 @@ def _with_fitted_rivals(
         key: of the law.
         compared: fits that were compared with each other.
     """
-    laws = {candidate.key: candidate for candidate in fit.model.candidates}
+    laws = {candidate.key for candidate in fit.model.candidates}
     best = {rival.candidate.key: rival for rival in rivals}
     for fits in compared:
-        own = next((one for one in fits.values() if {c.key for c in one.model.candidates} == laws.keys()), None)
+        own = next((one for one in fits.values() if {c.key for c in one.model.candidates} == laws), None)
         if own is None:
             continue
         for other in fits.values():
             new = [candidate for candidate in other.model.candidates if candidate.key not in laws]
-            if len(new) != 1 or {c.key for c in other.model.candidates} - {new[0].key} != laws.keys() - {key}:
+            if len(new) != 1 or {c.key for c in other.model.candidates} - {new[0].key} != laws - {key}:
                 continue
             gap = max(other.neg2_log_evidence - own.neg2_log_evidence, 0.0)
             if new[0].key not in best or gap < best[new[0].key].evidence_gap:
@@ -261,11 +267,10 @@ def _exchange_near_rival(
     Returns:
         that fit, and all fits that were compared under the same noise.
     """
-    hypothesis, leaves_noise = centre.hypothesis(), centre.leaves_noise()
-    discrepancies = [] if leaves_noise else list(filter(is_discrepancy, candidates))
-    present = centre.linear.without_discrepancy(centre.laws) if leaves_noise else hypothesis
+    discrepancies = [] if centre.leaves_noise else list(filter(is_discrepancy, candidates))
+    present = centre.alone if centre.leaves_noise else centre.beside
     best, lowest = None, present.neg2_log_evidence - MIN_EXCHANGE_GAIN
-    rivals = _fit_sets(centre, _near_rivals(centre.linear, hypothesis, fitted), fitted)
+    rivals = _fit_sets(centre, _near_rivals(centre.linear, centre.beside, fitted), fitted)
     fitted |= rivals
     compared = {effects: fit for effects, fit in rivals.items() if centre.is_followed_by(fit)}
     for fit in compared.values():
