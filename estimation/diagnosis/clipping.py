@@ -70,11 +70,13 @@ def clipped_readouts(runs: Sequence[Run], saturation: Term | None) -> list[Candi
     Args:
         saturation: the catalogue's term; None if saturation is not a candidate.
     """
+    if saturation is None:
+        return []
     by_axis: dict[str, Candidate] = {}
     for run in runs:
         for output in run.outputs:
-            rail = find_rail(output.full) if saturation is not None and output.kind == "sense" else None
-            if rail is not None and saturation is not None:
+            rail = find_rail(output.full) if output.kind == "sense" else None
+            if rail is not None:
                 fixed = Parameter("limit", "V", lambda scales, limit=rail.limit: limit, kind="fixed")  # type: ignore[misc]
                 term = replace(saturation, parameters=(fixed,), channels=saturation.variants)
                 by_axis.setdefault(output.axes[0], Candidate(term, output.axes[0], rail.channel))

@@ -99,7 +99,7 @@ def detectability(likelihood: Likelihood, fit: Fit, terms: Iterable[Term]) -> li
     evaluated at the grid point of median size, a confounder at the one that fits best.
     """
     present = {candidate.key for candidate in fit.model.candidates}
-    candidates = [c for c in all_candidates(fit.model.device, fit.model, terms) if c.key not in present]
+    candidates = [c for c in all_candidates(fit.model, terms) if c.key not in present]
     linearisations = [
         (candidate, block[likelihood.rows])
         for candidate, blocks in zip(candidates, candidate_sensitivities(likelihood, fit, candidates), strict=True)

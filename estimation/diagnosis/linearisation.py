@@ -58,8 +58,7 @@ def linear_model(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidat
 
 def linear_model_of_corrections(likelihood: Likelihood, fit: Fit) -> LinearModel:
     """The linear model of the corrections of all stages that a fit does not contain, beside all of its parameters."""
-    corrections = all_candidates(fit.model.device, fit.model, DISCREPANCY_TERMS.values())
-    blocks = _blocks_beside(likelihood, fit, corrections)
+    blocks = _blocks_beside(likelihood, fit, all_candidates(fit.model, DISCREPANCY_TERMS.values()))
     return _project_out(fit, list(range(fit.x.size)), blocks, fit.residual - fit.jacobian @ fit.x)
 
 

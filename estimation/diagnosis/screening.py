@@ -13,7 +13,6 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.parallel import map_parallel
 from scanner.arrays import Array
-from scanner.device import Device
 from scanner.integrator.abi import LANES
 from scanner.terms import Parameter, Term
 from scanner.terms.term import AMPLITUDE_KINDS
@@ -48,9 +47,9 @@ class ScoreTest:
     columns: Array
 
 
-def all_candidates(device: Device, model: Model, terms: Iterable[Term]) -> list[Candidate]:
+def all_candidates(model: Model, terms: Iterable[Term]) -> list[Candidate]:
     """Every term on every axis and channel where it applies; terms of a shared readout are on the first axis only."""
-    candidates = []
+    device, candidates = model.device, list[Candidate]()
     for axis in model.axes:
         scales = model.scales(axis)
         kinds = {output.kind for run in model.runs for output in run.outputs if axis in output.axes}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import (
@@ -100,7 +100,7 @@ class SelectionResult:
     likelihood: Likelihood
     nominal: Fit
     final: Fit
-    steps: tuple[SelectionStep, ...] = field(default_factory=tuple)
+    steps: tuple[SelectionStep, ...] = ()
     remaining: float = 0.0
 
 
@@ -157,7 +157,7 @@ def select_terms(
     nominal = with_interference_line(likelihood, nominal)
     certain = {candidate.term.effect for candidate in clipped}
     named = [term for term in terms.values() if term.effect not in certain]
-    pool = all_candidates(device, nominal.model, [*named, *DISCREPANCY_TERMS.values()])
+    pool = all_candidates(nominal.model, [*named, *DISCREPANCY_TERMS.values()])
     progress(counted(len(pool), "candidate"))
     selected = _choose_terms(_Search(likelihood, nominal, early, stops, pool, progress))
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)

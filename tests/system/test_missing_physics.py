@@ -52,7 +52,7 @@ def test_the_term_in_the_device_file_sharpens_the_same_scan() -> None:
 def test_terms_of_a_shared_readout_are_candidates_once(calibration) -> None:  # type: ignore[no-untyped-def]
     nominal = devices.load("imaging")
     model = Model([prepare_run(calibration, nominal)], nominal)
-    keys = [each.key for each in all_candidates(nominal, model, catalogue().values())]
+    keys = [each.key for each in all_candidates(model, catalogue().values())]
     assert "x.readout-lag" in keys
     assert "y.readout-lag" not in keys
     assert {"y.cubic-stiffness", "y.feedthrough", "y.channel-delay:angle", "y.comb-offset"} <= set(keys)

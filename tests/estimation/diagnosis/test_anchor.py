@@ -78,7 +78,7 @@ def test_a_drifting_stiffness_follows_the_motion_of_a_spring() -> None:
     anchor, _ = fit_anchor(likelihood, early[-1], early, stops, [[drift]])
     assert [candidate.key for candidate in anchor.model.candidates] == [drift.key]
     assert residual_ratio(likelihood, anchor) < MAX_RESIDUAL_RATIO
-    pool = all_candidates(device, nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
+    pool = all_candidates(nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
     choice = choose_laws(anchor, early[-1], pool, lambda text: None)
     assert choice is not None
     assert [candidate.term.effect for candidate in choice.fit.model.candidates] == ["cubic-stiffness"]

@@ -225,7 +225,7 @@ def test_a_pair_of_laws_is_selected_around_a_discrepancy() -> None:
     free = Candidate(DISCREPANCY_TERMS["free-mechanics"], "x", "sense")
     model = Model([run], DEVICE, [free], nominal.mains)
     free_fit = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x), max_iterations=20)
-    pool = all_candidates(DEVICE, nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
+    pool = all_candidates(nominal, [*catalogue().values(), *DISCREPANCY_TERMS.values()])
     linear = linear_model(likelihood, free_fit, [c for c in pool if not c.channel.startswith("angle")])
     assert linear.effects(linear.select().laws) == {("x", "cubic-stiffness"), ("x", "gain-drift")}
 

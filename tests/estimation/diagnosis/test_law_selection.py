@@ -190,7 +190,7 @@ def test_a_law_without_which_the_fit_is_worse_is_kept_although_the_linear_model_
     early = fit_progressively(likelihood, nominal, stops)[-1]
     laws = ("cubic-stiffness", "gain-drift")
     terms = [*(catalogue()[name] for name in laws), *DISCREPANCY_TERMS.values()]
-    pool = all_candidates(DEVICE, nominal, terms)
+    pool = all_candidates(nominal, terms)
     model = Model([run], DEVICE, [law for law in pool if law.term.effect == "gain-drift"], nominal.mains)
     anchor = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x))
     monkeypatch.setattr(LinearModel, "select", without_drift_beside_spring)
@@ -242,7 +242,7 @@ def test_where_the_selection_alternates_between_two_laws_their_near_rivals_are_c
     likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
     early = fit_progressively(likelihood, nominal, stops)[-1]
     laws = ("cubic-stiffness", "quintic-stiffness", "cubic-damping")
-    pool = all_candidates(DEVICE, nominal, [*(catalogue()[name] for name in laws), *DISCREPANCY_TERMS.values()])
+    pool = all_candidates(nominal, [*(catalogue()[name] for name in laws), *DISCREPANCY_TERMS.values()])
     monkeypatch.setattr(law_selection, "_propose_laws", alternate)
     monkeypatch.setattr(law_selection, "_exchange_near_rival", record)
     choice = choose_laws(early, early, pool, lambda text: None)
