@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from benchmarks.null_gain import null_gain
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.initial import fit_progressively, flat_whiteners, window_schedule
@@ -26,6 +25,7 @@ from scanner.recording import Recording
 from scanner.stages import Mechanics
 from scanner.terms import catalogue
 from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
+from tests.support.null_gain import null_gain
 
 SAMPLES, FREE = 600, 12
 LAWS = ("cubic-stiffness", "cubic-damping", "sensor-cubic")

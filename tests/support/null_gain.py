@@ -1,4 +1,4 @@
-"""Gain of the best law in noise alone, against which the detection threshold is set."""
+"""Gain of the best law in noise alone, against which the detection threshold of the diagnosis is set."""
 
 from __future__ import annotations
 
