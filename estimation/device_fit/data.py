@@ -256,7 +256,8 @@ def _output(channel: Channel, axes: tuple[str, ...], device: Device, step: float
     first = max(0, ceil((start - channel.start) * channel.sample_rate - 1e-6))
     full = full[first:]
     decimation = max(1, round(step * channel.sample_rate))
-    data = full if decimation == 1 else decimate(full, decimation)
+    forgotten = min(device.axis(name).quality for name in axes) < MAX_QUALITY_FORGETTING
+    data = full if decimation == 1 else decimate(full, decimation, "line" if forgotten else "mean")
     interval = decimation / channel.sample_rate
     offset = (channel.start + first / channel.sample_rate - start) / step
     data = data[: fast_transform_length(floor((n - offset) * step / interval + 1e-6) + 1)]
@@ -264,7 +265,6 @@ def _output(channel: Channel, axes: tuple[str, ...], device: Device, step: float
     drive = max((lines[name].max() for name in axes if lines[name].size), default=0.0)
     band = min(0.35 / interval, max(BAND_HARMONICS * fastest, 1.5 * drive))
     edge = FILTER_EDGE_SAMPLES if decimation > 1 else 2
-    forgotten = min(device.axis(name).quality for name in axes) < MAX_QUALITY_FORGETTING
     guard = (0 if forgotten else max(edge, ceil(1.0 / (fastest * interval))), edge)
     kind = channel.name.partition("_")[0]
     readout = readout_of(device, axes[0])

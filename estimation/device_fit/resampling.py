@@ -55,12 +55,13 @@ def fast_transform_length(n: int) -> int:
     return int(prev_fast_len(n, real=True))
 
 
-def decimate(values: Array, factor: int) -> Array:
+def decimate(values: Array, factor: int, padding: str = "mean") -> Array:
     """Decimate by ``factor`` after a zero-phase low-pass, flat to 1e-5 in the lower 70 % of the new band.
 
-    Beyond its ends the signal is continued without a step.
+    Args:
+        padding: continuation beyond both ends, as in ``scipy.signal.resample_poly``; ``"line"`` has no step there.
     """
     from scipy.signal import firwin, resample_poly
 
     taps = firwin(32 * factor + 1, 0.9 / factor, window=("kaiser", 10.0))
-    return np.asarray(resample_poly(values, 1, factor, window=taps, padtype="line"))
+    return np.asarray(resample_poly(values, 1, factor, window=taps, padtype=padding))
