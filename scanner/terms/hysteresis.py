@@ -16,15 +16,16 @@ from scanner.terms.term import Parameter, SignalContext, Term
 def prandtl_ishlinskii(v):  # type: ignore[no-untyped-def]
     """Return the integral of the play operators of all half-widths over a signal ``v`` (n,), shape (n,).
 
-    All operators are at rest at the first sample. With uniform density the integral has a closed form (Rayleigh):
-    P = ± x²/2 away from rest, and P = P_r ± (x − x_r)²/4 after a reversal at x_r. A signal that passes an earlier
-    reversal erases it, so the reversals that still count are nested, each inside the one before.
+    All operators are at rest at 0 before the first sample, so that the loops of a symmetric oscillation are symmetric
+    wherever in it the signal begins. With uniform density the integral has a closed form (Rayleigh): P = ± x²/2 away
+    from rest, and P = P_r ± (x − x_r)²/4 after a reversal at x_r. A signal that passes an earlier reversal erases it,
+    so the reversals that still count are nested, each inside the one before.
     """
     out = np.zeros_like(v)
     reversal, value_at = np.empty_like(v), np.empty_like(v)
     depth, widest = 0, 0.0
-    for i in range(1, v.size):
-        x, before = v[i] - v[0], v[i - 1] - v[0]
+    for i in range(v.size):
+        x, before = v[i], v[max(i - 1, 0)]
         if abs(x) >= widest:
             widest = abs(x)
             out[i] = 0.5 * x * widest
