@@ -14,7 +14,7 @@ from scanner.terms.term import NaturalScales, Parameter, SignalContext, Term
 def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
     *coefficients, T = p
     # cos(j u) is the Chebyshev polynomial T_j of cos u, so all terms need one cosine.
-    return signal + chebval(np.cos(np.pi * context.time / T), [0.0, *coefficients])
+    return signal + chebval(np.cos(np.pi * np.minimum(context.time / T, 1.0)), [0.0, *coefficients])
 
 
 def _size(j: int) -> Callable[[NaturalScales], float]:
@@ -24,7 +24,7 @@ def _size(j: int) -> Callable[[NaturalScales], float]:
 TERM = Term(
     effect="offset-drift",
     stage="readout",
-    equation="y = y_nominal + Σ c_j cos(π j t/T)",
+    equation="y = y_nominal + Σ c_j cos(π j t/T),  from T on as at T",
     parameters=(
         *(Parameter(f"c{j}", "V", _size(j)) for j in range(1, 6)),
         Parameter("T", "s", lambda s: s.duration, kind="fixed"),
