@@ -62,7 +62,7 @@ def _required_parameters(fit: Fit, indices: list[int]) -> list[int]:
         step = np.where(free, 0.0, -x)
         gradient = slope + precision * x + information @ step
         inner = information[free][:, free]
-        step[free] = -np.linalg.solve(inner + np.diag(precision[free]), gradient[free])
+        step[free] = -np.linalg.lstsq(inner + np.diag(precision[free]), gradient[free])[0]
         chi2 = fit.chi2 + 2.0 * slope @ step + step @ information @ step
         penalised = float(chi2 + precision @ (x + step) ** 2)
         return laplace_neg2_log_evidence(penalised, inner, precision[free] ** -0.5)
