@@ -16,6 +16,7 @@ from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from estimation.diagnosis.significance import residual_is_noise
 from scanner.device import Axis, Device
+from scanner.stages import MotionSensor
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 
 
@@ -132,7 +133,7 @@ def improved_device(fit: Fit) -> Device:
     axes: dict[str, Axis] = dict(device.axes)
     shared_readout = device.readout
     for name in fit.model.axes:
-        axis = fit.model.nominal(name, fit.x)
+        axis = _with_fitted_offset(fit, name, fit.model.nominal(name, fit.x))
         if shared_readout is not None:
             shared_readout = axis.readout if name == next(iter(device.axes)) else shared_readout
             axis = replace(axis, readout=None)
@@ -150,3 +151,16 @@ def improved_device(fit: Fit) -> Device:
                 terms[MEASURED_LAW] = table
         axes[name] = replace(axis, terms=terms)
     return replace(device, axes=axes, readout=shared_readout)
+
+
+def _with_fitted_offset(fit: Fit, name: str, axis: Axis) -> Axis:
+    """An axis with the mean over all runs of the constant that was fitted beside the stated offset of its sensor."""
+    model, readout, values = fit.model, axis.readout, list[float]()
+    for r, run in enumerate(model.runs):
+        for output in run.outputs:
+            index = model.index("additive", output.name, "offset", r)
+            if output.kind == "sense" and output.axes == (name,) and index is not None:
+                values.append(float(fit.x[index] * model.additive_terms(output)["offset"][0]))
+    if not values or not isinstance(readout, MotionSensor):
+        return axis
+    return replace(axis, readout=replace(readout, offset=readout.offset + sum(values) / len(values)))

@@ -1,0 +1,49 @@
+"""The improved device: what a recording determines beside the findings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimation.diagnosis.diagnose import diagnose
+from scanner.active_terms import stated_terms
+from scanner.device import Axis, Device
+from scanner.forward_model import DriveInput, simulate_axis
+from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
+
+SAMPLE_RATE_HZ = 4000.0
+NOISE_SD = 2e-4  # [V]
+RESONANCE = 2 * np.pi * 120.0
+STAGE = Axis(
+    Mechanics(1.0 / RESONANCE**2, 0.1 / RESONANCE, 1.0),
+    drive=Drive("linear", 1.0),
+    readout=Position(1.0, NOISE_SD),
+    name="x",
+)
+
+
+def recording_with_offset(offset: float, seed: int) -> Recording:
+    """A stage that is driven by tones, read by a position sensor whose output at rest is not the stated one."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(2401) / (2.0 * SAMPLE_RATE_HZ)  # at the samples and between them
+    phases = rng.uniform(0.0, 2 * np.pi, 12)
+    fine = sum(3e-3 * np.cos(2 * np.pi * 15.0 * j * time + phase) for j, phase in enumerate(phases, 1))
+    drive = fine[::2]
+    inputs = DriveInput(np.stack([drive[:-1], fine[1::2], drive[1:]], axis=1), 1 / SAMPLE_RATE_HZ)
+    angle = simulate_axis(STAGE, stated_terms(STAGE), inputs, (0.0, 0.0)).angle
+    sensed = angle + offset + NOISE_SD * rng.standard_normal(angle.size)
+    channels = {"drive_x": (drive, "V", SAMPLE_RATE_HZ, 0.0), "sense_x": (sensed, "V", SAMPLE_RATE_HZ, 0.0)}
+    return Recording.from_arrays(channels, Device("stage", {"x": STAGE}))
+
+
+@pytest.mark.slow
+def test_the_offset_of_a_position_sensor_is_part_of_the_improved_device() -> None:
+    offsets = (1.0e-3, 1.2e-3)
+    diagnosis = diagnose([recording_with_offset(offset, seed) for seed, offset in enumerate(offsets)])
+    assert diagnosis.findings == ()
+    readout = diagnosis.device.axis("x").readout
+    assert isinstance(readout, Position)
+    assert readout.offset == pytest.approx(np.mean(offsets), abs=4 * NOISE_SD / np.sqrt(2400))
+    loop = diagnosis.open_loop["sense_x"]
+    assert loop["improved"]["rmse"] < 1.2 * NOISE_SD < 4 * NOISE_SD < loop["nominal"]["rmse"]
