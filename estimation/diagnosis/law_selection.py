@@ -11,6 +11,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
 from estimation.device_fit.initial import refit_under_own_noise
 from estimation.device_fit.parameters import Candidate
@@ -99,6 +101,12 @@ class _Centre:
         """Whether corrections beside the laws of the fit gain no more than a law has to."""
         return self.alone.neg2_log_evidence - self.beside.neg2_log_evidence <= DETECTION_THRESHOLD
 
+    def takes_bulk(self, nominal: Fit) -> bool:
+        """Whether the laws of the fit take the bulk of the misfit of the nominal device."""
+        before = fit_model(self.likelihood, nominal.model, nominal.x)
+        explained = misfit(before) - misfit(self.fit)
+        return need_of_laws(self.linear, self.laws, explained, alone=np.inf).takes_bulk
+
     def is_followed_by(self, other: Fit) -> bool:
         """Whether another fit has possible signs and has not lost the motion, which this one has."""
         return satisfies_sign_constraints(other) and other.chi2 < MAX_CHI2_RATIO * self.fit.chi2
@@ -115,7 +123,7 @@ def choose_laws(
         candidates: named laws and discrepancy terms.
         progress: called with one line of text at every step.
     """
-    end, compared = _iterate_selection(anchor, candidates, progress)
+    end, compared = _iterate_selection(anchor, nominal, candidates, progress)
     if end is None:
         return None
     before = fit_model(end.likelihood, nominal.model, nominal.x)
@@ -133,7 +141,7 @@ def choose_laws(
 
 
 def _iterate_selection(
-    anchor: Fit, candidates: Sequence[Candidate], progress: Callable[[str], None]
+    anchor: Fit, nominal: Fit, candidates: Sequence[Candidate], progress: Callable[[str], None]
 ) -> tuple[_Centre | None, list[dict[Effects, Fit]]]:
     """Select laws around a fit and fit them until the selection no longer changes.
 
@@ -165,6 +173,9 @@ def _iterate_selection(
         if not fitted and present:
             fits[present] = centre.fit
         fits = {effects: fit for effects, fit in fits.items() if centre.is_followed_by(fit)}
+        if _has_no_addition(centre, options, fits) and not centre.takes_bulk(nominal):
+            more = _fit_sets(centre, _further_additions(centre, fitted.keys() | options.keys()), fitted)
+            fits |= {effects: fit for effects, fit in more.items() if centre.is_followed_by(fit)}
         if not fits:
             return centre if present else None, compared
         compared.append(fits)
@@ -198,6 +209,25 @@ def _propose_laws(centre: _Centre, kept: tuple[int, ...], first: bool) -> list[t
     else:
         alone = [(law,) for law in centre.laws]
     return [linear.select().laws, linear.strongest_together(), *alone]
+
+
+def _has_no_addition(centre: _Centre, options: Collection[Effects], fits: Mapping[Effects, Fit]) -> bool:
+    """Whether laws were added to those of a fit, and none of the new fits has a better evidence."""
+    are_additions = all(centre.effects and centre.effects < effects for effects in options)
+    return are_additions and all(fit.neg2_log_evidence > centre.fit.neg2_log_evidence for fit in fits.values())
+
+
+def _further_additions(centre: _Centre, fitted: Collection[Effects]) -> dict[Effects, tuple[int, ...]]:
+    """The laws of a fit with one more that has not been fitted, up to ``MAX_ALTERNATIVES``.
+
+    They are tried where the sensitivities of the one that the linear model proposed were wrong.
+    """
+    linear, best = centre.linear, dict[Effects, tuple[int, ...]]()
+    more = [(*centre.laws, i) for i in range(len(linear.laws)) if not linear.effects([i]) & centre.effects]
+    for laws in sorted(more, key=lambda one: linear.without_discrepancy(one).neg2_log_evidence):
+        if (effects := linear.effects(laws)) not in fitted:
+            best.setdefault(effects, laws)
+    return dict(list(best.items())[:MAX_ALTERNATIVES])
 
 
 def _fit_sets(

@@ -104,3 +104,21 @@ def test_a_device_without_a_drive_is_predicted_as_a_free_decay() -> None:
     decay = 0.3 * np.exp(-fall * time) * np.cos(turn * time + 0.4)
     recording = Recording.from_arrays({"sense_x": (decay, "V", rate, 0.0)}, Device("beam", {"x": axis}))
     assert predict(recording, Device("beam", {"x": axis}))["sense_x"].rmse < 1e-3
+
+
+@pytest.mark.slow
+def test_the_device_improved_by_half_a_scan_of_the_piezo_stage_has_its_offset(measured_data: Path) -> None:
+    ((whole,), _, device) = ROWS["stage"](measured_data)
+    diagnosis = diagnose([whole.slice(0.0, 0.5 * whole.duration)], device)
+    assert diagnosis.findings[0].effect == "offset-drift"
+    loop = diagnosis.open_loop["sense_x"]
+    assert loop["improved"]["rmse"] < 0.1e-3 < 1e-3 < loop["nominal"]["rmse"]  # [V]
+
+
+@pytest.mark.slow
+def test_gravity_is_named_wherever_the_recording_of_the_pendulum_begins(measured_data: Path) -> None:
+    ((whole,), _, device) = ROWS["pendulum-45"](measured_data)
+    diagnosis = diagnose([whole.slice(0.25, whole.duration)], device)
+    assert diagnosis.findings[0].effect == "gravity-stiffness"
+    loop = diagnosis.open_loop["sense_x"]
+    assert loop["improved"]["rmse"] < 0.25 * loop["nominal"]["rmse"]
