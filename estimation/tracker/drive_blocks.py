@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.reference import PhaseReference
 from estimation.tracker.averaged_dynamics import FORCE_HARMONICS, AxisParameters
@@ -22,6 +23,10 @@ from scanner.errors import BadInput
 
 MAX_LINE_RATE_RATIO = 0.45
 """Highest frequency of a line over the sample rate: a margin of a tenth to the Nyquist frequency."""
+
+MIN_RECORDED_SHARE = 0.5
+"""Share of a block's drive samples from which they determine its force: one of the two cycles that a block has at
+least. Fewer do not separate the harmonics from the mean."""
 
 
 class BlockDrive(NamedTuple):
@@ -44,6 +49,8 @@ def demodulate_drive(
     channel: Channel | None, reference: PhaseReference, time: Array, width: float, law: AxisParameters
 ) -> BlockDrive:
     """Reference and force in each block; no force if no drive was recorded.
+
+    In a gap of the drive (NaN) the force is interpolated between the blocks beside it.
 
     Args:
         channel: the drive's voltage. time: middles of the blocks, shape (blocks,) [s]. width: of a block [s].
@@ -71,6 +78,7 @@ def demodulate_drive(
     lines = np.stack([np.zeros_like(orders), orders], axis=1)
     squared = law.electrostatic_factor > 0.0
     projections = project_blocks(channel, starts, length, lines, w[:, None], squared=squared, may_clip=False)
+    recorded = projections.counts >= MIN_RECORDED_SHARE * length
     switches = find_switch_times(channel, reference, starts, length, projections, orders, squared)
     if switches.size:
         reference = with_switches(reference, switches)
@@ -87,7 +95,18 @@ def demodulate_drive(
     for m in range(1, min(FORCE_HARMONICS, orders.size + 1)):
         rotation = np.exp(-1j * m * law.drive_order * (psi + w * delay))
         force[:, m] = (fitted[:, 2 * m - 1] - 1j * fitted[:, 2 * m]) * rotation
-    return BlockDrive(reference, switches, psi, w, force, drive_shares(time, switches))
+    return BlockDrive(reference, switches, psi, w, _without_gaps(force, recorded), drive_shares(time, switches))
+
+
+def _without_gaps(force: Complex, recorded: NDArray[np.bool_]) -> Complex:
+    """Harmonics of the force, shape (blocks, FORCE_HARMONICS), interpolated over the blocks that are not ``recorded``.
+
+    They are relative to the reference, so that those of a drive that continues through the gap change little.
+    """
+    if recorded.all() or not recorded.any():
+        return force
+    block = np.arange(len(force))
+    return np.stack([np.interp(block, block[recorded], line[recorded]) for line in force.T], axis=1)
 
 
 def _linearise_reference(reference: PhaseReference, time: Array, low: Array, high: Array) -> tuple[Array, Array]:
