@@ -6,7 +6,7 @@ motion at resonance passes its whole range within a period, so that equal sample
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from math import ceil
@@ -124,8 +124,11 @@ def _may_be_held(channel: Channel, shortest: int) -> bool:
 def without_held_samples(channel: Channel, frequency: float) -> Channel:
     """Return a channel whose held samples are missing (NaN); arguments as for :func:`find_held_runs`."""
     runs = find_held_runs(channel, frequency)
-    if not runs:
-        return channel
+    return without_samples(channel, runs) if runs else channel
+
+
+def without_samples(channel: Channel, runs: Sequence[tuple[int, int]]) -> Channel:
+    """Return a channel whose samples in ``runs`` (first, stop) are missing (NaN)."""
 
     def fetch(first: int, stop: int) -> NDArray[np.float64]:
         values = channel.read(first, stop)

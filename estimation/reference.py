@@ -107,7 +107,7 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0, frequency: floa
         BadInput: the drive holds no oscillation.
     """
     f = frequency or tone_frequency(drive, low)
-    block = slow_clock_block(f, drive.sample_rate, BLOCK_CYCLES, drive.size)
+    time, phasors, block = drive_phasors(drive, f, BLOCK_CYCLES)
     if drive.size < 2 * block:
         raise BadInput(
             f"is {drive.size / drive.sample_rate:.3g} s long, less than {MIN_PERIODS:g} periods of its {f:.6g} Hz",
@@ -115,19 +115,33 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0, frequency: floa
             channel=drive.name,
             hint="record for longer",
         )
-    chunks: list[tuple[Array, Array, Array]] = []
-    chunk = block * max(1, CHUNK_SAMPLES // block)
-    for first in range(0, drive.size - block + 1, chunk):
-        values = drive.stored(first, min(first + chunk, drive.size))
-        start = drive.start + first / drive.sample_rate
-        t, z = block_phasors(values, drive.sample_rate, start, f, block, drive.gain)
-        chunks.append((t, np.angle(z * np.exp(-2j * np.pi * f * t)), np.nan_to_num(np.abs(z))))
-    time, phase, size = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    phase, size = np.angle(phasors), np.nan_to_num(np.abs(phasors))
     on = size > DRIVE_ON_RATIO * size.max()
     time, phase = (time[on], phase[on]) if on.sum() >= 2 else (time, phase)
     slow = unwrap_phase(phase)
     ratio = 0.5 if kind == "half-drive" else 1.0
     return PhaseReference(kind, ratio * f, time, ratio * slow)
+
+
+def drive_phasors(drive: Channel, frequency: float, cycles: float) -> tuple[Array, Complex, int]:
+    """Amplitude and phase of a channel against 2 pi f t, block by block.
+
+    Args:
+        frequency: f [Hz]. cycles: of a block, see ``slow_clock_block``.
+
+    Returns:
+        (centres of the blocks [s], phasors as of ``block_phasors``, both of shape (blocks,); samples of a block).
+    """
+    block = slow_clock_block(frequency, drive.sample_rate, cycles, drive.size)
+    chunks: list[tuple[Array, Complex]] = [(np.empty(0), np.empty(0, np.complex128))]
+    chunk = block * max(1, CHUNK_SAMPLES // block)
+    for first in range(0, drive.size - block + 1, chunk):
+        values = drive.stored(first, min(first + chunk, drive.size))
+        start = drive.start + first / drive.sample_rate
+        t, z = block_phasors(values, drive.sample_rate, start, frequency, block, drive.gain)
+        chunks.append((t, z * np.exp(-2j * np.pi * frequency * t)))
+    time, phasors = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    return time, phasors, block
 
 
 def tone_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
