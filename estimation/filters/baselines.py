@@ -37,6 +37,7 @@ from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 from scanner.stages import Position
+from scanner.wording import counted
 
 MIN_BLOCKS = 2
 """Blocks that a motion's slow clock has at least."""
@@ -85,18 +86,20 @@ def estimate_from_sensor(recording: Recording, device: Device) -> Motion:
     Raises:
         ChannelMissing: an axis has neither. BadInput: a channel cannot be used.
     """
-    return Motion({name: axis_motion_from_sensor(recording, device, name) for name in device.axes}, "sensor", {})
+    found = {name: axis_motion_from_sensor(recording, device, name) for name in device.axes}
+    notes = tuple(note for _, own in found.values() for note in own)
+    return Motion({name: motion for name, (motion, _) in found.items()}, "sensor", {}, notes)
 
 
-def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> AxisMotion:
-    """Motion of one axis; as :func:`estimate_from_sensor`."""
+def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> tuple[AxisMotion, list[str]]:
+    """Motion of one axis, and a note on samples that are left out; as :func:`estimate_from_sensor`."""
     measured = any(f"{kind}_{name}" in recording for kind in ("sense", "angle"))
     if f"amplitude_{name}" in recording and "intensity" in recording and not measured:
         light = recording["intensity"]
         angle = lock_in_angle(recording, device.axis(name), light.time())
         channel = make_channel(f"phase_{name}", angle, unit="rad", sample_rate=light.sample_rate, start=light.start)
         reference = reference_of_any_waveform(recording, device, name, channel)
-        return axis_motion_from_angle(angle, channel, reference, None, intensity_clock(recording, channel))
+        return axis_motion_from_angle(angle, channel, reference, None, intensity_clock(recording, channel)), []
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel)
     angle = (channel.read() - zero) / scale
@@ -104,7 +107,19 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     if reference.kind in ("drive", "half-drive") and channel.sample_rate < MIN_SAMPLES_PER_PERIOD * reference.frequency:
         raise sampled_too_slowly(channel, "a motion", reference.frequency)
     held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
-    return axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel), held)
+    motion = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel), held)
+    return motion, _describe_held(channel, held)
+
+
+def _describe_held(channel: Channel, held: Sequence[tuple[int, int]]) -> list[str]:
+    """A line on the samples of a sensor that was stopped, if there are any."""
+    if not held:
+        return []
+    number = sum(stop - first for first, stop in held)
+    return [
+        f"{channel.name}: {counted(number, 'sample')} ({number / channel.size:.2g} of all) at which it stands at one "
+        "value are left out of phase, amplitude and picture"
+    ]
 
 
 def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[Channel, float, float, float | None]:
@@ -171,14 +186,27 @@ def axis_motion_from_angle(
         angle: at the samples of ``channel``, shape (n,) [rad].
         noise_sd: white noise of the sensor, per sample [rad]; measured where None.
         clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
-        held: ranges of samples at which the sensor was stopped; the angle in the result is not known there (NaN).
+        held: ranges of samples at which the sensor was stopped. The angle in the result is not known there (NaN), and
+            the slow clock has no block with such samples.
 
     Raises:
-        BadInput: the channel is shorter than two blocks.
+        BadInput: the channel is shorter than two blocks, or was stopped in all but one.
     """
     rate = channel.sample_rate
     block = slow_clock_block(reference.frequency, rate, BLOCK_CYCLES, channel.size)
-    time, phasors = block_phasors(angle, rate, channel.start, reference.frequency, block)
+    moving = angle.copy()
+    for first, stop in held:
+        moving[first:stop] = np.nan
+    time, phasors = block_phasors(moving, rate, channel.start, reference.frequency, block)
+    known = np.isfinite(phasors)
+    if held and known.sum() < MIN_BLOCKS:
+        raise BadInput(
+            "stands at one value in nearly all of the recording, as a sensor that was stopped",
+            file=channel.file,
+            channel=channel.name,
+            hint="check the sensor and its cable, or cut the recording",
+        )
+    time, phasors = time[known], phasors[known]
     if time.size < MIN_BLOCKS:
         raise BadInput(
             f"is too short to determine its phase: {2 * block} samples are needed",
@@ -188,7 +216,7 @@ def axis_motion_from_angle(
         )
     amplitude = np.abs(phasors)
     if noise_sd is None:
-        noise_sd = white_noise_sd(angle[:NOISE_SAMPLES])
+        noise_sd = white_noise_sd(moving[:NOISE_SAMPLES])
     phase = reference.relative_phase(time, phasors)
     resampled = resample_to_clock(angle, channel, clock).copy()
     for first, stop in held:

@@ -23,7 +23,8 @@ def estimate_from_edges(recording: Recording, device: Device) -> Motion:
     for name in device.axes:
         edges = recording.edges.get(f"sync_{name}")
         if edges is None:
-            axes[name] = axis_motion_from_sensor(recording, device, name)
+            axes[name], own_notes = axis_motion_from_sensor(recording, device, name)
+            notes += own_notes
             continue
         axes[name], own_notes, info[f"sync_{name}"] = axis_motion_from_edges(
             recording, device, edges, _clock(recording)
