@@ -85,21 +85,36 @@ def find_held_runs(channel: Channel, frequency: float) -> list[tuple[int, int]]:
 
 
 def held_while_driven(recording: Recording, device: Device) -> tuple[str, float, float] | None:
-    """The first signal that is held while a drive of its axes changes; None if there is none.
-
-    A free decay ends below the resolution of its converter, where equal samples are right.
+    """The first run of :func:`held_runs_while_driven`; None if there is none.
 
     Returns:
         Name of the channel, begin and end of the run [s].
     """
+    for name, runs in held_runs_while_driven(recording, device).items():
+        channel = recording[name]
+        begin, end = (channel.start + at / channel.sample_rate for at in runs[0])
+        return name, begin, end
+    return None
+
+
+def held_runs_while_driven(recording: Recording, device: Device) -> dict[str, list[tuple[int, int]]]:
+    """Runs of samples (first, stop) in which a signal is held while a drive of its axes changes, by channel.
+
+    A free decay ends below the resolution of its converter, where equal samples are right. Channels without such a run
+    are left out.
+    """
+    found = {}
     for name, frequency in slowest_motions(recording, device).items():
         channel, axes = recording[name], [name.partition("_")[2]] if "_" in name else list(device.axes)
         drives = [recording[f"drive_{axis}"] for axis in axes if f"drive_{axis}" in recording]
-        for run in find_held_runs(channel, frequency):
-            begin, end = (channel.start + at / channel.sample_rate for at in run)
-            if any(_changes(drive, begin, end) for drive in drives):
-                return name, begin, end
-    return None
+        runs = [
+            run
+            for run in find_held_runs(channel, frequency)
+            if any(_changes(drive, *(channel.start + at / channel.sample_rate for at in run)) for drive in drives)
+        ]
+        if runs:
+            found[name] = runs
+    return found
 
 
 def _changes(channel: Channel, begin: float, end: float) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.open_loop import fit_start_only
+from estimation.held_samples import held_runs_while_driven, without_samples
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.recording import Recording
@@ -21,10 +23,11 @@ class Predicted:
 
     Attributes:
         values: predicted, shape (n,), NaN where the drive was not recorded.
-        measured: recorded, shape (n,).
+        measured: recorded, shape (n,), NaN where the signal stands at one value while the axis is driven.
         unit: of both.
         sample_rate, start: of both [Hz], [s].
         noise_sd: stated standard deviation of the noise of a sample, None where none is stated.
+        left_out: number of the samples that stand at one value, as a sensor or a converter that was stopped.
     """
 
     values: Array
@@ -33,13 +36,14 @@ class Predicted:
     sample_rate: float
     start: float
     noise_sd: float | None
+    left_out: int = 0
 
     def __repr__(self) -> str:
         return f"Predicted {self.values.size} samples at {self.sample_rate:.9g} Hz: rmse {self.rmse:.4g} {self.unit}"
 
     @property
     def rmse(self) -> float:
-        """Root mean square difference, in the channel's unit."""
+        """Root mean square difference over the samples that are not left out, in the channel's unit."""
         return float(np.sqrt(np.nanmean((self.values - self.measured) ** 2)))
 
 
@@ -57,8 +61,9 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
     """
     run = prepare_run(recording, device)
     model, x = fit_start_only([run], device)
+    held = held_runs_while_driven(recording, device)
     return {
-        output.name: _at_sample_times(run, index, signal, recording)
+        output.name: _at_sample_times(run, index, signal, recording, held.get(output.name, []))
         for index, (output, signal) in enumerate(zip(run.outputs, model.full_signals(x), strict=True))
     }
 
@@ -97,8 +102,14 @@ def beyond_measured_laws(recording: Recording, device: Device) -> dict[str, floa
     return fractions
 
 
-def _at_sample_times(run: Run, index: int, signal: Array, recording: Recording) -> Predicted:
-    """A signal on the integration grid, at every sample of its channel, by a cubic spline."""
+def _at_sample_times(
+    run: Run, index: int, signal: Array, recording: Recording, held: Sequence[tuple[int, int]]
+) -> Predicted:
+    """A signal on the integration grid, at every sample of its channel, by a cubic spline.
+
+    Args:
+        held: runs of samples (first, stop) of the channel that are not compared.
+    """
     from scipy.interpolate import CubicSpline
 
     output, channel = run.outputs[index], recording[run.outputs[index].name]
@@ -108,4 +119,6 @@ def _at_sample_times(run: Run, index: int, signal: Array, recording: Recording) 
     values = np.full(time.size, np.nan)
     inside = (time >= grid[0] - 1e-9) & (time <= grid[-1] + 1e-9)
     values[inside] = CubicSpline(grid, signal)(time[inside])
-    return Predicted(values, channel.read(), channel.unit, channel.sample_rate, channel.start, output.noise_sd)
+    measured = without_samples(channel, held).read()
+    left_out = sum(stop - first for first, stop in held)
+    return Predicted(values, measured, channel.unit, channel.sample_rate, channel.start, output.noise_sd, left_out)

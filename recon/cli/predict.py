@@ -66,9 +66,10 @@ def predict_file(
             "channels": {
                 name: {
                     "rmse": prediction.rmse,
-                    "nrmse": prediction.rmse / max(float(np.std(prediction.measured)), 1e-300),
+                    "nrmse": prediction.rmse / max(float(np.nanstd(prediction.measured)), 1e-300),
                     "noise_sd": prediction.noise_sd,
                     "unit": prediction.unit,
+                    "left_out": prediction.left_out,
                 }
                 for name, prediction in predictions.items()
             },
@@ -93,5 +94,10 @@ def format_summary(summary: dict[str, Any]) -> str:
         line = f"  {name}: rmse {channel['rmse']:.4g} {channel['unit']}, {channel['nrmse']:.3%} of the signal's sd"
         if channel["noise_sd"] is not None:
             line += f"; noise sd {channel['noise_sd']:.4g} {channel['unit']}"
+        if channel["left_out"]:
+            line += (
+                f"; {counted(channel['left_out'], 'sample')} left out, which stand at one value as of a sensor or a "
+                "converter that was stopped"
+            )
         lines.append(line)
     return "\n".join(lines)

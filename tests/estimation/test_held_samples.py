@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.device_fit.predict import predict
+from estimation.filters.baselines import estimate_from_sensor
 from estimation.held_samples import find_held_runs, held_while_driven, without_held_samples
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
 from scanner.device import Axis, Device
@@ -69,3 +71,40 @@ def test_equal_values_without_a_drive_are_those_of_a_motion_below_the_resolution
     recording = lever_recording(0.0)
     assert recording.device is not None
     assert held_while_driven(recording, recording.device) is None
+
+
+def test_a_prediction_is_not_compared_with_samples_of_a_sensor_that_stands_still_under_a_drive() -> None:
+    driven, free = (lever_recording(drive_V) for drive_V in (1.0, 0.0))
+    assert driven.device is not None
+    predicted = predict(driven, driven.device)["sense_x"]
+    assert predicted.left_out == 2_000
+    assert np.isnan(predicted.measured[8_000:10_000]).all()
+    others = np.r_[0:8_000, 10_000:20_000]
+    difference = (predicted.values - driven["sense_x"].read())[others]
+    assert predicted.rmse == pytest.approx(np.sqrt(np.nanmean(difference**2)))
+    assert predict(free, driven.device)["sense_x"].left_out == 0
+
+
+def test_the_sensor_counts_held_samples_neither_in_phase_nor_in_amplitude() -> None:
+    recording = lever_recording(1.0)
+    assert recording.device is not None
+    motion = estimate_from_sensor(recording, recording.device)
+    lever = motion.axes["x"]
+    np.testing.assert_allclose(lever.amplitude, 1.0, rtol=1e-6)
+    np.testing.assert_allclose(lever.phase - lever.phase[0], 0.0, atol=1e-6)
+    assert lever.phase_sd.max() < 1e-3
+    assert np.isnan(lever.angle.read()[8_000:10_000]).all()
+    assert motion.notes == (
+        "sense_x: 2000 samples (0.1 of all) at which it stands at one value are left out of phase, amplitude and "
+        "picture",
+    )
+
+
+def test_a_sensor_that_stands_still_throughout_is_refused() -> None:
+    recording = lever_recording(1.0)
+    sensed = recording["sense_x"].read()
+    sensed[4_000:] = sensed[4_000]
+    held = recording.with_channel(make_channel("sense_x", sensed, unit="V", sample_rate=RATE_HZ))
+    assert recording.device is not None
+    with pytest.raises(BadInput, match="sense_x: stands at one value in nearly all of the recording"):
+        estimate_from_sensor(held, recording.device)
