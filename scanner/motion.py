@@ -7,12 +7,17 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanner.arrays import Array, Complex
 from scanner.interpolation import shift_samples
 
 if TYPE_CHECKING:
     import xarray
+
+
+UNKNOWN_PHASE_SD_RAD = float(np.pi / np.sqrt(3.0))
+"""Standard deviation of a phase of which nothing is known: the largest that an estimator states."""
 
 
 class AngleTrack(Protocol):
@@ -153,6 +158,12 @@ class AxisMotion:
     reference: str = "half-drive"
     sign: str = "ambiguous"
     amplitude_sd: Array | None = None
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether a phase is known at each time, shape (n,); all where none is, as in noise alone."""
+        known = np.asarray(self.phase_sd < UNKNOWN_PHASE_SD_RAD)
+        return known if known.any() else np.ones_like(known)
 
     def __repr__(self) -> str:
         sd = np.degrees(np.sqrt(np.mean(np.square(self.phase_sd))))

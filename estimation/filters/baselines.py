@@ -34,16 +34,13 @@ from scanner.channel_names import list_names
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 from scanner.stages import Position
 from scanner.wording import counted
 
 MIN_BLOCKS = 2
 """Blocks that a motion's slow clock has at least."""
-
-UNIFORM_PHASE_SD = float(np.pi / np.sqrt(3.0))
-"""Standard deviation of a phase of which nothing is known [rad]: the largest that is stated."""
 
 CONSTANT_POINTS = 200
 """Points of the slow clock of a constant motion: only a chirped drive's frequency changes along it."""
@@ -186,27 +183,18 @@ def axis_motion_from_angle(
         angle: at the samples of ``channel``, shape (n,) [rad].
         noise_sd: white noise of the sensor, per sample [rad]; measured where None.
         clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
-        held: ranges of samples at which the sensor was stopped. The angle in the result is not known there (NaN), and
-            the slow clock has no block with such samples.
+        held: ranges of samples at which the sensor was stopped. The angle in the result is not known there (NaN). Phase
+            and amplitude are interpolated through them, and the phase has the standard deviation of an unknown one.
 
     Raises:
         BadInput: the channel is shorter than two blocks, or was stopped in all but one.
     """
     rate = channel.sample_rate
     block = slow_clock_block(reference.frequency, rate, BLOCK_CYCLES, channel.size)
-    moving = angle.copy()
+    stopped = np.zeros(angle.size, bool)
     for first, stop in held:
-        moving[first:stop] = np.nan
-    time, phasors = block_phasors(moving, rate, channel.start, reference.frequency, block)
-    known = np.isfinite(phasors)
-    if held and known.sum() < MIN_BLOCKS:
-        raise BadInput(
-            "stands at one value in nearly all of the recording, as a sensor that was stopped",
-            file=channel.file,
-            channel=channel.name,
-            hint="check the sensor and its cable, or cut the recording",
-        )
-    time, phasors = time[known], phasors[known]
+        stopped[first:stop] = True
+    time, phasors = block_phasors(angle, rate, channel.start, reference.frequency, block)
     if time.size < MIN_BLOCKS:
         raise BadInput(
             f"is too short to determine its phase: {2 * block} samples are needed",
@@ -214,10 +202,21 @@ def axis_motion_from_angle(
             channel=channel.name,
             hint="record for longer",
         )
-    amplitude = np.abs(phasors)
+    by_block = stopped[: time.size * block].reshape(-1, block)
+    known = ~by_block.any(axis=1)
+    if known.sum() < MIN_BLOCKS:
+        raise BadInput(
+            "stands at one value in nearly all of the recording, as a sensor that was stopped",
+            file=channel.file,
+            channel=channel.name,
+            hint="check the sensor and its cable, or cut the recording",
+        )
+    amplitude = np.interp(time, time[known], np.abs(phasors[known]))
     if noise_sd is None:
-        noise_sd = white_noise_sd(moving[:NOISE_SAMPLES])
-    phase = reference.relative_phase(time, phasors)
+        noise_sd = white_noise_sd(angle[:NOISE_SAMPLES][~stopped[:NOISE_SAMPLES]])
+    phase = np.interp(time, time[known], reference.relative_phase(time[known], phasors[known]))
+    phase_sd = noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block)
+    phase_sd[by_block.mean(axis=1) >= 0.5] = UNKNOWN_PHASE_SD_RAD
     resampled = resample_to_clock(angle, channel, clock).copy()
     for first, stop in held:
         begin, end = (round((channel.start + at / rate - clock[1]) * clock[0]) for at in (first, stop))
@@ -227,9 +226,7 @@ def axis_motion_from_angle(
         phase=phase,
         amplitude=amplitude,
         frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
-        phase_sd=np.minimum(
-            noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block), UNIFORM_PHASE_SD
-        ),
+        phase_sd=np.minimum(phase_sd, UNKNOWN_PHASE_SD_RAD),
         angle=SampledAngle(resampled, clock[0], clock[1]),
         reference=reference.kind,
         sign=f"known: {channel.name}",

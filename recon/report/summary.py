@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,7 @@ def readout_phase_summary(result: Reconstruction, axis: str) -> dict[str, Any] |
 
 def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
     """What the summary says of one axis."""
-    own, bound = result.motion.axes[axis], result.phase_bound(axis)
+    own, bound = known_part(result.motion.axes[axis]), result.phase_bound(axis)
     error, scale = result.evaluation.get(axis), result.picture.grid.angle_scale
     metres = result.picture.grid.metres_per_radian
     summary: dict[str, Any] = {
@@ -93,12 +93,20 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
     return summary
 
 
+def known_part(own: AxisMotion) -> AxisMotion:
+    """The motion of an axis without the times at which nothing is known of it, as where its sensor was stopped."""
+    if own.known.all():
+        return own
+    of_time = ("time", "phase", "amplitude", "frequency", "phase_sd", "amplitude_sd")
+    return replace(own, **{name: each[own.known] for name in of_time if (each := getattr(own, name)) is not None})
+
+
 def amplitude_uncertainty(result: Reconstruction, axis: str) -> dict[str, float | None]:
     """Standard deviation of the amplitude, by noise and calibration together and by calibration alone [rad].
 
     None where nothing calibrates the amplitude.
     """
-    own, relative = result.motion.axes[axis], result.amplitude_calibration[axis]
+    own, relative = known_part(result.motion.axes[axis]), result.amplitude_calibration[axis]
     if relative is None:
         return {"amplitude_sd_rad": None, "amplitude_sd_calibration_rad": None}
     scale = result.picture.grid.angle_scale

@@ -116,7 +116,7 @@ def _estimate_axes(
         axis = motion.axes[name]
         time, value, sd = measured_phase_error(errors, column, axis, corrected.axes[name])
         times = posterior_times(axis, time)
-        sense_sd = np.interp(times, axis.time, axis.phase_sd)
+        sense_sd = np.interp(times, axis.time[axis.known], axis.phase_sd[axis.known])
         used_sd = np.full_like(sd, np.inf) if name in refuted else sd
         axes[name] = weigh_hypotheses(time, value, used_sd, times, sense_sd, len(errors) >= MIN_DRIFT_SLICES)
     measured = {name: axis for name, axis in axes.items() if axis.determines_constant}
@@ -157,10 +157,13 @@ def measured_phase_error(
 
 
 def advance_axis(axis: AxisMotion, error: ReadoutPhase) -> AxisMotion:
-    """The motion ahead by a phase error, with the standard deviation of that error, which includes the motion's."""
+    """The motion ahead by a phase error, with the standard deviation of that error, which includes the motion's.
+
+    A phase that is not known stays so.
+    """
     variance = np.interp(axis.time, error.time, error.variance)
     ahead = axis.advanced(np.interp(axis.time, error.time, error.mean))
-    return replace(ahead, phase_sd=np.sqrt(variance))
+    return replace(ahead, phase_sd=np.where(axis.known, np.sqrt(variance), axis.phase_sd))
 
 
 def widen_undetermined(axis: AxisMotion) -> AxisMotion:

@@ -23,6 +23,7 @@ from recon.quality.clock_jumps import detect_clock_jumps
 from recon.quality.defects import Defect, describe_defects, find_defects
 from recon.quality.dropped_samples import first_late_slice, slice_delays
 from recon.reconstruction import Options, Reconstruction
+from recon.report.summary import summarise
 from recon.sample_ranges import subtract_ranges, to_sample_ranges
 from scanner.device import Device
 from scanner.recording import Recording
@@ -134,6 +135,10 @@ def test_a_held_position_maps_no_samples_and_leads_the_conclusion_where_it_is_us
     assert 10_000 <= result.unlocated_samples < 13_000
     assert result.limits == []
     assert any("sense_x: held at one value for 10 ms" in note for note in result.notes)
+    assert any("sense_x: 10000 samples" in note and "are left out of phase, amplitude" in note for note in result.notes)
+    stated = summarise(result)["x"]
+    assert stated["phase_sd_deg"] < 1.0
+    assert stated["amplitude_rad"] == pytest.approx(0.97 * two_axis_scan.HALF_RAD, rel=0.01)
     taken = reconstruct(held, Options(pixels=(80, 80), estimator="sine-ukf", allow_outside=True), quiet=True)
     assert any(line.startswith("sense_x: stands at one value for 10 ms") for line in taken.limits)
 

@@ -95,6 +95,7 @@ def test_misspelt_channels_are_noted_with_the_nearest_name() -> None:
 def test_a_sensor_that_dies_states_an_unknown_phase() -> None:
     motion = estimate(driven_scan(dead_from=TIME.size // 2), DEVICE, "sensor").axes["x"]
     assert motion.phase_sd.max() == pytest.approx(np.pi / np.sqrt(3.0))
+    assert np.ptp(motion.amplitude) < 1e-3 * motion.amplitude[0]
     assert motion.phase_sd[: motion.time.size // 3].max() < 0.01
 
 
