@@ -6,7 +6,7 @@ a drift is less accurate or refuted, so it is measured again in the intensity wi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from recon.estimated_motion import EstimatedMotion
@@ -18,6 +18,8 @@ from recon.imaging.intensity_correction import (
 )
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_motion_phase_errors
 from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
+from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
+from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.imaging.scan_phase.slow_gain import describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice, register_slices_separately
 from recon.reconstruction import Options
@@ -72,8 +74,8 @@ def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
 def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
     """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
 
-    Where the picture changes its timing at some moment, the motion is left as it is, because dropped samples are to be
-    restored first.
+    Where the picture changes its timing at some moment, the motion is not corrected, because dropped samples are to be
+    restored first. The standard deviation of the phase includes the errors that are left.
     """
     motion = estimated.motion
 
@@ -81,11 +83,16 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         return measure_phase_errors(replace(estimated, motion=corrected))
 
     errors = register(motion)
-    if not wants_readout_phase(motion, options) or _loses_timing(estimated, errors):
+    if not wants_readout_phase(motion, options):
         return replace(estimated, phase_errors=errors)
-    one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
-    motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
-    notes = [*describe_readout_phase(motion, readout_phase), *estimated.motion_notes]
+    readout_phase: Mapping[str, ReadoutPhase] = {}
+    notes: list[str] = []
+    if not _loses_timing(estimated, errors):
+        one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
+        motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
+        notes = describe_readout_phase(motion, readout_phase)
+    motion, remaining_notes = include_remaining_errors(motion, errors)
+    notes = [*notes, *remaining_notes, *estimated.motion_notes]
     return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
 
 

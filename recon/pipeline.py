@@ -231,6 +231,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         intensity=intensity,
         position_z=prepared.position_z,
         name=prepared.recording.name,
+        clock_doubted=bool(prepared.clock_notes),
     )
 
 

@@ -115,6 +115,8 @@ class Reconstruction:
         affected: pixels that hold samples from defects, shape (height, width).
         limits: reasons why the picture does not show the scene, or only a part, a line each.
         notes: what else a reader has to know, a line each.
+        clock_doubted: whether a note doubts the sample rate of the intensity. The standard deviations of the phase are
+            those at a right one.
         intensity: the channel that was gridded: the segment in use, corrected for the device's optics.
         position_z: position of the objective or the stage; None where it was not recorded.
         name: of the recording.
@@ -146,6 +148,7 @@ class Reconstruction:
     intensity: Channel
     position_z: Channel | None
     name: str
+    clock_doubted: bool = False
     seconds: float = 0.0
 
     def __repr__(self) -> str:

@@ -270,13 +270,14 @@ def format_summary(summary: dict[str, Any]) -> str:
         from recon.cli.reconstruct_many import format_summary as format_many
 
         return format_many(summary)
-    from recon.report.conclusions import describe_stack
+    from recon.report.conclusions import condition_on_clock, describe_stack
 
     lines = [
         summary["conclusion"],
         f"{summary['output']}: {summary['estimator']}, {summary['samples']} samples, fill {summary['fill']:.1%}",
     ]
-    lines += [_format_axis(name, summary[name]) for name in summary["axes"]]
+    condition = condition_on_clock(summary)
+    lines += [_format_axis(name, summary[name], condition) for name in summary["axes"]]
     if summary["stack"]:
         lines.append(f"  {describe_stack(summary['stack'])}")
     if "live" in summary:
@@ -286,8 +287,8 @@ def format_summary(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _format_axis(name: str, axis: Mapping[str, Any]) -> str:
-    line = f"  {name}: phase ±{axis['phase_sd_deg']:.3f}° (1 sd)"
+def _format_axis(name: str, axis: Mapping[str, Any], condition: str) -> str:
+    line = f"  {name}: phase ±{axis['phase_sd_deg']:.3f}° (1 sd{condition})"
     line += f", bound {axis['bound_deg']:.3f}° satisfied for {axis['within_bound']:.1%} of the scan"
     if "phase_rmse_deg" in axis:
         line += f", true error {axis['phase_rmse_deg']:.3f}° rms"

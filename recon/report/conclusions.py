@@ -43,14 +43,19 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
     limits = "".join(f"{limit[0].upper()}{limit[1:]}. " for limit in summary["limits"])
     subject = "The motion alone would give a picture that is" if limits else "The picture is"
     text = f"{limits}{_describe_readout_phase(summary)}" + (
-        f"{subject} {verdict}: {what} {errors} ({'rms' if measured else '1 sd'}), and {within:.1%} of the scan "
-        f"lies within the bound of {' / '.join(bounds)}."
+        f"{subject} {verdict}: {what} {errors} ({'rms' if measured else '1 sd'}{condition_on_clock(summary)}), and "
+        f"{within:.1%} of the scan lies within the bound of {' / '.join(bounds)}."
     )
     if verdict != "sharp":
         text += " Run lissajous diagnose on this recording to find what the device file lacks."
     if summary["fill"] < SUFFICIENT_FILL:
         text += f" Only {summary['fill']:.0%} of the pixels were visited: record longer or choose fewer pixels."
     return text
+
+
+def condition_on_clock(summary: Mapping[str, Any]) -> str:
+    """The condition on which standard deviations of the phase hold, for a list in brackets; empty without a doubt."""
+    return ", if the sample rate of the intensity is right" if summary["clock_doubted"] else ""
 
 
 def describe_stack(stack: Mapping[str, Any]) -> str:

@@ -186,6 +186,7 @@ def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str
         **grouped,
         **axes,
         "detectors": list(result.picture.detectors),
+        "clock_doubted": result.clock_doubted,
         "fill": fill_factor(result.picture.coverage),
         "resolution_px": result.resolution_px,
         "seconds_to_fill": seconds_to_fill(result),
