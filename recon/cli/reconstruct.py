@@ -288,6 +288,8 @@ def format_summary(summary: dict[str, Any]) -> str:
 
 
 def _format_axis(name: str, axis: Mapping[str, Any], condition: str) -> str:
+    from recon.report.conclusions import describe_slices
+
     line = f"  {name}: phase ±{axis['phase_sd_deg']:.3f}° (1 sd{condition})"
     line += f", bound {axis['bound_deg']:.3f}° satisfied for {axis['within_bound']:.1%} of the scan"
     if "phase_rmse_deg" in axis:
@@ -295,6 +297,7 @@ def _format_axis(name: str, axis: Mapping[str, Any], condition: str) -> str:
     measured = axis["picture_phase_error_deg"]
     if measured["sd"] is not None:
         line += f", phase error measured in the picture {measured['value']:+.3f}° ± {measured['sd']:.3f}°"
+        line += describe_slices(measured)
     line += f", amplitude {axis['amplitude_rad']:.4g} rad{_format_amplitude_sd(axis)}"
     if axis["amplitude_um"] is not None:
         line += f", {axis['amplitude_um']:.4g} µm on the sample"

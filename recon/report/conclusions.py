@@ -58,6 +58,12 @@ def condition_on_clock(summary: Mapping[str, Any]) -> str:
     return ", if the sample rate of the intensity is right" if summary["clock_doubted"] else ""
 
 
+def describe_slices(measured: Mapping[str, Any]) -> str:
+    """What the slices of the scan show beside the mean of their phase errors; empty where they agree."""
+    scatter = measured["scatter"]
+    return f" (mean; slices of the scan differ by {scatter:.2g}°, 1 sd)" if scatter else ""
+
+
 def describe_stack(stack: Mapping[str, Any]) -> str:
     """Number of the slices, their spacing and their range; ``stack`` is an entry of the summary."""
     if stack["z_m"] is None:

@@ -13,7 +13,7 @@ from recon.imaging.picture import Grid
 from recon.imaging.sample_motion.correction import describe_sample_motion
 from recon.io.output import pixel_size
 from recon.reconstruction import Reconstruction
-from recon.report.conclusions import conclude_reconstruction, describe_stack
+from recon.report.conclusions import conclude_reconstruction, describe_slices, describe_stack
 from recon.report.figures import (
     blur_figure,
     contrast_limits,
@@ -245,4 +245,4 @@ def _phase_text(result: Reconstruction) -> str:
 def _format_picture_phase(value: Mapping[str, Any]) -> str:
     if value["value"] is None or value["sd"] is None:
         return "not determined"
-    return format_uncertain(value["value"], value["sd"], "°")
+    return format_uncertain(value["value"], value["sd"], "°") + describe_slices(value)

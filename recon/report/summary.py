@@ -17,6 +17,7 @@ from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.reconstruction import Reconstruction
 from recon.z_rests import cut_to_intensity, read_blocks
 from recon.z_slices import ZSlices
+from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion
@@ -27,11 +28,21 @@ FILL_FRACTIONS = (0.25, 0.5, 0.75, 0.9, 0.99)
 MAX_FILL_SAMPLES = 1 << 22
 """Samples from the start of the scan in which these times are searched: 0.8 s at 5 MS/s, longer than any frame."""
 
+MIN_SD_RAD = 1e-9
+"""Least standard error of a phase: without noise it can be 0."""
+
+
+MIN_CONTRADICTION_SDS = 3.0
+"""Excess of chi-square over its degrees of freedom, in its standard deviations, from which slices contradict each
+other."""
+
 
 def picture_phase_error(errors: list[PhaseError], axis: str) -> dict[str, Any]:
     """Phase error that the picture shows [degrees]: of each time slice, and the mean of the slices that determine one.
 
-    Each has its standard error, which is infinite where the picture determines nothing.
+    Each has its standard error, which is infinite where the picture determines nothing. ``scatter`` is the standard
+    deviation between slices that contradict each other, 0 where they agree. As the mean is that of the scan, its
+    standard error contains the scatter of the slices that determine nothing only.
     """
     estimates = [getattr(error, axis) for error in errors]
     slices = [
@@ -40,10 +51,35 @@ def picture_phase_error(errors: list[PhaseError], axis: str) -> dict[str, Any]:
     ]
     determined = [estimate for estimate in estimates if np.isfinite(estimate.sd)]
     if not determined:
-        return {"value": math.nan, "sd": math.inf, "slices": slices}
+        return {"value": math.nan, "sd": math.inf, "scatter": 0.0, "slices": slices}
     value, sd = (np.array(column) for column in zip(*determined, strict=True))
-    mean_sd = math.sqrt(float(np.sum(sd**2))) / sd.size
-    return {"value": math.degrees(value.mean()), "sd": math.degrees(mean_sd), "slices": slices}
+    excess, unknown_share = excess_variance(value, sd), 1.0 - sd.size / len(errors)
+    mean_sd = math.sqrt(float(np.mean(sd**2) + excess * unknown_share) / sd.size)
+    return {
+        "value": math.degrees(value.mean()),
+        "sd": math.degrees(mean_sd),
+        "scatter": math.degrees(math.sqrt(excess)),
+        "slices": slices,
+    }
+
+
+def excess_variance(value: Array, sd: Array) -> float:
+    """Variance between measurements that contradict each other, 0 where their standard errors explain it [rad²].
+
+    Source: DerSimonian and Laird, Controlled Clinical Trials 7, 177 (1986): a random effect of each measurement.
+
+    Args:
+        value, sd: shape (n,) [rad].
+    """
+    if value.size < 2:
+        return 0.0
+    weight = 1.0 / np.maximum(sd, MIN_SD_RAD) ** 2
+    total, freedom = float(weight.sum()), value.size - 1
+    excess = float(np.sum(weight * (value - np.sum(weight * value) / total) ** 2)) - freedom
+    shared = float(np.sum(weight * (total - weight)))
+    if not (excess > MIN_CONTRADICTION_SDS * math.sqrt(2.0 * freedom) and shared > 0.0):
+        return 0.0
+    return excess * total / shared
 
 
 AXIS_QUANTITIES = (
