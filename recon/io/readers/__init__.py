@@ -18,7 +18,7 @@ from scanner.user_files import load_objects
 
 __all__ = ["Contents", "Reader", "detect_format", "read", "readers", "register", "registered"]
 
-HELPER_MODULES = ("column_names", "contents", "reader", "text_table")
+HELPER_MODULES = ("column_names", "contents", "reader", "table_start", "text_table")
 """Modules of this package that are not a format."""
 
 LONGEST_BEGINNING = 32

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
@@ -24,11 +24,11 @@ from recon.io.readers.contents import (
     unique_names,
 )
 from recon.io.readers.reader import Reader
+from recon.io.readers.table_start import find_table, separator_and_mark, split_settings
 from recon.io.readers.text_table import (
     DECIMAL_COMMA_HINT,
     ONE_MARK_HINT,
     count_filled,
-    is_numeric,
     parse_number,
     parse_number_blocks,
     read_lines,
@@ -102,15 +102,16 @@ def read_csv(path: Path) -> Contents:
     if _fields(head[0])[0].lower() == "record length":
         layout, separator, decimal = _tektronix_beside(head), ",", "."
     else:
-        first = next((at for at, line in enumerate(head) if is_numeric(line, *_marks(line))), None)
+        first = find_table(head)
         if first is None:
             what = f"holds no table of numbers{_describe_other_field(head)}"
             raise BadInput(what, file=path, hint=NO_TABLE_HINT)
-        separator = _marks(head[first])[0]
+        separator = separator_and_mark(head[first])[0]
         decimal = "," if separator in "\t;" and any("," in line for line in head[first:]) else "."
         head = [_single_blanks(line, separator) for line in head]
-        above = [split_fields(line.lstrip("#"), separator) for line in head[:first]]
-        layout = _layout(path, above, head[first], separator)
+        settings, above = split_settings(head[:first])
+        layout = _layout(path, [split_fields(line.lstrip("#"), separator) for line in above], head[first], separator)
+        layout = replace(layout, first=first, about={**layout.about, **({"notes": settings} if settings else {})})
     rows = (_single_blanks(line, separator) for line in islice(read_lines(path), layout.first, None))
     width = max(layout.columns) + 1
     blocks = parse_number_blocks(rows, path, separator, layout.columns, layout.first + 1, decimal, width)
@@ -146,18 +147,10 @@ def _variables(layout: Layout, table: Array) -> dict[str, Variable]:
     return variables
 
 
-def _marks(line: str) -> tuple[str, str]:
-    """Separator and decimal mark of a line of numbers."""
-    for separator in ("\t", ";"):
-        if separator in line:
-            return separator, "," if "," in line else "."
-    return (" " if "," not in line and len(line.split()) > 1 else ","), "."
-
-
 def _describe_other_field(lines: Sequence[str]) -> str:
     """Words on the first line that holds a number: its field that is none, as a time of day; empty without one."""
     for number, line in enumerate(lines, 1):
-        separator, decimal = _marks(line)
+        separator, decimal = separator_and_mark(line)
         parts = split_fields(line, separator)
         known = [parse_number(part, decimal) is not None for part in parts]
         if any(part and good for part, good in zip(parts, known, strict=True)) and not all(known):

@@ -166,3 +166,50 @@ def test_quoted_headings_and_a_first_row_without_marks_are_read(
     assert list(variables) == list(expected)
     for name, values in expected.items():
         np.testing.assert_array_equal(variables[name].raw[0:2], values)
+
+
+SAMPLES = "".join(f"{-45.27 + 0.25 * k:.2f}\n" for k in range(40))
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "0,1,2\n1,2\n2,3,4\n3,4,5\n",
+        "0,1,2\n1,2,a\n2,3,4\n3,4,5\n",
+    ],
+)
+def test_a_damaged_second_row_is_not_taken_for_settings(rows: str, tmp_path: Path) -> None:
+    path = write_text(tmp_path / "cut.csv", "time,ch1,ch2\n" + rows)
+    with pytest.raises(BadInput, match="line 3"):
+        read(path)
+
+
+def test_a_first_row_with_an_empty_end_belongs_to_the_table(tmp_path: Path) -> None:
+    path = write_text(tmp_path / "gap.csv", "time,ch1,ch2\n0,1,\n1,2,\n2,3,4\n3,4,5\n")
+    assert np.asarray(read(path).variables["ch1"].raw).ravel().tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("start_deg, rate, duration\n45, 1000, 5 \n" + SAMPLES, ["column 1"]),
+        ("start_deg,rate\n45,1000\n\nangle\n" + SAMPLES, ["angle"]),
+        ("start_deg,rate\n45,1000\nangle\ndeg\n" + SAMPLES, ["angle"]),
+    ],
+)
+def test_settings_above_a_table_of_other_columns_are_no_samples(text: str, names: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "swing.txt"
+    path.write_text(text)
+    contents = read(path)
+    assert list(contents.variables) == names
+    np.testing.assert_allclose(
+        np.asarray(contents.variables[names[0]].raw).ravel(), -45.27 + 0.25 * np.arange(40), atol=1e-9
+    )
+    assert contents.about["notes"].startswith("start_deg = 45, rate = 1000")
+
+
+def test_a_table_that_ends_within_a_line_is_still_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cut.csv"
+    path.write_text("time,ch1,ch2\n0,1,2\n1,2,3\n2")
+    with pytest.raises(BadInput, match="line 4 ends after 1 of 3 columns"):
+        read(path)
