@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from scanner.arguments import check_flags
 from scanner.device import Device
-from scanner.errors import BadInput
+from scanner.errors import BadInput, DeviceInvalid
 from scanner.recording import Recording
 
 if TYPE_CHECKING:
@@ -96,7 +96,8 @@ def estimate(
     from estimation.estimate import estimate as estimate_motion
 
     check_flags(flip_x=flip_x, flip_y=flip_y)
-    return estimate_motion(_opened(recording, device, mapping), None, estimator, {"x": flip_x, "y": flip_y})
+    opened = _opened(recording, device, mapping)
+    return estimate_motion(opened, _stated_device(opened), estimator, {"x": flip_x, "y": flip_y})
 
 
 def reconstruct(
@@ -181,7 +182,9 @@ def reconstruct(
     known = truth_from_simulation(truth) if truth is not None else None
     if known is None and isinstance(recording, (str, Path)) and mapping is None:
         known = load_truth(Path(recording))
-    return reconstruct_recording(_opened(recording, device, mapping), options, known, quiet=True)
+    opened = _opened(recording, device, mapping)
+    _stated_device(opened)
+    return reconstruct_recording(opened, options, known, quiet=True)
 
 
 def diagnose(
@@ -207,7 +210,7 @@ def diagnose(
     from recon.sign_after_rest import follow_signs
 
     opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
-    nominal = None if device is None else load_device(device)
+    nominal = _stated_device(opened[0]) if device is None else load_device(device)
     return diagnose_with_optics(opened, nominal, progress, measure_reference_phase, follow_signs)
 
 
@@ -230,9 +233,8 @@ def identify(
     from estimation.identification.calibrate import identify as identify_device
 
     opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
-    nominal = load_device(device) if device is not None else next((r.device for r in opened if r.device), None)
-    if nominal is None:
-        raise BadInput("states no device", file=opened[0].path, channel="/device", hint="give one as device=")
+    stating = next((each for each in opened if each.device), opened[0])
+    nominal = _stated_device(stating) if device is None else load_device(device)
     return identify_device(opened, nominal)
 
 
@@ -258,9 +260,7 @@ def predict(
     from estimation.device_fit.predict import predict as predict_channels
 
     opened = _opened(recording, device, mapping)
-    if opened.device is None:
-        raise BadInput("states no device", file=opened.path, channel="/device", hint="give one as device=")
-    return predict_channels(opened, opened.device)
+    return predict_channels(opened, _stated_device(opened))
 
 
 def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: MappingSource | None) -> Recording:
@@ -269,10 +269,23 @@ def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: Ma
 
     if not isinstance(recording, (Recording, str, Path)):
         hint = "give a Recording (Recording.from_arrays makes one of arrays) or the path of a file"
+        if hasattr(recording, "columns"):
+            hint = "give dict(table) and sample_rate= to lissajous.reconstruct, or make a Recording by from_arrays"
         raise BadInput(f"is a {type(recording).__name__}, no recording", channel="recording", hint=hint)
     if not isinstance(recording, Recording):
         recording = open_any(Path(recording), None if mapping is None else _as_mapping(mapping))
     return recording if device is None else replace(recording, device_toml=load_device(device).to_toml())
+
+
+def _stated_device(recording: Recording) -> Device:
+    """The device of a recording.
+
+    Raises:
+        DeviceInvalid: it states none.
+    """
+    if recording.device is None:
+        raise DeviceInvalid("states no device", file=recording.path, channel="/device", hint="give one as device=")
+    return recording.device
 
 
 def _recording_of_arrays(arrays: Arrays, sample_rate: float | None) -> Recording:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lissajous.functions import DeviceSource, load_device
-from scanner.arguments import check_flags
+from scanner.arguments import check_flags, check_numbers
 from scanner.errors import BadInput
 from scanner.recording import Recording
 
@@ -80,6 +80,7 @@ def simulate(
     if not isinstance(seed, Integral) or seed < 0:
         raise BadInput(f"is {seed!r}", channel="seed", hint="give a whole number, 0 or greater")
     check_flags(angles=angles)
+    check_numbers(photons=photons)
     experiment = Experiment(
         device=load_device(device),
         target=target,

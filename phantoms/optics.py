@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.arguments import check_numbers, check_whole_numbers
 from scanner.arrays import Array
 from scanner.errors import BadInput
 from scanner.lowpass import run_section, section_coefficients
@@ -103,6 +104,9 @@ class Detector:
         positive = {"gain": self.gain, "photons_per_sample": self.photons_per_sample, "full_scale": self.full_scale}
         if self.bandwidth_hz is not None:
             positive["bandwidth_hz"] = self.bandwidth_hz
+        check_numbers(**positive, read_noise_sd=self.read_noise_sd)
+        if self.bits is not None:
+            check_whole_numbers(bits=self.bits)
         for name, value in positive.items():
             if not (math.isfinite(value) and value > 0):
                 raise BadInput(f"the detector's {name} is {value}", hint="give a finite value above zero")

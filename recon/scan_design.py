@@ -21,6 +21,7 @@ from recon.imaging.coverage import largest_gap, time_for_fill
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from recon.lissajous_figure import PHASES, FrequencyRange, LissajousFigure, enumerate_figures
+from scanner.arguments import check_numbers
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
@@ -73,6 +74,9 @@ class ScanRequirements:
     stiffness_margin: float = 0.0005
 
     def __post_init__(self) -> None:
+        check_numbers(frame_rate=self.frame_rate, fill=self.fill, stiffness_margin=self.stiffness_margin)
+        if self.sample_rate is not None:
+            check_numbers(sample_rate=self.sample_rate)
         if not 0.0 < self.fill <= 1.0:
             raise BadInput(f"a fill of {self.fill:g}", hint="give a fraction above 0 and at most 1")
         if not (math.isfinite(self.frame_rate) and self.frame_rate > 0.0):

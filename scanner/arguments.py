@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from numbers import Integral, Real
+
 import numpy as np
 
 from scanner.errors import BadInput
@@ -19,3 +22,26 @@ def check_flags(**flags: object) -> None:
     for name, value in flags.items():
         if not isinstance(value, (bool, np.bool_)):
             raise BadInput(f"is {value!r}", channel=name, hint="give True or False")
+
+
+def check_numbers(**numbers: object) -> None:
+    """Check that every argument is a real number. A text such as "3" is none.
+
+    Args:
+        numbers: values by the name of their argument.
+
+    Raises:
+        BadInput: one is none; the error names the argument.
+    """
+    _check_types(Real, "give a number", numbers)
+
+
+def check_whole_numbers(**numbers: object) -> None:
+    """Check that every argument is a whole number; as :func:`check_numbers`. 3.0 is none."""
+    _check_types(Integral, "give a whole number", numbers)
+
+
+def _check_types(kind: type, hint: str, values: Mapping[str, object]) -> None:
+    for name, value in values.items():
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise BadInput(f"is {value!r}", channel=name, hint=hint)

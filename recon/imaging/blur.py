@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.imaging.picture import Picture
-from scanner.arguments import check_flags
+from scanner.arguments import check_flags, check_numbers
 from scanner.arrays import Array
 from scanner.errors import BadInput
 
@@ -21,11 +21,12 @@ def phase_bound(p: float, m: float) -> float:
         m: half the number of pixels across.
 
     Raises:
-        BadInput: one of them is not positive.
+        BadInput: one of them is no positive number.
 
     Source:
         Chen et al. (2020), eq (7).
     """
+    check_numbers(p=p, m=m)
     if not (p > 0.0 and m > 0.0):
         raise BadInput(f"p = {p} and m = {m}", hint="give positive numbers of pixels")
     return p / m

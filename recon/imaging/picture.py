@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.arguments import check_numbers, check_whole_numbers
 from scanner.errors import BadInput
 from scanner.stages import Scan
 
@@ -37,7 +38,8 @@ class Grid:
         angle: kind of the angles that files and reports state, ``"mechanical"`` or ``"optical"``.
 
     Raises:
-        BadInput: a size or an angle is not positive and finite, or there are ``MAX_PIXELS`` pixels or more.
+        BadInput: a size or an angle is no number, or not positive and finite, or there are ``MAX_PIXELS`` pixels or
+            more.
     """
 
     width: int
@@ -48,6 +50,8 @@ class Grid:
     angle: str = "mechanical"
 
     def __post_init__(self) -> None:
+        check_whole_numbers(width=self.width, height=self.height)
+        check_numbers(half_angle_x=self.half_angle_x, half_angle_y=self.half_angle_y)
         if self.width < 1 or self.height < 1:
             raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint="give at least 1x1")
         if self.width * self.height >= MAX_PIXELS:

@@ -195,3 +195,39 @@ def test_a_bound_needs_positive_numbers_of_pixels() -> None:
     for p, m in ((0.0, 200), (1, 0), (-1, -3)):
         with pytest.raises(lissajous.BadInput, match="give positive numbers of pixels"):
             lissajous.phase_bound(p, m)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: lissajous.simulate(photons="a"), "photons: is 'a'; give a number"),
+        (lambda: lissajous.Grid("a", 10, 0.1, 0.1), "width: is 'a'; give a whole number"),
+        (lambda: lissajous.Grid(10, 10.5, 0.1, 0.1), "height: is 10.5; give a whole number"),
+        (lambda: lissajous.Grid(10, 10, 0.1, None), "half_angle_y: is None; give a number"),
+        (lambda: lissajous.phase_bound("a", 100.0), "p: is 'a'; give a number"),
+        (lambda: lissajous.design(frame_rate="a"), "frame_rate: is 'a'; give a number"),
+        (lambda: lissajous.design(volts="ab"), "volts: is 'a'; give a number"),
+        (lambda: lissajous.design(volts=(1.0,)), "volts: is .*; give amplitude and offset"),
+    ],
+)
+def test_an_argument_of_another_type_is_named(call: Callable, message: str) -> None:
+    with pytest.raises(lissajous.BadInput, match=f"^{message}"):
+        call()
+
+
+@pytest.mark.parametrize(
+    "function",
+    [lissajous.estimate, lissajous.reconstruct, lissajous.diagnose, lissajous.predict, lissajous.identify],
+)
+def test_a_missing_device_is_asked_for_as_an_argument(function: Callable) -> None:
+    recording = lissajous.Recording.from_arrays({"sense_x": (np.sin(np.arange(100.0)), "V", 1e3)})
+    with pytest.raises(lissajous.BadInput, match=r"states no device; give one as device=$"):
+        function(recording)
+
+
+def test_a_table_of_columns_is_no_recording_and_the_message_says_how_to_give_it() -> None:
+    class Table(dict):  # as a DataFrame, which the tests do not need to install
+        columns = ("sense_x",)
+
+    with pytest.raises(lissajous.BadInput, match=r"is a Table, no recording; give dict\(table\) and sample_rate="):
+        lissajous.estimate(Table())
