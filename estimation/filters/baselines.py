@@ -10,6 +10,7 @@ import numpy as np
 from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
 from estimation.held_samples import find_held_runs
 from estimation.initial import fit_initial_motion
+from estimation.isolated_spikes import find_spikes, without_spikes
 from estimation.lock_in_channels import lock_in_angle
 from estimation.reference import (
     MIN_SAMPLES_PER_PERIOD,
@@ -28,7 +29,7 @@ from estimation.signals import (
     sense_channels,
     white_noise_sd,
 )
-from scanner.arrays import Array
+from scanner.arrays import Array, Index
 from scanner.channel import Channel, check_signal, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Axis, Device
@@ -100,12 +101,25 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel)
     angle = (channel.read() - zero) / scale
+    spikes = find_spikes(angle)
+    angle = without_spikes(angle, spikes)
     reference = reference_of_any_waveform(recording, device, name, channel)
     if reference.kind in ("drive", "half-drive") and channel.sample_rate < MIN_SAMPLES_PER_PERIOD * reference.frequency:
         raise sampled_too_slowly(channel, "a motion", reference.frequency)
     held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
     motion = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel), held)
-    return motion, _describe_held(channel, held)
+    return motion, [*_describe_held(channel, held), *_describe_spikes(channel, spikes)]
+
+
+def _describe_spikes(channel: Channel, spikes: Index) -> list[str]:
+    """A line on single samples that were far from their neighbours, if there are any."""
+    if not spikes.size:
+        return []
+    return [
+        f"{channel.name}: {counted(spikes.size, 'single sample')} far from the samples around, the first at "
+        f"{channel.start + spikes[0] / channel.sample_rate:.6g} s, are replaced by the cubic through these: check the "
+        "cable and the converter"
+    ]
 
 
 def _describe_held(channel: Channel, held: Sequence[tuple[int, int]]) -> list[str]:

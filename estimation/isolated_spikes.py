@@ -1,0 +1,57 @@
+"""Single samples of a position signal far from their neighbours: a bit that flipped, or a spark in a cable."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scanner.arrays import Array, Index
+
+MIN_SPIKE_SDS = 8.0
+"""Distance of a spike from the cubic through its neighbours, in robust standard deviations of that distance: noise
+exceeds it once in 1e15 samples, and a sine, whose largest distance is 1.4 times the median one, never."""
+
+NEIGHBOURS = {-2: -1.0 / 6.0, -1: 4.0 / 6.0, 1: 4.0 / 6.0, 2: -1.0 / 6.0}
+"""Weights of the samples around one in the cubic through them, by their distance."""
+
+REACH = max(NEIGHBOURS)
+
+
+def find_spikes(values: Array) -> Index:
+    """Samples that are isolated spikes, increasing.
+
+    Without a spike the neighbours on one side at least fit those around them. Those of a step or of the flyback of a
+    raster do not. Spikes that are one or two samples apart are not found.
+
+    Args:
+        values: shape (n,).
+    """
+    if values.size <= 4 * REACH:
+        return np.zeros(0, np.int64)
+    distance = values - _cubic(values)
+    inner = np.abs(distance[REACH:-REACH])
+    scale = float(np.nanmedian(inner)) / 0.6745 if np.isfinite(inner).any() else 0.0
+    limit = MIN_SPIKE_SDS * scale
+    if not limit > 0.0:
+        return np.zeros(0, np.int64)
+    found = 2 * REACH + np.flatnonzero(np.abs(distance[2 * REACH : -2 * REACH]) > limit)
+    fits = {
+        step: np.abs(distance[found + step] + weight * distance[found]) <= limit for step, weight in NEIGHBOURS.items()
+    }
+    return found[(fits[-2] & fits[-1]) | (fits[1] & fits[2])]
+
+
+def without_spikes(values: Array, spikes: Index) -> Array:
+    """The values, shape (n,), with each isolated spike on the cubic through its neighbours."""
+    if not spikes.size:
+        return values
+    repaired = values.copy()
+    repaired[spikes] = _cubic(values)[spikes]
+    return repaired
+
+
+def _cubic(values: Array) -> Array:
+    """Value at each sample of the cubic through the two samples on either side, shape (n,); NaN at the ends."""
+    out = np.full(values.size, np.nan)
+    inner = slice(REACH, -REACH)
+    out[inner] = sum(weight * np.roll(values, -step)[inner] for step, weight in NEIGHBOURS.items())
+    return out

@@ -1,0 +1,63 @@
+"""Single samples far from their neighbours are found and replaced; steps, noise and coarse sampling are no spikes."""
+
+import numpy as np
+import pytest
+
+from estimation.filters.baselines import estimate_from_sensor
+from estimation.isolated_spikes import find_spikes, without_spikes
+from scanner.device import Axis, Device
+from scanner.recording import Recording
+from scanner.stages import Position
+
+RATE_HZ, FREQUENCY_HZ = 1e6, 2e3
+TIME = np.arange(40_000) / RATE_HZ
+SINE = np.sin(2.0 * np.pi * FREQUENCY_HZ * TIME)
+NOISE = np.random.default_rng(0).standard_normal(TIME.size)
+AT = np.sort(np.random.default_rng(1).choice(np.arange(9, TIME.size - 9, 3), 200, replace=False))
+
+
+def with_spikes(values: np.ndarray) -> np.ndarray:
+    spiked = values.copy()
+    spiked[AT] = 3.0 * np.where(AT % 2, 1.0, -1.0)
+    return spiked
+
+
+def test_spikes_are_found_and_replaced_to_the_noise() -> None:
+    values = SINE + 1e-3 * NOISE
+    spiked = with_spikes(values)
+    spikes = find_spikes(spiked)
+    np.testing.assert_array_equal(spikes, AT)
+    assert np.abs(without_spikes(spiked, spikes) - SINE).max() < 6e-3
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        SINE,
+        SINE + 0.1 * NOISE,
+        np.round(100.0 * SINE),
+        np.sin(2.0 * np.pi * 0.3 * np.arange(4_000)),
+        (TIME * 1e3) % 1.0 + 1e-4 * NOISE,
+        np.where(TIME < 0.02, 0.0, 1.0) + 1e-4 * NOISE,
+        np.cumsum(NOISE),
+        np.zeros(100),
+        np.full(100, np.nan),
+        SINE[:6],
+    ],
+    ids=["sine", "noise", "coarse", "few samples a period", "sawtooth", "step", "walk", "zero", "missing", "short"],
+)
+def test_other_signals_have_no_spikes(values: np.ndarray) -> None:
+    assert not find_spikes(values).size
+
+
+def test_the_sensor_is_as_accurate_as_it_states_in_spite_of_spikes() -> None:
+    device = Device("lever", {"x": Axis(readout=Position(1.0, 1e-3), name="x")})
+    recording = Recording.from_arrays({"sense_x": (with_spikes(SINE + 1e-3 * NOISE), "V", RATE_HZ)}, device)
+    motion = estimate_from_sensor(recording, device)
+    axis = motion.axes["x"]
+    error = axis.phase - axis.phase.mean()  # the frequency of the reference is that of the motion, but for the noise
+    error -= np.polyval(np.polyfit(axis.time, error, 1), axis.time)
+    assert np.sqrt(np.mean(error**2)) < 1.5 * axis.phase_sd.max()
+    assert axis.amplitude == pytest.approx(1.0, abs=1e-3)
+    (note,) = motion.notes
+    assert note.startswith("sense_x: 200 single samples far from the samples around, the first at ")
