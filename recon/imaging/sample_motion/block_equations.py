@@ -29,14 +29,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from recon.imaging.sample_motion.residual_variance import ResidualVariance, fit_residual_variance
 from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
 
 FOLDS = 8
 """Parts of the blocks, each of which is compared with the picture of the others: that one lacks an eighth of them."""
-
-MIN_MISFIT = 1e-12
-"""Lower bound on the mean square of the residuals, for recordings without noise and structure."""
 
 MIN_WEIGHT = 0.05
 """Kernel-weighted number of samples, relative to the mean, below which a pixel is not compared."""
@@ -57,6 +55,12 @@ of smoothed detail. A picture of 256 x 256 pixels has 1024 of them."""
 NUISANCES = 6
 """Free values in each block: phase of x and y, amplitude of x and y, brightness, gain."""
 
+
+MAX_VARIANCE_SAMPLES = 1 << 16
+"""Samples from which the variance of the residuals is fitted: they determine it to 1 %."""
+
+UNIT_VARIANCE = ResidualVariance(1.0, 0.0, 0.0, 0.0)
+"""Variance under which equations remain in the unit of the intensity."""
 
 STEP_PX = 0.01
 """Step of the places that are kept [px]: its rounding, 0.003 px rms, is far below what a block determines."""
@@ -138,15 +142,16 @@ def block_equations(
     """
     reference = fold_references(samples, shift, length, shape, width)
     moments = np.zeros((len(shift), 2 + NUISANCES + 1, 2 + NUISANCES + 1))
-    counts = np.zeros((len(shift), 2))
+    counts = np.zeros((len(shift), 3))
     centre = 0.5 * np.array(shape[::-1], float)
-    _add_products(*samples, shift, length, reference, centre, moments, counts)
+    noise = residual_noise(samples, shift, length, reference)
+    _add_products(*samples, shift, length, reference, centre, noise, moments, counts)
     moments += np.swapaxes(np.triu(moments, 1), 1, 2)
     total = counts.sum(axis=0)
     compared = float(total[0] / max(total[1], 1.0))
-    misfit = float(moments[:, -1, -1].sum() / max(total[0], 1.0))
+    misfit = float(total[2] / max(total[0], 1.0))
     blocks, size = len(shift) // PARTS, 2 * len(SHAPES)
-    moments = moments.reshape(blocks, PARTS, *moments.shape[1:]) / max(misfit, MIN_MISFIT)
+    moments = moments.reshape(blocks, PARTS, *moments.shape[1:])
     nuisance = moments[..., 2:-1, 2:-1].sum(axis=1)
     scale = np.sqrt(np.einsum("bii->bi", nuisance)) + 1e-12
     scaled = nuisance / scale[:, :, None] / scale[:, None, :] + 1e-6 * np.eye(NUISANCES)
@@ -157,7 +162,7 @@ def block_equations(
     explained = columns[..., :-1] @ coefficients
     own = np.einsum("kp,lp,bpij->bkilj", SHAPES, SHAPES, moments[..., :2, :2], optimize=True)
     information, score = own.reshape(blocks, size, size) - explained[..., :-1], columns[..., -1] - explained[..., -1]
-    scatter = partial(scatter_by_place, samples, shift, length, reference, coefficients, max(misfit, MIN_MISFIT))
+    scatter = partial(scatter_by_place, samples, shift, length, reference, noise, coefficients)
     return BlockEquations(score, information, misfit, compared, scatter)
 
 
@@ -166,8 +171,8 @@ def scatter_by_place(
     shift: Array,
     length: int,
     reference: NDArray[np.float32],
+    noise: ResidualVariance,
     coefficients: Array,
-    misfit: float,
     columns: Array,
     change: Array,
 ) -> Array:
@@ -176,9 +181,9 @@ def scatter_by_place(
     Args:
         samples, shift, length: as for :func:`block_equations`.
         reference: of :func:`fold_references`.
+        noise: of :func:`residual_noise`.
         coefficients: of the eliminated values of each block in the gradients along ``SHAPES`` and in the residual,
             shape (blocks, NUISANCES, 7).
-        misfit: mean square of the residuals.
         columns: displacement of each part by each value, shape (blocks, PARTS, 2, k).
         change: displacement of each part from ``shift`` under the fitted values, shape (blocks * PARTS, 2) [px].
     """
@@ -188,9 +193,20 @@ def scatter_by_place(
     parts = np.ascontiguousarray(columns.reshape(len(shift), 2, -1))
     residual = np.ascontiguousarray(coefficients[..., -1])
     centre = 0.5 * np.array(reference.shape[2:0:-1], float)
-    _add_by_place(*samples, shift, length, reference, centre, nuisances, residual, parts, change, sums)
-    total = sums.reshape(-1, sums.shape[-1]) / misfit
+    _add_by_place(*samples, shift, length, reference, centre, noise, nuisances, residual, parts, change, sums)
+    total = sums.reshape(-1, sums.shape[-1])
     return np.asarray(total.T @ total)
+
+
+def residual_noise(
+    samples: ScanSamples, shift: Array, length: int, reference: NDArray[np.float32]
+) -> ResidualVariance:
+    """Return the variance of the residuals, from at most ``MAX_VARIANCE_SAMPLES``; args as in :func:`scatter_by_place`."""
+    step = -(-samples.x.size // MAX_VARIANCE_SAMPLES)
+    found = np.full((max(samples.x.size - 2, 0) // step, 3), np.nan)
+    centre = 0.5 * np.array(reference.shape[2:0:-1], float)
+    _residuals(*samples, shift, length, reference, centre, step, found)
+    return fit_residual_variance(*found[np.isfinite(found[:, 0])].T)
 
 
 def by_shape(displacement: Array) -> Array:
@@ -259,7 +275,17 @@ def _accumulate(x, y, value, shift, length, sums):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _row(x, y, value, shift, length, reference, centre, i, row):  # type: ignore[no-untyped-def]
+def _residuals(x, y, value, shift, length, reference, centre, step, found):  # type: ignore[no-untyped-def]
+    """Write expected value, squared gradient and residual of every ``step``-th sample."""
+    row = np.empty(2 + NUISANCES + 1)
+    for k in range(found.shape[0]):
+        i = 1 + k * step
+        if _row(x, y, value, shift, length, reference, centre, UNIT_VARIANCE, i, row)[3]:
+            found[k, 0], found[k, 1], found[k, 2] = row[7], row[0] ** 2 + row[1] ** 2, row[8]
+
+
+@njit(cache=True)
+def _row(x, y, value, shift, length, reference, centre, noise, i, row):  # type: ignore[no-untyped-def]
     """Write a sample's equation; return its part, its square of the scene, and whether it is compared with others."""
     folds, height, width = reference.shape[:3]
     u, v = _shift_at(shift, length, i)
@@ -276,19 +302,21 @@ def _row(x, y, value, shift, length, reference, centre, i, row):  # type: ignore
     row[4], row[5] = gx * (px - centre[0]), gy * (py - centre[1])
     row[6], row[7] = 1.0, f
     row[8] = value[i] - f - gx * (px - cx) - gy * (py - cy)
+    row /= np.sqrt(noise[0] + noise[1] * max(f - noise[3], 0.0) + noise[2] * (gx * gx + gy * gy))
     return part, int(py) // PLACE_PX, int(px) // PLACE_PX, True
 
 
 @njit(cache=True)
-def _add_products(x, y, value, shift, length, reference, centre, moments, counts):  # type: ignore[no-untyped-def]
+def _add_products(x, y, value, shift, length, reference, centre, noise, moments, counts):  # type: ignore[no-untyped-def]
     columns = moments.shape[1]
     row = np.empty(columns)
     for i in range(1, x.size - 1):
-        part, _, _, compared = _row(x, y, value, shift, length, reference, centre, i, row)
+        part, _, _, compared = _row(x, y, value, shift, length, reference, centre, noise, i, row)
         if part >= 0:
             counts[part, 1] += 1.0
         if compared:
             counts[part, 0] += 1.0
+            counts[part, 2] += (row[8] / row[6]) ** 2
             for j in range(columns):
                 for k in range(j, columns):
                     moments[part, j, k] += row[j] * row[k]
@@ -296,11 +324,11 @@ def _add_products(x, y, value, shift, length, reference, centre, moments, counts
 
 @njit(cache=True)
 def _add_by_place(  # type: ignore[no-untyped-def]
-    x, y, value, shift, length, reference, centre, nuisances, residual, columns, change, sums
+    x, y, value, shift, length, reference, centre, noise, nuisances, residual, columns, change, sums
 ):
     row = np.empty(2 + NUISANCES + 1)
     for i in range(1, x.size - 1):
-        part, down, across, compared = _row(x, y, value, shift, length, reference, centre, i, row)
+        part, down, across, compared = _row(x, y, value, shift, length, reference, centre, noise, i, row)
         if not compared:
             continue
         block = part // PARTS

@@ -1,0 +1,77 @@
+"""Variance of a sample's residual from a smoothed picture of the scene."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from scanner.arrays import Array
+
+LOWEST = 1.0 / 16.0
+"""Fraction of the samples whose mean is the dark level: the least value is that of noise."""
+
+ROUNDS = 100
+"""Updates of the coefficients: the last ones change them by less than their standard error."""
+
+MIN_VARIANCE = 1e-12
+"""Lower bound on the variance, for recordings without noise and structure."""
+
+MIN_RELATIVE_VARIANCE = 1e-3
+"""Lower bound on the variance relative to its mean: a dark sample is then worth at most 1000 usual ones."""
+
+
+class ResidualVariance(NamedTuple):
+    """Variance ``floor + slope * (f - dark) + place * |∇f|²`` for the expected value f, in the square of its unit.
+
+    Read noise and photon noise, as in :class:`recon.imaging.pixel_noise.SampleNoise`, and the detail that the kernel
+    smooths, which displaces edges by ``place`` [px²] in the mean square. ``f - dark`` is at least 0.
+    """
+
+    floor: float
+    slope: float
+    place: float
+    dark: float
+
+
+def fit_residual_variance(expected: Array, gradient: Array, residual: Array) -> ResidualVariance:
+    """Return the variance under which normal residuals are most likely, with coefficients that are not negative.
+
+    The updates are multiplicative and never lower the likelihood (Févotte and Idier 2011, "Algorithms for nonnegative
+    matrix factorization with the β-divergence", eq. 4.1 for β = 0). Least squares would follow the few brightest
+    samples, whose squared residuals scatter most.
+
+    Args:
+        expected: value of the picture, shape (n,).
+        gradient: its squared gradient, shape (n,) [1/px²].
+        residual: shape (n,).
+    """
+    lowest = int(np.ceil(LOWEST * expected.size))
+    if not lowest or not residual.any():
+        return ResidualVariance(MIN_VARIANCE, 0.0, 0.0, 0.0)
+    dark = float(np.mean(np.partition(expected, lowest - 1)[:lowest]))
+    terms = np.column_stack([np.ones_like(expected), np.maximum(expected - dark, 0.0), gradient])
+    square = residual**2
+    start = square.mean() / (terms.shape[1] * np.maximum(terms.mean(axis=0), 1e-300))
+    floor, slope, place = _most_likely(terms, square, start)
+    least = max(MIN_RELATIVE_VARIANCE * float(square.mean()), MIN_VARIANCE)
+    return ResidualVariance(max(floor, least), slope, place, dark)
+
+
+@njit(cache=True)
+def _most_likely(terms, square, values):  # type: ignore[no-untyped-def]
+    """Coefficients, from positive ones, of the terms of the variance of values with the given squares."""
+    for _ in range(ROUNDS):
+        up, down = np.zeros(values.size), np.zeros(values.size)
+        for i in range(square.size):
+            variance = 0.0
+            for j in range(values.size):
+                variance += values[j] * terms[i, j]
+            for j in range(values.size):
+                up[j] += terms[i, j] * square[i] / variance / variance
+                down[j] += terms[i, j] / variance
+        for j in range(values.size):
+            if down[j] > 0.0:
+                values[j] *= np.sqrt(up[j] / down[j])
+    return values[0], values[1], values[2]
