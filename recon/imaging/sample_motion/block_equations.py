@@ -12,6 +12,10 @@ error displaces a sample by a multiple of its velocity, an amplitude error by on
 A block is a period of the slower axis. Within it the translation is a polynomial of the time (``SHAPES``), which
 resolves vibrations faster than the blocks.
 
+Every equation is divided by the standard deviation of its residual (``residual_noise``): that of photon noise and of
+detail is many times larger on a bright bead or an edge than in the background. With one variance for all of them, the
+noise of the few bright places would be taken for information on the translation.
+
 The residuals of a sharp scene hold detail that the kernel smooths, and that returns whenever the beam passes its place.
 Where the visits of a place have a fixed phase against a vibration, whose frequency is then a difference of multiples of
 the scan's frequencies, such detail looks like an amplitude. The variance of a fitted value is therefore that of the
@@ -29,7 +33,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.imaging.sample_motion.residual_variance import ResidualVariance, fit_residual_variance
+from recon.imaging.sample_motion.residual_noise import ResidualNoise, fit_residual_noise
 from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
 
@@ -56,10 +60,10 @@ NUISANCES = 6
 """Free values in each block: phase of x and y, amplitude of x and y, brightness, gain."""
 
 
-MAX_VARIANCE_SAMPLES = 1 << 16
+MAX_NOISE_SAMPLES = 1 << 16
 """Samples from which the variance of the residuals is fitted: they determine it to 1 %."""
 
-UNIT_VARIANCE = ResidualVariance(1.0, 0.0, 0.0, 0.0)
+UNIT_NOISE = ResidualNoise(1.0, 0.0, 0.0, 0.0)
 """Variance under which equations remain in the unit of the intensity."""
 
 STEP_PX = 0.01
@@ -110,7 +114,7 @@ class ScanSamples(NamedTuple):
 
 
 class BlockEquations(NamedTuple):
-    """Score and information of the translation of each block, for noise of variance 1.
+    """Score and information of the translation of each block, under the variance of the residuals.
 
     Attributes:
         score: derivative of the log likelihood by x and y of the first of ``SHAPES``, of the second, and of the third,
@@ -144,14 +148,14 @@ def block_equations(
     moments = np.zeros((len(shift), 2 + NUISANCES + 1, 2 + NUISANCES + 1))
     counts = np.zeros((len(shift), 3))
     centre = 0.5 * np.array(shape[::-1], float)
-    noise = residual_noise(samples, shift, length, reference)
+    noise = measure_residual_noise(samples, shift, length, reference)
     _add_products(*samples, shift, length, reference, centre, noise, moments, counts)
     moments += np.swapaxes(np.triu(moments, 1), 1, 2)
     total = counts.sum(axis=0)
     compared = float(total[0] / max(total[1], 1.0))
     misfit = float(total[2] / max(total[0], 1.0))
     blocks, size = len(shift) // PARTS, 2 * len(SHAPES)
-    moments = moments.reshape(blocks, PARTS, *moments.shape[1:])
+    moments = np.reshape(moments, (blocks, PARTS, *moments.shape[1:]))
     nuisance = moments[..., 2:-1, 2:-1].sum(axis=1)
     scale = np.sqrt(np.einsum("bii->bi", nuisance)) + 1e-12
     scaled = nuisance / scale[:, :, None] / scale[:, None, :] + 1e-6 * np.eye(NUISANCES)
@@ -171,7 +175,7 @@ def scatter_by_place(
     shift: Array,
     length: int,
     reference: NDArray[np.float32],
-    noise: ResidualVariance,
+    noise: ResidualNoise,
     coefficients: Array,
     columns: Array,
     change: Array,
@@ -181,7 +185,7 @@ def scatter_by_place(
     Args:
         samples, shift, length: as for :func:`block_equations`.
         reference: of :func:`fold_references`.
-        noise: of :func:`residual_noise`.
+        noise: of :func:`measure_residual_noise`.
         coefficients: of the eliminated values of each block in the gradients along ``SHAPES`` and in the residual,
             shape (blocks, NUISANCES, 7).
         columns: displacement of each part by each value, shape (blocks, PARTS, 2, k).
@@ -198,15 +202,15 @@ def scatter_by_place(
     return np.asarray(total.T @ total)
 
 
-def residual_noise(
+def measure_residual_noise(
     samples: ScanSamples, shift: Array, length: int, reference: NDArray[np.float32]
-) -> ResidualVariance:
-    """Return the variance of the residuals, from at most ``MAX_VARIANCE_SAMPLES``; args as in :func:`scatter_by_place`."""
-    step = -(-samples.x.size // MAX_VARIANCE_SAMPLES)
+) -> ResidualNoise:
+    """Return the variance of the residuals, from ``MAX_NOISE_SAMPLES``; args as in :func:`scatter_by_place`."""
+    step = -(-samples.x.size // MAX_NOISE_SAMPLES)
     found = np.full((max(samples.x.size - 2, 0) // step, 3), np.nan)
     centre = 0.5 * np.array(reference.shape[2:0:-1], float)
     _residuals(*samples, shift, length, reference, centre, step, found)
-    return fit_residual_variance(*found[np.isfinite(found[:, 0])].T)
+    return fit_residual_noise(*found[np.isfinite(found[:, 0])].T)
 
 
 def by_shape(displacement: Array) -> Array:
@@ -280,7 +284,7 @@ def _residuals(x, y, value, shift, length, reference, centre, step, found):  # t
     row = np.empty(2 + NUISANCES + 1)
     for k in range(found.shape[0]):
         i = 1 + k * step
-        if _row(x, y, value, shift, length, reference, centre, UNIT_VARIANCE, i, row)[3]:
+        if _row(x, y, value, shift, length, reference, centre, UNIT_NOISE, i, row)[3]:
             found[k, 0], found[k, 1], found[k, 2] = row[7], row[0] ** 2 + row[1] ** 2, row[8]
 
 

@@ -1,9 +1,10 @@
 """Coarse translation of the sample in successive parts of a scan, by exhaustive comparison with the earlier parts.
 
-For every translation up to ``MAX_STEP_PX`` from that of the part before, the mean square difference of the part's
-samples from the picture of the earlier parts gives the likelihood. Pixels without samples are left out (Padfield 2012,
-"Masked object registration in the Fourier domain"). A step needs likelihood against its prior, so that a scene without
-structure remains at rest.
+For every translation up to ``MAX_STEP_PX`` from that of the part before, the picture of the earlier parts predicts the
+part's samples, with a mean and a variance by cell. Cells without earlier samples predict the mean and the variance of
+the scene, so that the likelihoods of all translations are those of the same samples. With overlapping samples alone, a
+part that moves away would no longer contradict the picture. A step needs likelihood against its prior, so that a scene
+without structure remains at rest.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from recon.imaging.sample_motion.block_equations import ScanSamples
+from recon.imaging.sample_motion.residual_noise import fit_residual_noise
 from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
 
@@ -21,6 +23,9 @@ CELL_PX = 2.0
 
 KERNEL_CELLS = 1.0
 """Standard deviation of the kernel of the picture of earlier parts [cells]."""
+
+PRIOR_SAMPLES = 0.3
+"""Samples that the level of the scene counts for in the value of a cell."""
 
 MAX_STEP_PX = 16.0
 """Largest step from one part to the next [px], above the 10 px that are asked for."""
@@ -53,10 +58,8 @@ def search_motion(samples: ScanSamples, length: int, parts: int, shape: tuple[in
         own = _grid(samples, part, last, (height, width))
         step = np.zeros(2)
         if k:
-            cost, overlap = _costs(own, reference, size, steps)
             penalty = np.minimum(0.5 * (distance / STEP_SD_PX) ** 2, JUMP_PENALTY)
-            log = 0.5 * overlap.max() * np.log(np.maximum(cost, 1e-30)) + penalty
-            step = _refined_minimum(log, steps)
+            step = _refined_minimum(_costs(own, reference, size, steps) + penalty, steps)
         last = last + step * CELL_PX
         found[k] = last
         reference += _grid(samples, part, last, (height, width))
@@ -74,31 +77,51 @@ def _grid(samples: ScanSamples, part: slice, shift: Array, shape: tuple[int, int
     return np.stack(sums).astype(float).reshape(3, *shape)
 
 
-def _costs(own: Array, reference: Array, size: tuple[int, ...], steps: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Mean square difference and number of compared samples by step, each of shape (steps, steps): rows are y."""
+def _costs(own: Array, reference: Array, size: tuple[int, ...], steps: NDArray[np.int64]) -> Array:
+    """Negative log probability of the part's samples by step, but for a constant, shape (steps, steps): rows are y.
+
+    The earlier samples around a cell draw its value from the level of the scene to their mean, in the proportion of
+    their number to ``PRIOR_SAMPLES``. The variance is that of the residuals at the present translation, and the share
+    of the scene's variance that they leave.
+
+    Args:
+        own, reference: of the part and of the earlier parts, as returned by :func:`_grid`.
+        size: of the Fourier transforms.
+        steps: in x and y [cells], shape (steps,).
+    """
     import cv2
 
     odd = 2 * max(int(REACH * KERNEL_CELLS + 0.5), 1) + 1
     count, total = (
         cv2.GaussianBlur(each, (odd, odd), KERNEL_CELLS, borderType=cv2.BORDER_CONSTANT) for each in reference[:2]
     )
-    weight = count / (count + 0.3)
-    mean = np.divide(total, count, out=np.zeros_like(total), where=count > 1e-6)
-    level = total.sum() / max(count.sum(), 1e-30)
-    mean = np.where(count > 1e-6, mean - level, 0.0)
-    number, sums, squares = own
-    squares = squares - 2.0 * level * sums + level**2 * number
-    sums = sums - level * number
-    fixed = [rfft2(each, size) for each in (weight, weight * mean, weight * mean**2)]
-    moved = [rfft2(each, size) for each in (number, sums, squares)]
+    samples = max(reference[0].sum(), 1.0)
+    level = reference[1].sum() / samples
+    spread = reference[2].sum() / samples - level**2
+    weight = count / (count + PRIOR_SAMPLES)
+    mean = weight * (np.divide(total, count, out=np.full_like(total, level), where=count > 1e-6) - level)
+    number, sums = own[0], own[1] - level * own[0]
+    squares = own[2] - 2.0 * level * own[1] + level**2 * number
+    visited = (number > 0.0) & (count > PRIOR_SAMPLES)
+    if not visited.any() or not spread > 0.0:
+        return np.zeros((steps.size, steps.size))
+    down, across = np.gradient(mean)
+    gradient = down**2 + across**2
+    square = squares - 2.0 * mean * sums + mean**2 * number
+    residual = np.sqrt(np.maximum(square[visited] / number[visited], 0.0))
+    noise = fit_residual_noise(mean[visited], gradient[visited], residual)
+    variance = np.minimum(noise.at(mean, gradient), spread) + (1.0 - weight) * spread
+    outside = min(noise.floor, spread) + spread
+    terms = 1.0 / variance - 1.0 / outside, mean / variance, mean**2 / variance + np.log(variance / outside)
+    fixed = [rfft2(each, size) for each in terms]
+    moved = [rfft2(each, size) for each in (squares, sums, number)]
 
     def correlate(a: Array, b: Array) -> Array:
         """Sum of a(place) b(place - step)."""
         return np.asarray(irfft2(a * np.conj(b), size)[np.ix_(-steps, -steps)])
 
-    overlap = np.maximum(correlate(fixed[0], moved[0]), 1.0)
-    cost = correlate(fixed[0], moved[2]) - 2.0 * correlate(fixed[1], moved[1]) + correlate(fixed[2], moved[0])
-    return np.maximum(cost, 0.0) / overlap, overlap
+    products = [correlate(one, other) for one, other in zip(fixed, moved, strict=True)]
+    return 0.5 * (products[0] - 2.0 * products[1] + products[2])
 
 
 def _refined_minimum(values: Array, steps: NDArray[np.int64]) -> Array:

@@ -5,7 +5,8 @@
    nothing is reported.
 2. Coarse: parts of ``SEARCH_PERIODS`` by exhaustive comparison (``coarse_search``).
 3. Fine: Gauss-Newton over blocks of one period of the slower axis. Every round maps the samples with the present
-   motion, and smooths the equations of all blocks. Kernels become narrower from round to round.
+   motion, and smooths the equations of all blocks. The kernel is the one that predicts best after the search: a wider
+   one would blur a lattice of its width, and with it the difference between the periods.
 4. Left: the variance of a motion that both halves of the scene show after that (``residual``).
 """
 
@@ -30,11 +31,8 @@ SEARCH_PERIODS = 12
 WIDTHS_PX = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 """Kernels that are compared [px]. Below 0.7 the gradient is that of single pixels."""
 
-COARSE_WIDTHS_PX = (4.0, 2.8, 2.0)
-"""Kernels of the first rounds after the search, whose error is up to its cell of two pixels."""
-
 MAX_ROUNDS = 8
-"""Rounds with the narrowest kernel at most; three or four are usual."""
+"""Rounds at most; three or four are usual."""
 
 CONVERGED_SD = 0.1
 """Change of the motion, in its standard deviations, below which the rounds end."""
@@ -139,8 +137,6 @@ def _follow(
     samples: ScanSamples, smoothed: SmoothedMotion, part: int, shape: tuple[int, int]
 ) -> tuple[SmoothedMotion, float]:
     """The motion after rounds of Gauss-Newton from a coarse one, and the kernel [px] of the last ones."""
-    for coarse in COARSE_WIDTHS_PX:
-        smoothed = _round(samples, smoothed, part, shape, coarse)
     width, _ = choose_width(samples, smoothed.shift, part, shape)
     for _ in range(MAX_ROUNDS):
         before = smoothed

@@ -22,7 +22,7 @@ MIN_RELATIVE_VARIANCE = 1e-3
 """Lower bound on the variance relative to its mean: a dark sample is then worth at most 1000 usual ones."""
 
 
-class ResidualVariance(NamedTuple):
+class ResidualNoise(NamedTuple):
     """Variance ``floor + slope * (f - dark) + place * |∇f|²`` for the expected value f, in the square of its unit.
 
     Read noise and photon noise, as in :class:`recon.imaging.pixel_noise.SampleNoise`, and the detail that the kernel
@@ -34,8 +34,12 @@ class ResidualVariance(NamedTuple):
     place: float
     dark: float
 
+    def at(self, expected: Array, gradient: Array) -> Array:
+        """Variance at expected values and squared gradients [1/px²] of any shape."""
+        return self.floor + self.slope * np.maximum(expected - self.dark, 0.0) + self.place * gradient
 
-def fit_residual_variance(expected: Array, gradient: Array, residual: Array) -> ResidualVariance:
+
+def fit_residual_noise(expected: Array, gradient: Array, residual: Array) -> ResidualNoise:
     """Return the variance under which normal residuals are most likely, with coefficients that are not negative.
 
     The updates are multiplicative and never lower the likelihood (Févotte and Idier 2011, "Algorithms for nonnegative
@@ -49,14 +53,14 @@ def fit_residual_variance(expected: Array, gradient: Array, residual: Array) -> 
     """
     lowest = int(np.ceil(LOWEST * expected.size))
     if not lowest or not residual.any():
-        return ResidualVariance(MIN_VARIANCE, 0.0, 0.0, 0.0)
+        return ResidualNoise(MIN_VARIANCE, 0.0, 0.0, 0.0)
     dark = float(np.mean(np.partition(expected, lowest - 1)[:lowest]))
     terms = np.column_stack([np.ones_like(expected), np.maximum(expected - dark, 0.0), gradient])
     square = residual**2
     start = square.mean() / (terms.shape[1] * np.maximum(terms.mean(axis=0), 1e-300))
     floor, slope, place = _most_likely(terms, square, start)
     least = max(MIN_RELATIVE_VARIANCE * float(square.mean()), MIN_VARIANCE)
-    return ResidualVariance(max(floor, least), slope, place, dark)
+    return ResidualNoise(max(floor, least), slope, place, dark)
 
 
 @njit(cache=True)
