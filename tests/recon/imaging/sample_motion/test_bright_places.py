@@ -35,7 +35,8 @@ def checker() -> np.ndarray:
 
 @pytest.mark.parametrize("picture", [beads, edge])
 def test_bright_places_at_rest_are_reported_at_rest(picture) -> None:  # type: ignore[no-untyped-def]
-    found = estimate_sample_motion(scan(np.zeros((2, 2)), 200.0, picture=picture()), PERIOD, (PIXELS, PIXELS))
+    samples = scan(np.zeros((2, 2)), 1000.0, 2 * BLOCKS, picture())
+    found = estimate_sample_motion(samples, PERIOD, (PIXELS, PIXELS))
     assert found is not None
     assert not found.moving
     assert found.gain < 0.5 * MIN_LOG_LIKELIHOOD_GAIN
