@@ -223,8 +223,8 @@ def reconstruct_file(
     from recon.io.output import finite, replacing_folder, write_json, write_motion, write_sample_motion, write_tiff
     from recon.notes import describe_live_frames
     from recon.pipeline import reconstruct
-    from recon.report.conclusions import conclude_reconstruction
     from recon.report.figures import save_picture
+    from recon.report.picture_conclusion import conclude_reconstruction
     from recon.report.reconstruction import reconstruction_report
     from recon.report.summary import summarise
     from recon.z_slices import find_z_slices

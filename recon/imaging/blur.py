@@ -57,6 +57,7 @@ def blur_by_cause(
     phase: Array,
     amplitude_error: Array,
     optics_px: float = 0.0,
+    sample_px: float = 0.0,
 ) -> dict[str, float]:
     """Return the displacement of samples along one axis by cause, rms over the scan [px].
 
@@ -72,9 +73,10 @@ def blur_by_cause(
         amplitude_error: relative errors of the amplitude about their mean, any shape. A uniform error is a
             magnification and no blur.
         optics_px: standard deviation of the spot [px].
+        sample_px: standard deviation of the position of the sample, rms over the scan [px].
 
     Returns:
-        ``phase``, ``amplitude``, ``sampling``, ``optics``, and ``total``, their sum in quadrature.
+        ``phase``, ``amplitude``, ``sampling``, ``optics``, ``sample``, and ``total``, their sum in quadrature.
     """
     scale = 0.5 * pixels * amplitude / half_angle
     causes = {
@@ -82,6 +84,7 @@ def blur_by_cause(
         "amplitude": scale * math.sqrt(0.5 * float(np.mean(np.square(amplitude_error)))),
         "sampling": math.sqrt(1.0 / 12.0),
         "optics": optics_px,
+        "sample": sample_px,
     }
     return causes | {"total": math.sqrt(sum(value**2 for value in causes.values()))}
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from recon.frame_axis import format_positions
-from recon.report.numbers import format_interval, format_uncertain, format_value
+from recon.report.numbers import format_degrees, format_interval, format_value
 from scanner.wording import counted
 
 SHARP_FRACTION = 0.99
@@ -19,38 +19,6 @@ the samples is not visible."""
 MIN_USABLE_FRACTION = 0.5
 """Fraction of the scan within the bound below which a picture is called blurred, and no estimator is recommended: most
 samples are then in a wrong pixel."""
-
-MIN_READOUT_ERROR_SD = 3.0
-"""Phase error of the readout in standard deviations from which it is stated: chance exceeds it in 0.3 % of readouts."""
-
-SIGNALS_BY_ESTIMATOR = {"sensor": "position signal is", "edges": "list of sync edges is"}
-"""The signal that an estimator takes the phase from, where it is not the sense signal."""
-
-SUFFICIENT_FILL = 0.9
-"""Fraction of visited pixels below which a longer recording or fewer pixels are advised. Isolated holes up to this
-number are filled from their neighbours without visible loss."""
-
-
-def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
-    """What the picture does not show, how sharp it is, and what would improve it."""
-    axes = summary["axes"]
-    within = min(summary[axis]["within_bound"] for axis in axes)
-    measured = all("phase_rmse_deg" in summary[axis] for axis in axes)
-    key, what = ("phase_rmse_deg", "the phase error is") if measured else ("phase_sd_deg", "the phase is known to")
-    errors = " and ".join(f"{_degrees(summary[axis][key])} in {axis}" for axis in axes)
-    bounds = sorted({f"{summary[axis]['bound_deg']:.3f}°" for axis in axes})
-    verdict = "sharp" if within >= SHARP_FRACTION else "partly blurred" if within >= MIN_USABLE_FRACTION else "blurred"
-    limits = "".join(f"{limit[0].upper()}{limit[1:]}. " for limit in summary["limits"])
-    subject = "The motion alone would give a picture that is" if limits else "The picture is"
-    text = f"{limits}{_describe_readout_phase(summary)}" + (
-        f"{subject} {verdict}: {what} {errors} ({'rms' if measured else '1 sd'}{condition_on_clock(summary)}), and "
-        f"{within:.1%} of the scan lies within the bound of {' / '.join(bounds)}."
-    )
-    if verdict != "sharp":
-        text += " Run lissajous diagnose on this recording to find what the device file lacks."
-    if summary["fill"] < SUFFICIENT_FILL:
-        text += f" Only {summary['fill']:.0%} of the pixels were visited: record longer or choose fewer pixels."
-    return text
 
 
 def condition_on_clock(summary: Mapping[str, Any]) -> str:
@@ -73,29 +41,6 @@ def describe_stack(stack: Mapping[str, Any]) -> str:
         return f"stack of a single slice at z = {z[0]} µm"
     uneven = "" if stack["even"] else " in the mean, unevenly spaced"
     return f"stack of {len(z)} slices {1e6 * stack['step_m']:.4g} µm apart{uneven}, from z = {z[0]} µm to {z[-1]} µm"
-
-
-def _describe_readout_phase(summary: Mapping[str, Any]) -> str:
-    """A sentence on the phase error of the readout that was removed; empty where none was significant."""
-    late: dict[str, list[str]] = {}
-    for axis in summary["axes"]:
-        error = summary[axis].get("readout_phase_deg")
-        if error is not None and abs(error["value"]) > MIN_READOUT_ERROR_SD * error["sd"]:
-            word = "late" if error["value"] > 0.0 else "early"
-            said = f"{format_uncertain(abs(error['value']), error['sd'], '°')} {word} in {axis}"
-            late.setdefault(_signal_of_axis(summary, axis), []).append(said)
-    if not late:
-        return ""
-    signals = ", the ".join(f"{signal} {' and '.join(said)}" for signal, said in late.items())
-    return f"The {signals}; the picture was used instead. "
-
-
-def _signal_of_axis(summary: Mapping[str, Any], axis: str) -> str:
-    """The signal of an axis's phase, and its verb; ``edges`` treats axes without edges as ``sensor`` does."""
-    from_sensor = summary["estimator"] == "edges" and str(summary[axis].get("sign")).endswith(
-        (f"sense_{axis}", f"angle_{axis}")
-    )
-    return SIGNALS_BY_ESTIMATOR.get("sensor" if from_sensor else summary["estimator"], "sense signal is")
 
 
 def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] | None = None) -> str:
@@ -241,7 +186,7 @@ def conclude_study(summary: Mapping[str, Any]) -> str:
         else f"No estimator is accurate enough: the smallest phase error is that of {best}"
     )
     text = (
-        f"{subject}, {_degrees(values['phase_rmse_deg_median'])} rms (median), "
+        f"{subject}, {format_degrees(values['phase_rmse_deg_median'])} rms (median), "
         f"with {values['within_bound']:.1%} of the scan within the bound p/m."
     )
     if summary["failed"]:
@@ -276,7 +221,9 @@ def conclude_bidirectional(summary: Mapping[str, Any]) -> str:
     text = f"The lines of the two directions lay {shift['median']:+.3f} ± {shift['sd']:.3f} pixels apart"
     if summary["frames"] > 1:
         text += f" (between {shift['min']:+.3f} and {shift['max']:+.3f} over {summary['frames']} frames)"
-    text += "; the lag is the same in all columns" if phase is None else f", a phase error of {_degrees(abs(phase))}"
+    text += (
+        "; the lag is the same in all columns" if phase is None else f", a phase error of {format_degrees(abs(phase))}"
+    )
     return (
         f"{text}. Lines differed from their neighbours by {rms['recorded']:.3g} rms and differ by "
         f"{rms['corrected']:.3g} in corrected.tif."
@@ -311,7 +258,3 @@ def conclude_fleet(summary: Mapping[str, Any]) -> str:
     if summary["failed"]:
         text += f" {counted(summary['failed'], 'recording')} failed; the reasons are listed below."
     return text
-
-
-def _degrees(value: float) -> str:
-    return f"{value:.2g}°" if value < 1.0 else f"{value:.2f}°"

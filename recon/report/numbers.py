@@ -39,6 +39,11 @@ def format_value(value: float, digits: int = 4) -> str:
     return f"{value / 10.0**power:.{digits - 1}f} · 10{_superscript(power)}".replace("-", "−")
 
 
+def format_degrees(value: float) -> str:
+    """An angle in degrees: two significant digits, two decimal places above 1°."""
+    return f"{value:.2g}°" if value < 1.0 else f"{value:.2f}°"
+
+
 def format_interval(value: float, low: float, high: float, unit: str = "") -> str:
     """A value with its 95 % interval as ``value ± sd``, or as a range if the interval is clearly asymmetric."""
     factor, unit = readable_unit(value, unit)

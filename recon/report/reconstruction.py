@@ -13,7 +13,7 @@ from recon.imaging.picture import Grid
 from recon.imaging.sample_motion.correction import describe_sample_motion
 from recon.io.output import pixel_size
 from recon.reconstruction import Reconstruction
-from recon.report.conclusions import conclude_reconstruction, describe_slices, describe_stack
+from recon.report.conclusions import describe_slices, describe_stack
 from recon.report.figures import (
     blur_figure,
     contrast_limits,
@@ -29,6 +29,7 @@ from recon.report.figures import (
 )
 from recon.report.numbers import format_uncertain
 from recon.report.page import Figure, Section, Table, render
+from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.phase_slider import phase_slider_data
 from scanner.device import AXES
 

@@ -13,6 +13,7 @@ from recon.frame_axis import position_axis
 from recon.imaging import blur
 from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
+from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.reconstruction import Reconstruction
 from recon.z_rests import cut_to_intensity, read_blocks
@@ -166,7 +167,31 @@ def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEv
     phase = own.phase_sd if error is None else error.phase
     amplitude = np.zeros(1) if error is None else error.amplitude - np.mean(error.amplitude)
     spot = result.truth.spot_sd * result.pixels("x") if result.spot is None and result.truth else result.spot or 0.0
-    return blur.blur_by_cause(float(np.mean(own.amplitude)), half, result.pixels(axis), phase, amplitude, spot)
+    return blur.blur_by_cause(
+        float(np.mean(own.amplitude)),
+        half,
+        result.pixels(axis),
+        phase,
+        amplitude,
+        spot,
+        float(sample_displacement_px(result)[AXES.index(axis)]),
+    )
+
+
+def sample_displacement_sd(motion: SampleMotion) -> Array:
+    """Standard deviation of the sample's position in x and y at each knot, shape (knots, 2) [px].
+
+    A sample in which no motion was found is displaced by what was not followed alone: the standard deviation of its
+    position is then that of a single block, of which the picture is the mean over many.
+    """
+    return motion.sd if motion.moving else np.tile(motion.left, (len(motion.sd), 1))
+
+
+def sample_displacement_px(result: Reconstruction) -> Array:
+    """Standard deviation of the sample's position in x and y, rms over the scan, shape (2,) [px]; 0 if not estimated."""
+    if result.sample_motion is None:
+        return np.zeros(len(AXES))
+    return np.asarray(np.sqrt(np.mean(sample_displacement_sd(result.sample_motion) ** 2, axis=0)))
 
 
 def intensity_drift_summary(result: Reconstruction) -> list[dict[str, Any] | None] | None:
@@ -198,6 +223,11 @@ def sample_motion_summary(result: Reconstruction) -> dict[str, Any] | None:
             for each in motion.vibrations
         ],
         "left_px": dict(zip(AXES, motion.left.tolist(), strict=True)),
+        "displaced_px": dict(zip(AXES, sample_displacement_px(result).tolist(), strict=True)),
+        "within_tolerance": {
+            axis: blur.within_bound(result.p, sd=sd)
+            for axis, sd in zip(AXES, sample_displacement_sd(motion).T, strict=True)
+        },
     }
 
 
@@ -221,6 +251,7 @@ def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str
         "angle": result.picture.grid.angle,
         **grouped,
         **axes,
+        "tolerance_px": result.p,
         "detectors": list(result.picture.detectors),
         "clock_doubted": result.clock_doubted,
         "fill": fill_factor(result.picture.coverage),

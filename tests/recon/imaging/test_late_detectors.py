@@ -10,7 +10,7 @@ from phantoms.sync import SyncDetector, sync_edges
 from recon.evaluation import Truth, truth_from_simulation
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
-from recon.report.conclusions import conclude_reconstruction
+from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
 from scanner.recording import Recording
 from tests.support.simulated import imaging

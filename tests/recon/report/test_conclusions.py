@@ -6,7 +6,8 @@ import numpy as np
 
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
-from recon.report.conclusions import conclude_prediction, conclude_reconstruction, conclude_study
+from recon.report.conclusions import conclude_prediction, conclude_study
+from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
 from tests.support.simulated import imaging
 
