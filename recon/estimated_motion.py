@@ -13,6 +13,7 @@ from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.preparation import PreparedRecording
+from scanner.arrays import Array
 from scanner.motion import Motion
 
 
@@ -26,7 +27,7 @@ class EstimatedMotion:
         grid: the pixels over the device's field of view, else over the range of the motion.
         field_notes, motion_notes: what a reader has to know of the field and of the motion, a line each.
         phase_errors: of the motion, as the picture shows them; None where they were not measured.
-        readout_phase, intensity_drift, sample_motion: as in ``Reconstruction``.
+        readout_phase, estimator_phase_sd, intensity_drift, sample_motion: as in ``Reconstruction``.
     """
 
     prepared: PreparedRecording
@@ -36,6 +37,7 @@ class EstimatedMotion:
     motion_notes: list[str]
     phase_errors: list[PhaseError] | None = None
     readout_phase: Mapping[str, ReadoutPhase] = field(default_factory=dict)
+    estimator_phase_sd: Mapping[str, Array] = field(default_factory=dict)
     intensity_drift: Sequence[IntensityDrift | None] = ()
     sample_motion: SampleMotion | None = None
 

@@ -85,6 +85,7 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     errors = register(motion)
     if not wants_readout_phase(motion, options):
         return replace(estimated, phase_errors=errors)
+    sensed = motion
     readout_phase: Mapping[str, ReadoutPhase] = {}
     notes: list[str] = []
     if not _loses_timing(estimated, errors):
@@ -92,8 +93,15 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
         notes = describe_readout_phase(motion, readout_phase)
     motion, remaining_notes = include_remaining_errors(motion, errors)
-    notes = [*notes, *remaining_notes, *estimated.motion_notes]
-    return replace(estimated, motion=motion, phase_errors=errors, readout_phase=readout_phase, motion_notes=notes)
+    without_readout, _ = include_remaining_errors(sensed, errors)
+    return replace(
+        estimated,
+        motion=motion,
+        phase_errors=errors,
+        readout_phase=readout_phase,
+        estimator_phase_sd={name: axis.phase_sd for name, axis in without_readout.axes.items()},
+        motion_notes=[*notes, *remaining_notes, *estimated.motion_notes],
+    )
 
 
 def _loses_timing(estimated: EstimatedMotion, errors: Sequence[PhaseError]) -> bool:

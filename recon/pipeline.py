@@ -201,6 +201,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         spot=options.spot,
         phase_errors=estimated.phase_errors or [],
         readout_phase=estimated.readout_phase,
+        estimator_phase_sd=estimated.estimator_phase_sd,
         intensity_drift=estimated.intensity_drift,
         sample_motion=estimated.sample_motion,
         evaluation={axis: evaluate_axis(motion.axes[axis], *angle) for axis, angle in angles.items()},

@@ -19,6 +19,7 @@ from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.preparation import DeviceSource
 from recon.quality.defects import Defect
+from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.motion import Motion
 
@@ -106,6 +107,9 @@ class Reconstruction:
         phase_errors: phase error of each time slice that forward and backward half-periods show.
         readout_phase: phase error of the readout that the picture showed and that was removed, by axis; without the
             axes of which nothing determined it.
+        estimator_phase_sd: standard deviation of the phase by the estimator alone, by axis, shape (n,) [rad]: without
+            the uncertainty of the readout's phase, which that of ``motion`` contains. Empty where no readout's phase
+            was searched.
         intensity_drift: drift that was removed, by detector; empty unless it was asked for.
         sample_motion: motion of the sample; None unless it was asked for and the scan has crossings.
         evaluation: estimate against the truth, by axis; empty without a truth.
@@ -136,6 +140,7 @@ class Reconstruction:
     spot: float | None
     phase_errors: list[PhaseError]
     readout_phase: Mapping[str, ReadoutPhase]
+    estimator_phase_sd: Mapping[str, Array]
     intensity_drift: Sequence[IntensityDrift | None]
     sample_motion: SampleMotion | None
     evaluation: Mapping[str, AxisEvaluation]

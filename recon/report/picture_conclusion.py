@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from recon.report.conclusions import MIN_USABLE_FRACTION, SHARP_FRACTION, condition_on_clock
@@ -40,16 +40,30 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
         summary: content of summary.json.
     """
     limits = "".join(f"{limit[0].upper()}{limit[1:]}. " for limit in summary["limits"])
-    subject = "The motion alone would give a picture that is" if limits else "The picture is"
-    phase = _phase_displacement(summary)
-    causes = [each for each in (phase, *_sample_displacements(summary)) if each.within < SHARP_FRACTION]
-    verdict = _grade(min((each.within for each in causes), default=1.0))
-    text = f"{limits}{_describe_readout_phase(summary)}{subject} {verdict}: "
-    text += "; ".join(dict.fromkeys([each.text for each in causes] + [phase.text])) + "."
-    text += "".join(f" {each.advice}" for each in causes)
+    text = f"{limits}{_describe_readout_phase(summary)}"
+    if _is_readout_unchecked(summary):
+        causes = [each for each in _sample_displacements(summary) if each.within < SHARP_FRACTION]
+        text += _describe_sharpness(causes, bool(limits)) + " " if causes else ""
+        text += _describe_unchecked_readout(summary, bool(limits or causes))
+    else:
+        text += _describe_sharpness([_phase_displacement(summary), *_sample_displacements(summary)], bool(limits))
     if summary["fill"] < SUFFICIENT_FILL:
         text += f" Only {summary['fill']:.0%} of the pixels were visited: record longer or choose fewer pixels."
     return text
+
+
+def _describe_sharpness(causes: Sequence[Displacement], limited: bool) -> str:
+    """How sharp the picture is, by which cause, and what would make it sharper.
+
+    Args:
+        causes: of which the first is stated in any case, the others only if they blur.
+        limited: whether the picture does not show the scene, so that this is said of the motion alone.
+    """
+    blurring = [each for each in causes if each.within < SHARP_FRACTION]
+    verdict = _grade(min(each.within for each in causes))
+    subject = "The motion alone would give a picture that is" if limited else "The picture is"
+    reasons = "; ".join(dict.fromkeys(each.text for each in (*blurring, causes[0])))
+    return f"{subject} {verdict}: {reasons}." + "".join(f" {each.advice}" for each in blurring)
 
 
 def _grade(within: float) -> str:
@@ -57,10 +71,60 @@ def _grade(within: float) -> str:
     return "sharp" if within >= SHARP_FRACTION else "partly blurred" if within >= MIN_USABLE_FRACTION else "blurred"
 
 
+def _is_readout_unchecked(summary: Mapping[str, Any]) -> bool:
+    """Whether only the uncertainty of the readout's phase leaves a part of the scan outside the bound.
+
+    It is no evidence of a blur: the recording did not measure the phase of the readout that precisely.
+    """
+    axes = [summary[axis] for axis in summary["axes"]]
+    if _is_truth_known(summary) or any(axis["readout_as_stated"] is None for axis in axes):
+        return False
+    as_stated = min(axis["readout_as_stated"]["within_bound"] for axis in axes)
+    return as_stated >= SHARP_FRACTION > min(axis["within_bound"] for axis in axes)
+
+
+def _describe_unchecked_readout(summary: Mapping[str, Any], blurred: bool) -> str:
+    """What is not known of the readout's phase, what was assumed of it, and what settles it.
+
+    Args:
+        summary: content of summary.json.
+        blurred: whether the picture has another defect, stated before.
+    """
+    axes = {axis: summary[axis] for axis in summary["axes"] if summary[axis]["within_bound"] < SHARP_FRACTION}
+    as_stated = {axis: each["readout_as_stated"] for axis, each in axes.items()}
+    assumed = [axis for axis, each in as_stated.items() if each["assumed_delay_us"] is not None]
+    bounds = " / ".join(sorted({f"{each['bound_deg']:.3f}°" for each in axes.values()}))
+    reasons = []
+    if assumed:
+        delay = max(as_stated[axis]["assumed_delay_us"] for axis in assumed)
+        reasons.append(
+            f"the picture determines no phase of {' and '.join(assumed)}, and a readout delay of {delay:g} µs (1 sd) "
+            "that the device file does not state was assumed"
+        )
+    reasons += [f"the picture determines the phase of {axis} less precisely" for axis in axes if axis not in assumed]
+    return (
+        f"{'The' if blurred else 'No blur was found, but the'} phase could not be checked to within the bound of "
+        f"{bounds}: {'; '.join(reasons)}. The phase is thus known to {_list_sd(axes)} (1 sd), with a probability of "
+        f"{min(each['within_bound'] for each in axes.values()):.1%} within the bound; with the readout exactly as "
+        f"stated, to {_list_sd(as_stated)}. To settle it, record a scene with detail in both directions, more light or "
+        "a longer scan; or, if the delay of the readout was measured and the device file states it, add --sense-only."
+    )
+
+
+def _list_sd(axes: Mapping[str, Mapping[str, float]]) -> str:
+    """Standard deviation of the phase of each axis, in words."""
+    return " and ".join(f"{format_degrees(each['phase_sd_deg'])} in {axis}" for axis, each in axes.items())
+
+
+def _is_truth_known(summary: Mapping[str, Any]) -> bool:
+    """Whether the error of the phase is known, as of a simulation."""
+    return all("phase_rmse_deg" in summary[axis] for axis in summary["axes"])
+
+
 def _phase_displacement(summary: Mapping[str, Any]) -> Displacement:
     """The displacement by the error of the phase, or by its uncertainty where the truth is not known."""
     axes = summary["axes"]
-    measured = all("phase_rmse_deg" in summary[axis] for axis in axes)
+    measured = _is_truth_known(summary)
     key, what = ("phase_rmse_deg", "the phase error is") if measured else ("phase_sd_deg", "the phase is known to")
     errors = " and ".join(f"{format_degrees(summary[axis][key])} in {axis}" for axis in axes)
     bounds = " / ".join(sorted({f"{summary[axis]['bound_deg']:.3f}°" for axis in axes}))

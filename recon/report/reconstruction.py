@@ -29,8 +29,8 @@ from recon.report.figures import (
 )
 from recon.report.numbers import format_uncertain
 from recon.report.page import Figure, Section, Table, render
-from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.phase_slider import phase_slider_data
+from recon.report.picture_conclusion import conclude_reconstruction
 from scanner.device import AXES
 
 

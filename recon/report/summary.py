@@ -15,6 +15,7 @@ from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.readout_phase import UNDESCRIBED_DELAY_SD_S
 from recon.reconstruction import Reconstruction
 from recon.z_rests import cut_to_intensity, read_blocks
 from recon.z_slices import ZSlices
@@ -97,6 +98,22 @@ def readout_phase_summary(result: Reconstruction, axis: str) -> dict[str, Any] |
     return {"value": math.degrees(found.value), "sd": math.degrees(found.sd), "from": "picture"}
 
 
+def readout_as_stated_summary(result: Reconstruction, axis: str) -> dict[str, float | None] | None:
+    """What the phase would be known to without the uncertainty of the readout's phase, which the picture is to measure.
+
+    ``assumed_delay_us`` is the standard deviation of the delay that was assumed; None where the picture measured the
+    phase. The result is None where no readout's phase was searched.
+    """
+    sd = result.estimator_phase_sd.get(axis)
+    if sd is None:
+        return None
+    return {
+        "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(sd**2)))),
+        "within_bound": blur.within_bound(result.phase_bound(axis), sd=sd),
+        "assumed_delay_us": None if axis in result.readout_phase else 1e6 * UNDESCRIBED_DELAY_SD_S,
+    }
+
+
 def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
     """What the summary says of one axis."""
     own, bound = known_part(result.motion.axes[axis]), result.phase_bound(axis)
@@ -117,6 +134,7 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
         "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
         "picture_phase_error_deg": picture_phase_error(result.phase_errors, axis),
         "readout_phase_deg": readout_phase_summary(result, axis),
+        "readout_as_stated": readout_as_stated_summary(result, axis),
         "blur_px": blur_parts(result, own, axis, error),
     }
     if error is not None:
@@ -188,7 +206,10 @@ def sample_displacement_sd(motion: SampleMotion) -> Array:
 
 
 def sample_displacement_px(result: Reconstruction) -> Array:
-    """Standard deviation of the sample's position in x and y, rms over the scan, shape (2,) [px]; 0 if not estimated."""
+    """Standard deviation of the sample's position in x and y, rms over the scan, shape (2,) [px].
+
+    It is 0 where no motion was estimated.
+    """
     if result.sample_motion is None:
         return np.zeros(len(AXES))
     return np.asarray(np.sqrt(np.mean(sample_displacement_sd(result.sample_motion) ** 2, axis=0)))

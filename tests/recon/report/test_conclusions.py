@@ -25,9 +25,9 @@ def test_only_a_picture_that_shows_its_scene_is_called_sharp() -> None:
     assert "the detector is saturated" in saturated.split(". ")[0]
     noise = np.random.default_rng(0).normal(1.0, 0.1, light.size)
     assert conclude(noise).startswith("Intensity: no structure beyond the noise")
+    assert "The motion alone would give a picture that is" in saturated
     for text in (saturated, conclude(noise)):
         assert "The picture is" not in text
-        assert "The motion alone would give a picture that is" in text
 
 
 def test_an_estimator_that_blurs_every_picture_is_not_recommended() -> None:

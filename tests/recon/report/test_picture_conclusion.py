@@ -45,3 +45,26 @@ def test_a_motion_of_the_sample_that_was_removed_leaves_the_picture_sharp() -> N
     shift, sd = np.array([[5.0, 0.0], [-5.0, 0.0]]), np.full((2, 2), 0.05)
     motion = SampleMotion(100, np.array([0.0, 1e4]), shift, sd, True, 50.0, np.zeros(2), ())
     assert conclude(replace(reconstructed(), sample_motion=motion)).startswith("The picture is sharp")
+
+
+def test_a_delay_that_was_only_assumed_is_no_blur() -> None:
+    """A scene that determines no phase: its readout is not checked, and nothing shows a blur."""
+    recording = imaging()[0]
+    noise = np.random.default_rng(0).normal(1.0, 0.1, recording["intensity"].size)
+    recording = recording.with_channel(replace(recording["intensity"], raw=noise, gain=1.0, offset=0.0))
+    summary = summarise(reconstruct(recording, Options(), quiet=True)) | {"limits": []}
+    assert summary["x"]["within_bound"] < 0.5 < 0.99 < summary["x"]["readout_as_stated"]["within_bound"]
+    text = conclude_reconstruction(summary)
+    assert text.startswith("No blur was found, but the phase could not be checked to within the bound of")
+    assert "a readout delay of 0.5 µs (1 sd)" in text
+    assert "diagnose" not in text
+    assert "blurred" not in text
+
+
+def test_noise_of_the_estimator_beyond_the_bound_is_a_blur() -> None:
+    result = reconstructed()
+    axis = result.motion.axes["x"]
+    noisy = replace(axis, phase_sd=np.full_like(axis.phase_sd, 0.1))
+    motion = replace(result.motion, axes={**result.motion.axes, "x": noisy})
+    result = replace(result, motion=motion, estimator_phase_sd={**result.estimator_phase_sd, "x": noisy.phase_sd})
+    assert conclude(result).startswith("The picture is blurred: the phase is known to 5.73° in x")
