@@ -158,6 +158,16 @@ def _sample_displacements(summary: Mapping[str, Any]) -> list[Displacement]:
 
 def _describe_readout_phase(summary: Mapping[str, Any]) -> str:
     """A sentence on the phase error of the readout that was removed; empty where none was significant."""
+    delay = summary["readout_delay_us"]
+    if delay is not None and delay["value"] < 0.0:
+        errors = (summary[axis]["readout_phase_deg"] for axis in summary["axes"])
+        sizes = (format_uncertain(abs(error["value"]), error["sd"], "°") for error in errors)
+        by_axis = " and ".join(f"{size} in {axis}" for axis, size in zip(summary["axes"], sizes, strict=True))
+        return (
+            f"The intensity is {format_uncertain(-delay['value'], delay['sd'], 'µs')} late against the signals of both "
+            f"axes (detector, amplifier, or start of the channel). This explains the phase errors of {by_axis}, "
+            "which the picture corrected. Run lissajous diagnose on this recording to find the cause. "
+        )
     late: dict[str, list[str]] = {}
     for axis in summary["axes"]:
         error = summary[axis].get("readout_phase_deg")

@@ -15,7 +15,7 @@ from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
-from recon.imaging.scan_phase.readout_phase import UNDESCRIBED_DELAY_SD_S
+from recon.imaging.scan_phase.readout_phase import UNDESCRIBED_DELAY_SD_S, common_delay
 from recon.reconstruction import Reconstruction
 from recon.z_rests import cut_to_intensity, read_blocks
 from recon.z_slices import ZSlices
@@ -112,6 +112,12 @@ def readout_as_stated_summary(result: Reconstruction, axis: str) -> dict[str, fl
         "within_bound": blur.within_bound(result.phase_bound(axis), sd=sd),
         "assumed_delay_us": None if axis in result.readout_phase else 1e6 * UNDESCRIBED_DELAY_SD_S,
     }
+
+
+def common_delay_summary(result: Reconstruction) -> dict[str, float] | None:
+    """Delay of the signals of both axes that explains their phase errors [µs]; None where none does."""
+    delay = common_delay(result.motion, result.readout_phase)
+    return None if delay is None else {"value": 1e6 * delay.value, "sd": 1e6 * delay.sd}
 
 
 def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
@@ -272,6 +278,7 @@ def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str
         "angle": result.picture.grid.angle,
         **grouped,
         **axes,
+        "readout_delay_us": common_delay_summary(result),
         "tolerance_px": result.p,
         "detectors": list(result.picture.detectors),
         "clock_doubted": result.clock_doubted,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -202,28 +203,39 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
         if not error.measured
     ]
     found = {name: error for name, error in found.items() if error.measured}
-    late = {name: error for name, error in found.items() if abs(error.value) > REPORTED_SDS * error.sd}
-    for name, error in late.items():
-        notes.append(
-            f"the signal of {name} is {abs(np.degrees(error.value)):.3g}° ± {np.degrees(error.sd):.1g}° "
-            f"{'late' if error.value > 0.0 else 'early'}; its phase was corrected by the picture"
-        )
-    delay = common_delay(motion, found) if late else None
-    if delay is not None:
-        notes.append(_describe_delay(delay, motion.estimator))
+    delay = common_delay(motion, found)
+    if delay is not None and delay.value < 0.0:
+        notes.append(_describe_late_intensity(delay.value))
+    for name, error in found.items():
+        if is_significant(error):
+            notes.append(
+                f"the signal of {name} is {abs(np.degrees(error.value)):.3g}° ± {np.degrees(error.sd):.1g}° "
+                f"{'late' if error.value > 0.0 else 'early'} against the intensity; its phase was corrected by the "
+                "picture"
+            )
+    if delay is not None and delay.value > 0.0:
+        notes.append(_describe_late_signals(delay.value, motion.estimator))
     return notes
 
 
-def _describe_delay(delay: float, estimator: str) -> str:
-    """The line on a delay [s] of the motion's signal that explains the phase errors of both axes.
+def is_significant(error: ReadoutPhase) -> bool:
+    """Whether a phase error of the readout exceeds its uncertainty."""
+    return abs(error.value) > REPORTED_SDS * error.sd
 
-    No signal comes before the motion, so that a negative delay is one of the intensity, or of its clock.
+
+def _describe_late_intensity(delay: float) -> str:
+    """The line on a negative delay [s] of the motion's signals, which explains the phase errors of both axes.
+
+    No signal comes before the motion, so that it is the intensity, or its clock, that is late.
     """
-    if delay < 0.0:
-        return (
-            f"an intensity that is {-1e6 * delay:.2g} µs late (detector, amplifier, start of the channel) would "
-            "explain the error of both axes: positions in the picture are right, and the motion is late by this time"
-        )
+    return (
+        f"an intensity that is {-1e6 * delay:.2g} µs late (detector, amplifier, start of the channel) would "
+        "explain the error of both axes: positions in the picture are right, and the motion is late by this time"
+    )
+
+
+def _describe_late_signals(delay: float, estimator: str) -> str:
+    """The line on a delay [s] of the motion's signals that explains the phase errors of both axes."""
     corner = 1.0 / (2.0 * np.pi * delay)
     near = f"{1e-3 * corner:.2g} kHz" if corner < 1e5 else f"{1e-6 * corner:.2g} MHz"
     pole = f"a delay of {1e6 * delay:.2g} µs or a pole near {near} in the "
@@ -238,15 +250,32 @@ def _sd_as_stated(axis: AxisMotion) -> float:
     return float(np.degrees(np.sqrt(np.mean(variance))))
 
 
-def common_delay(motion: Motion, found: Mapping[str, ReadoutPhase]) -> float | None:
-    """The delay [s] that explains the phase errors of both axes within their uncertainty; None if none does."""
-    if len(found) < len(AXES):
+class CommonDelay(NamedTuple):
+    """Delay of the signals of both axes against the intensity, and its standard deviation [s]."""
+
+    value: float
+    sd: float
+
+
+def common_delay(motion: Motion, found: Mapping[str, ReadoutPhase]) -> CommonDelay | None:
+    """The delay that explains the measured phase errors of both axes within their uncertainty.
+
+    None if none does, or if no phase error is significant.
+
+    Args:
+        motion: corrected.
+        found: the error that was removed, by axis.
+    """
+    if not (set(found) == set(AXES) and all(error.measured for error in found.values())):
+        return None
+    if not any(map(is_significant, found.values())):
         return None
     rate = np.array([2.0 * np.pi * np.median(motion.axes[name].frequency) for name in found])
     value, sd = np.array([(error.value, error.sd) for error in found.values()]).T
-    delay = float(np.sum(rate * value / sd**2) / np.sum(rate**2 / sd**2))
+    information = float(np.sum(rate**2 / sd**2))
+    delay = float(np.sum(rate * value / sd**2)) / information
     misfit = np.sum(((value - rate * delay) / sd) ** 2)
-    return delay if misfit < REPORTED_SDS**2 else None
+    return CommonDelay(delay, information**-0.5) if misfit < REPORTED_SDS**2 else None
 
 
 def posterior_times(axis: AxisMotion, measured: Array) -> Array:

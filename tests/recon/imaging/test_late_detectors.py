@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -93,6 +95,9 @@ def test_a_late_intensity_is_not_called_a_delay_of_the_readout() -> None:
     expect_found(result, {axis: -degrees for axis, degrees in EXPECTED_DEG.items()})
     assert any("an intensity that is 1 µs late" in note for note in result.notes)
     assert not any("in the readout would explain" in note for note in result.notes)
+    conclusion = conclude_reconstruction(summarise(result))
+    assert re.match(r"The intensity is \((0\.99|1\.00)\d+ ± 0\.00\d+\) µs late against the signals", conclusion)
+    assert "Run lissajous diagnose" in conclusion
 
 
 @pytest.mark.parametrize("signal", ["angle", "sync"])
