@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import pi
+from math import log, pi, sqrt
 
 import numpy as np
 
@@ -124,7 +124,15 @@ def _amplitudes(grid: Grid, motion: Motion) -> list[float]:
 
     The amplitude itself is that of a sine, which a spiral or a slow scan is not.
     """
-    return [grid.angle_scale * max(map(abs, _angle_range(motion.axes[name]))) for name in AXES]
+    return [grid.angle_scale * _largest_angle(motion.axes[name]) for name in AXES]
+
+
+def _largest_angle(axis: AxisMotion) -> float:
+    """Largest angle of an axis [rad], without the noise of single samples, of which the largest of n is about
+    sqrt(2 ln n) standard deviations (Cramér 1946, section 28.6)."""
+    largest = max(map(abs, _angle_range(axis)))
+    noise = axis.angle_noise_sd * sqrt(2.0 * log(INSPECTED_PARTS * INSPECTED_SAMPLES))
+    return min(largest, max(float(np.max(axis.amplitude)), largest - noise))
 
 
 def _angle_range(axis: AxisMotion) -> tuple[float, float]:

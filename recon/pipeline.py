@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from estimation.amplitude_calibration import motion_calibration_sd
-from estimation.estimate import default_estimator, estimate
+from estimation.estimate import estimate
 from recon.estimated_motion import EstimatedMotion
+from recon.estimator_choice import choose_estimator
 from recon.evaluation import Truth, evaluate_axis
 from recon.field_check import check_field, check_units, own_half_angle
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
@@ -103,7 +104,9 @@ def _reconstruct_prepared(
 ) -> Reconstruction:
     """Estimate, grid and assess, with a progress bar."""
     with tqdm(total=4, desc="reconstruct", file=sys.stderr, leave=False, disable=quiet or None) as progress:
-        estimator = options.estimator or default_estimator(prepared.recording, prepared.device)
+        estimator, choice_notes = options.estimator, list[str]()
+        if estimator is None:
+            estimator, choice_notes = choose_estimator(prepared, options)
         progress.set_postfix_str(estimator)
         estimated = estimate_motion(prepared, replace(options, estimator=estimator))
         progress.update()
@@ -117,7 +120,7 @@ def _reconstruct_prepared(
         progress.set_postfix_str("assessment")
         result = assess(gridded, options, truth)
         progress.update()
-    return result
+    return replace(result, notes=[*choice_notes, *result.notes])
 
 
 def estimate_motion(

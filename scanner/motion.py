@@ -147,6 +147,8 @@ class AxisMotion:
         sign: ``"known: <how>"`` or ``"ambiguous"``; an even capacitance fixes the phase modulo pi only.
         amplitude_sd: shape (n,), standard deviation of ``amplitude`` by the noise, without the calibration's [rad];
             None from an estimator that states none.
+        angle_noise_sd: standard deviation of the white noise in single samples of ``angle`` [rad]; 0 where the
+            estimator filters the noise, whose rest ``phase_sd`` and ``amplitude_sd`` state.
     """
 
     time: Array
@@ -158,6 +160,7 @@ class AxisMotion:
     reference: str = "half-drive"
     sign: str = "ambiguous"
     amplitude_sd: Array | None = None
+    angle_noise_sd: float = 0.0
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -40,6 +40,10 @@ from scanner.recording import Recording
 from scanner.stages import Position
 from scanner.wording import counted
 
+MIN_NOISE_SAMPLES_PER_PERIOD = 20.0
+"""Samples per period from which the sixth differences of a signal show its noise: those of the motion itself are then
+below 3e-5 of its amplitude."""
+
 MIN_BLOCKS = 2
 """Blocks that a motion's slow clock has at least."""
 
@@ -226,6 +230,7 @@ def axis_motion_from_angle(
             hint="check the sensor and its cable, or cut the recording",
         )
     amplitude = np.interp(time, time[known], np.abs(phasors[known]))
+    is_noise_known = noise_sd is not None or rate >= MIN_NOISE_SAMPLES_PER_PERIOD * reference.frequency
     if noise_sd is None:
         noise_sd = white_noise_sd(angle[:NOISE_SAMPLES][~stopped[:NOISE_SAMPLES]])
     phase = np.interp(time, time[known], reference.relative_phase(time[known], phasors[known]))
@@ -244,4 +249,5 @@ def axis_motion_from_angle(
         angle=SampledAngle(resampled, clock[0], clock[1]),
         reference=reference.kind,
         sign=f"known: {channel.name}",
+        angle_noise_sd=noise_sd if is_noise_known else 0.0,
     )

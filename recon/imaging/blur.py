@@ -12,6 +12,10 @@ from scanner.arguments import check_flags, check_numbers
 from scanner.arrays import Array
 from scanner.errors import BadInput
 
+SHARP_FRACTION = 0.99
+"""Fraction of the scan within the bound p/m from which a picture is called sharp: blur in the remaining hundredth of
+the samples is not visible."""
+
 
 def phase_bound(p: float, m: float) -> float:
     """Return p/m: the phase error [rad] that displaces no sample by more than ``p`` pixels.
@@ -32,22 +36,32 @@ def phase_bound(p: float, m: float) -> float:
     return p / m
 
 
-def within_bound(limit: float, error: Array | None = None, sd: Array | None = None) -> float:
+def within_bound(limit: float, error: Array | None = None, sd: Array | None = None, noise_sd: float = 0.0) -> float:
     """Return the fraction of the scan in which the phase error is within ``limit``.
 
     Args:
         limit: of the phase error [rad].
         error: phase errors, shape (n,) [rad], where the truth is known; those within the limit are counted.
         sd: otherwise standard deviations, shape (n,) [rad]; the normal probability of the limit is averaged.
+        noise_sd: standard deviation of noise that is added to either [rad].
 
     Raises:
         ValueError: neither ``error`` nor ``sd`` is given.
     """
-    if error is not None:
+    if error is not None and noise_sd == 0.0:
         return float(np.mean(np.abs(error) <= limit))
-    if sd is None:
+    if error is None and sd is None:
         raise ValueError("give errors or standard deviations")
-    return float(np.mean([math.erf(limit / (math.sqrt(2.0) * s)) if s > 0.0 else 1.0 for s in sd]))
+    middle = np.zeros(1) if error is None else np.abs(error)
+    spread = math.sqrt(2.0) * np.hypot(np.zeros(1) if sd is None else sd, noise_sd)
+    return float(np.mean([_central_probability(limit, m, s) for m, s in np.broadcast(middle, spread)]))
+
+
+def _central_probability(limit: float, middle: float, spread: float) -> float:
+    """Probability that a normal value around ``middle`` is within ±limit; spread: √2 standard deviations."""
+    if spread == 0.0:
+        return float(abs(middle) <= limit)
+    return 0.5 * (math.erf((limit - middle) / spread) + math.erf((limit + middle) / spread))
 
 
 def blur_by_cause(
@@ -58,6 +72,7 @@ def blur_by_cause(
     amplitude_error: Array,
     optics_px: float = 0.0,
     sample_px: float = 0.0,
+    sensor_px: float = 0.0,
 ) -> dict[str, float]:
     """Return the displacement of samples along one axis by cause, rms over the scan [px].
 
@@ -74,9 +89,11 @@ def blur_by_cause(
             magnification and no blur.
         optics_px: standard deviation of the spot [px].
         sample_px: standard deviation of the position of the sample, rms over the scan [px].
+        sensor_px: standard deviation of the noise in single samples of the angle [px].
 
     Returns:
-        ``phase``, ``amplitude``, ``sampling``, ``optics``, ``sample``, and ``total``, their sum in quadrature.
+        ``phase``, ``amplitude``, ``sampling``, ``optics``, ``sample``, ``sensor``, and ``total``, their sum in
+        quadrature.
     """
     scale = 0.5 * pixels * amplitude / half_angle
     causes = {
@@ -85,6 +102,7 @@ def blur_by_cause(
         "sampling": math.sqrt(1.0 / 12.0),
         "optics": optics_px,
         "sample": sample_px,
+        "sensor": sensor_px,
     }
     return causes | {"total": math.sqrt(sum(value**2 for value in causes.values()))}
 

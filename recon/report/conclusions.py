@@ -9,12 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from recon.frame_axis import format_positions
+from recon.imaging.blur import SHARP_FRACTION
 from recon.report.numbers import format_degrees, format_interval, format_value
 from scanner.wording import counted
-
-SHARP_FRACTION = 0.99
-"""Fraction of the scan within the bound p/m from which a picture is called sharp: blur in the remaining hundredth of
-the samples is not visible."""
 
 MIN_USABLE_FRACTION = 0.5
 """Fraction of the scan within the bound below which a picture is called blurred, and no estimator is recommended: most

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from recon.report.conclusions import MIN_USABLE_FRACTION, SHARP_FRACTION, condition_on_clock
+from recon.imaging.blur import SHARP_FRACTION
+from recon.report.conclusions import MIN_USABLE_FRACTION, condition_on_clock
 from recon.report.numbers import format_degrees, format_uncertain
 
 MIN_READOUT_ERROR_SD = 3.0
@@ -130,6 +131,16 @@ def _phase_displacement(summary: Mapping[str, Any]) -> Displacement:
     bounds = " / ".join(sorted({f"{summary[axis]['bound_deg']:.3f}°" for axis in axes}))
     within = min(summary[axis]["within_bound"] for axis in axes)
     kind = ("rms" if measured else "1 sd") + condition_on_clock(summary)
+    noise = {axis: summary[axis]["blur_px"]["sensor"] for axis in axes}
+    if any(px > summary[axis]["blur_px"]["phase"] for axis, px in noise.items()) and within < SHARP_FRACTION:
+        sizes = " and ".join(f"{px:.2g} px in {axis}" for axis, px in noise.items())
+        return Displacement(
+            within,
+            f"the noise of the position signals moves single samples by {sizes} (1 sd), so that {within:.1%} of the "
+            f"scan lies within the tolerated {summary['tolerance_px']:g} px; {what} {errors} ({kind})",
+            "Use --estimator tracker, which follows the motion through the noise; it needs the drives and [mechanics] "
+            "in the device file.",
+        )
     return Displacement(
         within,
         f"{what} {errors} ({kind}), and {within:.1%} of the scan lies within the bound of {bounds}",

@@ -109,7 +109,7 @@ def readout_as_stated_summary(result: Reconstruction, axis: str) -> dict[str, fl
         return None
     return {
         "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(sd**2)))),
-        "within_bound": blur.within_bound(result.phase_bound(axis), sd=sd),
+        "within_bound": blur.within_bound(result.phase_bound(axis), sd=sd, noise_sd=angle_noise_phase(result, axis)),
         "assumed_delay_us": None if axis in result.readout_phase else 1e6 * UNDESCRIBED_DELAY_SD_S,
     }
 
@@ -128,9 +128,9 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(own.phase_sd**2)))),
         "bound_deg": float(np.degrees(bound)),
-        "within_bound": blur.within_bound(bound, sd=own.phase_sd)
+        "within_bound": blur.within_bound(bound, sd=own.phase_sd, noise_sd=angle_noise_phase(result, axis))
         if error is None
-        else blur.within_bound(bound, error=error.phase),
+        else blur.within_bound(bound, error=error.phase, noise_sd=angle_noise_phase(result, axis)),
         "sign": own.sign,
         "amplitude_rad": scale * float(np.mean(own.amplitude)),
         "amplitude_um": None if metres is None else 1e6 * metres * float(np.mean(own.amplitude)),
@@ -199,7 +199,14 @@ def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEv
         amplitude,
         spot,
         float(sample_displacement_px(result)[AXES.index(axis)]),
+        own.angle_noise_sd / grid.pixel_angle[AXES.index(axis)],
     )
+
+
+def angle_noise_phase(result: Reconstruction, axis: str) -> float:
+    """The phase error [rad] that displaces no sample by more than the noise in single samples of the angle does."""
+    half = dict(zip(AXES, (result.picture.grid.half_angle_x, result.picture.grid.half_angle_y), strict=True))
+    return result.motion.axes[axis].angle_noise_sd / half[axis]
 
 
 def sample_displacement_sd(motion: SampleMotion) -> Array:
