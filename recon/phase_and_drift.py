@@ -20,7 +20,7 @@ from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_mot
 from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
-from recon.imaging.scan_phase.slow_gain import describe_slow_gain
+from recon.imaging.scan_phase.slow_gain import GainPart, describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice, register_slices_separately
 from recon.reconstruction import Options
 from recon.registration_segments import registration_segments
@@ -52,7 +52,11 @@ def _describe_gain(estimated: EstimatedMotion) -> list[str]:
     """The note on a slow gain; none of a stack, whose drift no option removes, as a place is at a new z each time."""
     if estimated.prepared.position_z is not None:
         return []
-    return describe_slow_gain([error.gain for error in estimated.phase_errors or [] if error.gain is not None])
+    gains = {id(error.gain): error.gain for error in estimated.phase_errors or [] if error.gain is not None}
+    segments = registration_segments(estimated.motion, estimated.prepared.intensity)
+    if len(gains) != len(segments):
+        return []
+    return describe_slow_gain([GainPart(*part, gain) for part, gain in zip(segments, gains.values(), strict=True)])
 
 
 def wants_readout_phase(motion: Motion, options: Options) -> bool:

@@ -113,17 +113,54 @@ def estimate_slow_gain(cell: NDArray[np.int64], time: Array, intensity: Array, s
     return SlowGain(share * log_gain, share * (covariance + (1.0 - share) * np.outer(log_gain, log_gain)))
 
 
-def describe_slow_gain(gains: Sequence[SlowGain]) -> list[str]:
+class GainPart(NamedTuple):
+    """The slow gain of a part of the scan with its own picture, and the begin and the end of the part [samples]."""
+
+    begin: int
+    end: int
+    gain: SlowGain
+
+
+def join_gains(parts: Sequence[GainPart]) -> SlowGain:
+    """The gain over the whole scan, from parts whose gains are each known up to a factor.
+
+    The gain is continuous. Between two parts its logarithm changes with the mean of their slopes.
+
+    Args:
+        parts: in the order of time, at least one.
+    """
+    sizes = [part.gain.log_gain.size for part in parts]
+    firsts = np.cumsum([0, *sizes])
+    own = np.eye(firsts[-1])
+    slopes = [
+        (own[last - 1] - own[first]) / (part.end - part.begin)
+        for first, last, part in zip(firsts[:-1], firsts[1:], parts, strict=True)
+    ]
+    joined = [own[: sizes[0]]]
+    for k in range(1, len(parts)):
+        gap = parts[k].begin - parts[k - 1].end
+        start = joined[-1][-1] + gap * 0.5 * (slopes[k - 1] + slopes[k])
+        joined.append(start + own[firsts[k] : firsts[k + 1]] - own[firsts[k]])
+    combine = np.concatenate(joined)
+    combine -= combine.mean(axis=0)
+    covariance = np.zeros_like(own)
+    for first, last, part in zip(firsts[:-1], firsts[1:], parts, strict=True):
+        covariance[first:last, first:last] = part.gain.covariance
+    log_gain = combine @ np.concatenate([part.gain.log_gain for part in parts])
+    return SlowGain(log_gain, combine @ covariance @ combine.T)
+
+
+def describe_slow_gain(parts: Sequence[GainPart]) -> list[str]:
     """A line if the gain changes, with the option that removes the change from the picture.
 
     Args:
-        gains: of parts of the scan, each with its own picture.
+        parts: in the order of time.
     """
-    changes = [gain.change for gain in gains]
-    clear = [each for each in changes if abs(each[0]) > max(MIN_REPORTED_CHANGE, REPORTED_SDS * each[1])]
-    if not clear:
+    if not parts:
         return []
-    change, sd = max(clear, key=lambda each: abs(each[0]))
+    change, sd = join_gains(parts).change
+    if abs(change) <= max(MIN_REPORTED_CHANGE, REPORTED_SDS * sd):
+        return []
     return [
         f"intensity: samples of one place {'rise' if change > 0.0 else 'fall'} by {100 * abs(change):.3g} % "
         f"± {100 * sd:.2g} % during the scan: the gain of the channel or what it records drifts. The phase allows for "

@@ -9,7 +9,14 @@ import pytest
 
 from phantoms.experiment import Experiment, simulate_experiment
 from recon.evaluation import truth_from_simulation
-from recon.imaging.scan_phase.slow_gain import PRIOR_SD, SlowGain, describe_slow_gain, estimate_slow_gain
+from recon.imaging.scan_phase.slow_gain import (
+    PRIOR_SD,
+    GainPart,
+    SlowGain,
+    describe_slow_gain,
+    estimate_slow_gain,
+    join_gains,
+)
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
 from scanner.device import AXES
@@ -55,13 +62,27 @@ def test_samples_that_show_no_gain_leave_it_at_one(case: str) -> None:
     light = 0.0 * light if case == "dark" else light
     gain = estimate_slow_gain(cell, time, light, SLICES)
     np.testing.assert_allclose(gain.log_gain, 0.0, atol=1e-9)
-    assert not describe_slow_gain([gain])
+    assert not describe_slow_gain([GainPart(0, 1, gain)])
 
 
 def test_a_change_within_its_error_is_not_reported() -> None:
     uncertain = SlowGain(np.array([0.0, -0.1]), PRIOR_SD**2 * np.eye(2))
-    assert not describe_slow_gain([uncertain])
-    assert len(describe_slow_gain([uncertain, uncertain._replace(covariance=1e-6 * np.eye(2))])) == 1
+    certain = uncertain._replace(covariance=1e-6 * np.eye(2))
+    assert not describe_slow_gain([GainPart(0, 1, uncertain)])
+    assert not describe_slow_gain([GainPart(0, 1, certain), GainPart(1, 2, uncertain)])
+    assert len(describe_slow_gain([GainPart(0, 1, certain)])) == 1
+
+
+def test_parts_of_a_long_scan_show_the_change_over_the_scan() -> None:
+    """Bleaching to 1/e, measured in three parts of a fifth each, one after a shorter gap than the other."""
+    parts = [(0, 20), (30, 50), (80, 100)]
+    gains = [
+        GainPart(*part, SlowGain(-np.linspace(*part, 3) / 100.0 + np.mean(part) / 100.0, 1e-6 * np.eye(3)))
+        for part in parts
+    ]
+    np.testing.assert_allclose(np.diff(join_gains(gains).log_gain)[[0, 2, 5]], [-0.1, -0.1, -0.3])
+    (note,) = describe_slow_gain(gains)
+    assert "fall by 63.2 % ±" in note
 
 
 def falling(recording: Recording) -> Recording:
@@ -72,9 +93,9 @@ def falling(recording: Recording) -> Recording:
 
 def test_a_change_of_the_gain_is_written_without_powers_of_ten() -> None:
     gain = SlowGain(np.array([0.5, -0.5]), np.diag([0.1, 0.1]) ** 2)
-    (note,) = describe_slow_gain([gain])
+    (note,) = describe_slow_gain([GainPart(0, 1, gain)])
     assert "fall by 63.2 % ± 5.2 % during" in note
-    (note,) = describe_slow_gain([gain._replace(log_gain=-gain.log_gain)])
+    (note,) = describe_slow_gain([GainPart(0, 1, gain._replace(log_gain=-gain.log_gain))])
     assert "rise by 172 % ± 38 % during" in note
 
 
