@@ -117,7 +117,7 @@ def prepare_segment(
         uncorrected=segment,
         device=device,
         clock_jumps=tuple(clock_jumps),
-        defects=(*clock_jumps, *find_defects(inspected, device)),
+        defects=(*clock_jumps, *find_defects(inspected, device, segment["intensity"])),
         unknown_entries=tuple(_unknown_entries(recording, device)),
         clock_notes=tuple(_describe_intensity_clock(recording)),
         origin=recording.start,
@@ -137,12 +137,13 @@ def prepare_frame(
     frame = correct_intensity(recording, device, undo_lag).slice(start, stop)
     inspected = correct_intensity(recording, device).slice(start, stop)
     frame.require("intensity", "a picture needs it")
+    uncorrected = recording.slice(start, stop)
     return PreparedRecording(
         recording=frame,
-        uncorrected=recording.slice(start, stop),
+        uncorrected=uncorrected,
         device=device,
         clock_jumps=(),
-        defects=tuple(find_defects(inspected, device)),
+        defects=tuple(find_defects(inspected, device, uncorrected.channels.get("intensity"))),
         unknown_entries=(),
         clock_notes=(),
         origin=recording.start,

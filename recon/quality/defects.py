@@ -66,12 +66,14 @@ class Defect:
     fraction: float = 1.0
 
 
-def find_defects(recording: Recording, device: Device) -> list[Defect]:
+def find_defects(recording: Recording, device: Device, recorded: Channel | None = None) -> list[Defect]:
     """Return gaps, held values, clipping and missing parts of the channels that a picture is made of.
 
     Args:
         recording: with an intensity.
         device: of the recording; it states how long a signal of the motion can stand at one value.
+        recorded: the intensity as it was recorded, whose time the others are to cover; that of ``recording`` where
+            None. A correction for a late detector moves the intensity to times before the recording.
 
     Returns:
         The defects channel by channel, those of one kind in order of time.
@@ -81,7 +83,8 @@ def find_defects(recording: Recording, device: Device) -> list[Defect]:
     slowest = slowest_motions(recording, device)
     for name, channel in recording.channels.items():
         if name.startswith(("sense", "drive_", "angle_")) or name == "intensity":
-            defects += _find_missing_ends(channel, intensity)
+            if name != "intensity":
+                defects += _find_missing_ends(channel, recorded or intensity)
             defects += _as_defects(channel, "gap", _find_gaps(channel))
             held = find_held_runs(channel, slowest[name]) if name in slowest else []
             defects += _as_defects(channel, HELD, held)

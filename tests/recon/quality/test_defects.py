@@ -19,6 +19,7 @@ from recon.evaluation import truth_from_simulation
 from recon.imaging.gridding import map_samples
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstimate
 from recon.pipeline import reconstruct
+from recon.preparation import prepare
 from recon.quality.clock_jumps import detect_clock_jumps
 from recon.quality.defects import Defect, describe_defects, find_defects
 from recon.quality.dropped_samples import first_late_slice, slice_delays
@@ -73,6 +74,16 @@ def test_an_intact_recording_has_no_defects(whole: Reconstruction) -> None:
     assert whole.defects == []
     assert whole.unlocated_samples == 0
     assert not whole.affected.any()
+
+
+def test_the_stated_lag_of_the_detector_leaves_no_channel_missing() -> None:
+    """It moves the intensity by four samples to times before the other channels begin."""
+    recording, _ = imaging()
+    assert recording.device is not None
+    text = recording.device.to_toml() + "\n[x.terms.detector-lag]\nf_c = 200e3\n"
+    prepared = prepare(recording, Device.from_toml(text))
+    assert prepared.intensity.start < recording["sense"].start - 2.0 / SAMPLE_RATE_HZ
+    assert not prepared.defects
 
 
 def test_missing_intensities_change_only_the_coverage(whole: Reconstruction) -> None:
