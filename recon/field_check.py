@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import log, pi, sqrt
+from collections.abc import Mapping, Sequence
+from math import acos, log, pi, sqrt
 
 import numpy as np
 
 from recon.imaging.picture import Grid, Picture
+from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.device_templates import MAX_MIRROR_ANGLE_RAD
 from scanner.errors import DeviceInvalid
@@ -56,13 +57,14 @@ def check_units(grid: Grid, motion: Motion) -> None:
                 )
 
 
-def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[str]:
+def check_field(picture: Picture, motion: Motion, allow_outside: bool, sample_moved: bool = False) -> list[str]:
     """Notes on samples outside the field, and on a field that the motion hardly covers.
 
     Args:
         picture: with the count of samples outside.
-        motion: of the beam.
+        motion: of the mirror.
         allow_outside: accept that most samples lie outside.
+        sample_moved: whether the samples were moved with the sample.
 
     Raises:
         DeviceInvalid: most samples lie outside.
@@ -82,7 +84,7 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[s
                     f"no mirror turns so far: check gain in [x.readout], in V/rad, or the unit of the angles; or {hint}"
                 )
             raise DeviceInvalid(what, channel="scan", hint=hint)
-        notes.append(f"{what}; check [scan] and the gain")
+        notes.append(f"{what}; {_explain_outside(grid, motion, sample_moved)}")
     notes += _describe_centres(grid, motion)
     if any(a < MIN_AMPLITUDE_FRACTION * h for a, h in zip(amplitude, half, strict=True)):
         notes.append(
@@ -90,6 +92,26 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool) -> list[s
             "readout's constants in the device"
         )
     return notes
+
+
+def _explain_outside(grid: Grid, motion: Motion, sample_moved: bool) -> str:
+    """What moves samples out of the field, and what to do: the end of a note."""
+    half_angles = dict(zip(AXES, (grid.half_angle_x, grid.half_angle_y), strict=True))
+    if sample_moved and _share_outside(half_angles, motion) <= MAX_OUTSIDE_FRACTION:
+        return "the sample moved there during the scan; a larger field in [scan] shows them"
+    of_sines = (
+        2.0 / pi * acos(min(half_angles[name] / float(np.mean(motion.axes[name].amplitude)), 1.0)) for name in AXES
+    )
+    noisy = any(axis.angle_noise_sd for axis in motion.axes.values())
+    if noisy and sum(of_sines) <= MAX_OUTSIDE_FRACTION:
+        return "the noise of the position signals moves them there; --estimator tracker filters it"
+    return "check [scan] and the gain"
+
+
+def _share_outside(half_angles: Mapping[str, float], motion: Motion) -> float:
+    """Share of the inspected samples outside the field of the given half angles [rad]."""
+    outside = [np.abs(_inspected_angles(motion.axes[name])) > half for name, half in half_angles.items()]
+    return float(np.mean(np.logical_or(*outside)))
 
 
 def own_half_angle(axis: AxisMotion) -> float:
@@ -137,9 +159,13 @@ def _largest_angle(axis: AxisMotion) -> float:
 
 def _angle_range(axis: AxisMotion) -> tuple[float, float]:
     """Smallest and largest angle of an axis [rad]."""
-    firsts = np.linspace(0, max(axis.angle.size - INSPECTED_SAMPLES, 0), INSPECTED_PARTS).astype(int)
-    parts = [axis.angle.read(first, first + INSPECTED_SAMPLES) for first in np.unique(firsts).tolist()]
-    angles = np.concatenate(parts)
+    angles = _inspected_angles(axis)
     if not np.isfinite(angles).any():
         return -float(np.max(axis.amplitude)), float(np.max(axis.amplitude))
     return float(np.nanmin(angles)), float(np.nanmax(angles))
+
+
+def _inspected_angles(axis: AxisMotion) -> Array:
+    """Angles of an axis in parts all over the scan, shape (n,) [rad]."""
+    firsts = np.linspace(0, max(axis.angle.size - INSPECTED_SAMPLES, 0), INSPECTED_PARTS).astype(int)
+    return np.concatenate([axis.angle.read(first, first + INSPECTED_SAMPLES) for first in np.unique(firsts).tolist()])

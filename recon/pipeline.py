@@ -171,7 +171,8 @@ def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
     prepared, beam, grid = estimated.prepared, estimated.beam, estimated.grid
     unlocated = _unlocated(estimated)
     picture = grid_intensity(beam, prepared.intensity, grid, unlocated)
-    field_notes = check_field(picture, estimated.motion, options.allow_outside)
+    moved = estimated.sample_motion is not None and estimated.sample_motion.moving
+    field_notes = check_field(picture, estimated.motion, options.allow_outside, moved)
     if not picture.coverage.any():
         hint = "check the channels' start times, and that the sensors recorded a motion throughout"
         raise BadInput("no sample was mapped: the angle is known nowhere", channel="intensity", hint=hint)

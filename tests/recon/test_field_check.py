@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from recon.cli import main
+from recon.field_check import check_field
+from recon.imaging.picture import Grid, Picture
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import UNVISITED
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
+from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 from scanner.stages import Scan
 from tests.support.simulated import imaging
@@ -32,6 +35,35 @@ def test_most_samples_outside_are_refused_unless_allowed() -> None:
     result = with_field(Scan(0.02, 0.02), allow_outside=True)
     assert any("lie outside the field of view" in note for note in result.notes)
     assert result.picture.outside > result.picture.coverage.sum()
+
+
+@pytest.mark.parametrize(
+    ("half_angle", "noise_sd", "moved", "reason"),
+    [
+        (0.1, 0.0, True, "the sample moved there"),
+        (0.1, 0.01, False, "the noise of the position signals moves them there"),
+        (0.095, 0.01, True, "check [scan] and the gain"),
+    ],
+)
+def test_the_note_on_samples_outside_names_what_moves_them(
+    half_angle: float, noise_sd: float, moved: bool, reason: str
+) -> None:
+    """A motion of 0.1 rad, and a picture that has lost a tenth of the samples."""
+    rng = np.random.default_rng(0)
+    angles = 0.1 * np.sin(2 * np.pi * np.outer([0.011, 0.0137], np.arange(20_000)))
+    angles += rng.normal(0.0, noise_sd, angles.shape) if noise_sd else 0.0
+    time, ones = np.array([0.0, 0.02]), np.ones(2)
+    axes = {
+        name: AxisMotion(
+            time, 0 * ones, 0.1 * ones, 1e4 * ones, 0 * ones, SampledAngle(each, 1e6), angle_noise_sd=noise_sd
+        )
+        for name, each in zip("xy", angles, strict=True)
+    }
+    grid = Grid(10, 10, half_angle, half_angle)
+    picture = Picture(np.zeros((10, 10), np.float32), np.full((10, 10), 180), grid, outside=2000)
+    (note,) = check_field(picture, Motion(axes, "sensor", {}), False, moved)
+    assert note.startswith("10% of the samples lie outside")
+    assert reason in note
 
 
 def test_some_samples_outside_are_noted() -> None:
