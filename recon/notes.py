@@ -21,6 +21,7 @@ from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.wording import percent
 
 MAX_FRAME_EXCESS = 1e-3
 """Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""
@@ -179,8 +180,8 @@ def describe_infinite(intensity: Channel) -> list[str]:
     if not infinite.any():
         return []
     return [
-        f"intensity: {infinite.mean():.2g} of the samples are infinite and left out: if they were too large for their "
-        "type (float16 ends at 65504), bright places are too dark; store them in another type"
+        f"intensity: {percent(infinite.mean())} of the samples are infinite and left out: if they were too large for "
+        "their type (float16 ends at 65504), bright places are too dark; store them in another type"
     ]
 
 
@@ -199,8 +200,9 @@ def describe_negative_counts(intensity: Channel) -> list[str]:
     values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
     if intensity.unit not in COUNT_UNITS or not (values < 0.0).any():
         return []
+    share = percent(float(np.mean(values < 0.0)))
     return [
-        f"intensity: {np.mean(values < 0.0):.2g} of the samples are negative, down to {np.nanmin(values):.4g} "
+        f"intensity: {share} of the samples are negative, down to {np.nanmin(values):.4g} "
         f"{intensity.unit}, which counts cannot be: check the offset and whether the integers are unsigned"
     ]
 

@@ -6,3 +6,8 @@ from __future__ import annotations
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, which is in the plural unless the number is 1: ``1 value``, ``3 values``."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def percent(share: float) -> str:
+    """A share in percent; small ones with two significant digits, so that they never read as none."""
+    return f"{100.0 * share:.0f}%" if share >= 0.1 else f"{100.0 * share:.2g}%"

@@ -16,6 +16,7 @@ from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, READ_CHUNK_SAMPLES, Channel
 from scanner.device import Device
 from scanner.motion import Motion, SampledAngle
 from scanner.recording import Recording
+from scanner.wording import percent
 
 MERGE_GAP_S = 1e-3
 """Intervals of one kind that are closer than this are reported as one: a signal that clips clips in every period."""
@@ -143,7 +144,7 @@ def describe_defects(defects: Sequence[Defect]) -> Iterator[str]:
         name = KIND_NAMES.get(kind, kind)
         fraction = sum(defect.fraction * (defect.stop - defect.start) for defect in same)
         fraction /= sum(defect.stop - defect.start for defect in same)
-        share = "" if fraction > MAX_STATED_FRACTION else f", {fraction:.2g} of the samples there"
+        share = "" if fraction > MAX_STATED_FRACTION else f", {percent(fraction)} of the samples there"
         yield f"{channel}: {name} for {1e3 * total:.4g} ms in {places}, the first at {intervals[0][0]:.6g} s{share}"
 
 

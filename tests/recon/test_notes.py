@@ -45,7 +45,9 @@ def test_negative_counts_are_stated_and_negative_volts_are_not() -> None:
     assert describe_negative_counts(counts) == []
     values[:10] = -3.0
     (note,) = describe_negative_counts(counts)
-    assert "0.01 of the samples are negative, down to -3 counts" in note
+    assert "intensity: 1% of the samples are negative, down to -3 counts" in note
+    (note,) = describe_negative_counts(replace(detector(-values - 1.0), unit="counts"))
+    assert "intensity: 99% of the samples are negative" in note
     assert describe_negative_counts(detector(values)) == []
 
 

@@ -90,7 +90,7 @@ NOTED: dict[str, tuple[str, Change | None, str | None]] = {
         TOLERANCE.replace("gain = {}", "Gain = 0.05"), None, "x.tolerance.Gain: is the tolerance of no value"),
     "a tolerance in percent": (TOLERANCE.format(5), None, "x.tolerance.gain: is 5, that is 500%; it is relative: 5 %"),
     "infinite samples": (
-        DEVICE, values("intensity", lambda v: np.where(v > 120.0, np.inf, v)), "0.074 of the samples are infinite"),
+        DEVICE, values("intensity", lambda v: np.where(v > 120.0, np.inf, v)), "7.4% of the samples are infinite"),
     "intensity of another rate and start": (
         DEVICE, lambda file: (values("intensity", lambda v: v[4000::2])(file),
         attribute("intensity", "sample_rate", RATE / 2)(file), attribute("intensity", "start", 0.004)(file)),

@@ -19,6 +19,7 @@ from recon.sample_ranges import SampleRanges, subtract_ranges
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.motion import Motion
+from scanner.wording import percent
 
 PictureKind = Literal["mean", "kernel", "posterior"]
 """Method by which the value of a pixel is estimated."""
@@ -143,7 +144,8 @@ def picture_of_sums(
         f"smooth; {np.mean(means.coverage == 0):.0%} of the pixels hold no sample, and their values follow from others"
     ]
     if not np.isfinite(image).all():
-        notes.append(f"{np.mean(np.isnan(image)):.1%} of the pixels are too far from any sample and have no value")
+        empty = percent(float(np.mean(np.isnan(image))))
+        notes.append(f"{empty} of the pixels are too far from any sample and have no value")
     following = [each for each in carry if each is not None]
     return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes, limits, following)
 

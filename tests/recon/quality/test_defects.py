@@ -108,7 +108,7 @@ def test_single_missing_samples_are_stated_with_their_share() -> None:
     (defect,) = defects_of(damaged(intensity=signal))
     assert defect.fraction == pytest.approx(0.02, rel=1e-3)
     (line,) = describe_defects([defect])
-    assert line.endswith("0.02 of the samples there")
+    assert line.endswith("2% of the samples there")
 
 
 def test_a_gap_in_the_sense_signal_is_bridged_and_its_pixels_marked(whole: Reconstruction) -> None:
