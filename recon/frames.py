@@ -18,7 +18,7 @@ from recon.frame_axis import FrameAxis, position_axis
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, fill_holes
 from recon.imaging.picture_kinds.picture_estimate import EstimatedPicture, estimate_picture
-from recon.imaging.pixel_noise import MAX_NOISE_SAMPLES, measure_noise
+from recon.imaging.pixel_noise import MAX_NOISE_SAMPLES, SampleNoise, measure_noise
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
@@ -31,6 +31,11 @@ from scanner.errors import BadInput
 
 if TYPE_CHECKING:
     import xarray
+
+
+MAX_OWN_NOISE_RELATIVE_SD = 0.05
+"""Relative standard error of the variance of a sample up to which a frame's own noise is used: its standard deviations
+are then uncertain by 2.5 %. In a shorter frame the noise of the whole recording, from more pairs, is nearer."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +72,13 @@ class ScanFrames:
         the samples of earlier frames where they agree with its own.
         """
         result, before = self.result, None
-        grid, noise, intensity = result.picture.grid, result.sample_noise, result.intensity
+        grid, intensity = result.picture.grid, result.intensity
         rails = detector_rails(intensity)
         for number, (begin, end) in enumerate(self.spans):
             if self.slices is not None:
                 intensity = self.slices.intensity_of(number, result.intensity)
-                noise = measure_noise(result.beam, intensity, grid, min(end - begin, MAX_NOISE_SAMPLES), begin)
+            own = measure_noise(result.beam, intensity, grid, min(end - begin, MAX_NOISE_SAMPLES), begin)
+            noise = own if self.slices is not None else _choose_noise(own, result.sample_noise)
             means = grid_intensity(result.beam, intensity, grid, self.unlocated, begin, end)
             data = result.beam, intensity, self.unlocated, begin, end
             try:
@@ -121,6 +127,19 @@ class ScanFrames:
         frames[dimension].attrs = {"units": unit, "long_name": what}
         frames["image"].attrs["units"] = frames["image_sd"].attrs["units"] = self.result.intensity.unit
         return frames
+
+
+def _choose_noise(
+    own: Sequence[SampleNoise | None], of_recording: Sequence[SampleNoise | None]
+) -> tuple[SampleNoise | None, ...]:
+    """The noise of a frame's samples by detector: its own where the frame determines it.
+
+    That of the recording holds the difference between passes far apart in time, of a scene that changed.
+    """
+    return tuple(
+        frame if frame is not None and frame.relative_sd <= MAX_OWN_NOISE_RELATIVE_SD else whole
+        for frame, whole in zip(own, of_recording, strict=True)
+    )
 
 
 def frames(

@@ -160,3 +160,16 @@ def test_a_posterior_frame_uses_earlier_frames_unless_they_are_independent(resul
     errors = [np.nanstd(each[2].picture.image - whole) for each in (with_earlier, independent)]
     assert errors[0] < 0.8 * errors[1]
     assert np.array_equal(with_earlier[2].picture.coverage, independent[2].picture.coverage)
+
+
+def test_the_noise_of_a_frame_is_not_that_of_a_scene_that_changed_later() -> None:
+    """The contrast is inverted in the second half, which pairs of passes of the whole scan show as noise."""
+    recording, _ = imaging()
+    light = recording["intensity"].read()
+    changed = np.where(np.arange(light.size) < light.size // 2, light, light.max() - light)
+    sd = []
+    for values in (light, changed):
+        own = recording.with_channel(replace(recording["intensity"], raw=values, gain=1.0, offset=0.0))
+        film = frames(reconstruct(own, Options(pixels=(60, 50)), quiet=True), 2)
+        sd.append(float(np.nanmedian(next(iter(film.estimates())).sd)))
+    assert sd[1] == pytest.approx(sd[0], rel=0.1)
