@@ -9,7 +9,7 @@ import numpy as np
 
 from estimation.rail import upper_rail
 from recon.imaging.picture import Grid, detector_names
-from recon.imaging.saturation import MAX_CHECKED_SAMPLES, detector_rails
+from recon.imaging.saturation import COUNT_UNITS, MAX_CHECKED_SAMPLES, detector_rails
 from recon.imaging.scan_phase.doubled_frequency import describe_doubled_axes
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions
 from recon.preparation import PreparedRecording
@@ -28,10 +28,6 @@ MAX_FRAME_EXCESS = 1e-3
 
 MAX_UNLOCATED_SHARE = 0.05
 """Share of samples at an unknown angle from which a note says so; the transients at both ends of a scan are shorter."""
-
-COUNT_UNITS = ("count", "counts", "photon", "photons")
-"""Units of an intensity that cannot be negative."""
-
 
 LOGARITHMIC_UNIT = "dB"
 """Beginning of the units of logarithms: dB, dBm, dBV."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from estimation.rail import upper_rail
+from estimation.rail import upper_rail, upper_rail_of_counts
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
 from recon.sample_ranges import SampleRanges
@@ -19,6 +19,9 @@ from scanner.motion import Motion
 
 MAX_CHECKED_SAMPLES = 1_000_000
 """Samples from the start of the intensity in which a rail is searched: 0.2 s at 5 MS/s. Sorting takes 0.1 s."""
+
+COUNT_UNITS = ("count", "counts", "photon", "photons")
+"""Units of an intensity that cannot be negative and has the noise of photons."""
 
 MAX_SATURATED_SHARE = 0.1
 """Share of a pixel's samples at the rail up to which its mean is used: it is then too small by 0.05 standard deviations
@@ -30,7 +33,8 @@ def detector_rails(intensity: Channel) -> list[tuple[float, int] | None]:
     count = min(intensity.size, MAX_CHECKED_SAMPLES)
     columns = intensity.read(0, count).reshape(count, -1).T
     finite = [column[np.isfinite(column)] for column in columns]
-    return [upper_rail(each) if each.size else None for each in finite]
+    find_rail = upper_rail_of_counts if intensity.unit in COUNT_UNITS else upper_rail
+    return [upper_rail(each) or find_rail(each) if each.size else None for each in finite]
 
 
 def sd_without_saturated(

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from recon.notes import (
     describe_fast_axes,
@@ -37,6 +38,17 @@ def test_photon_counts_are_not_saturated() -> None:
     for photons in (0.05, 2.0, 200.0):
         counts = np.random.default_rng(1).poisson(photons, 100_000).astype(float)
         assert describe_saturation(detector(counts)) == []
+
+
+@pytest.mark.parametrize("photons", [20.0, 200.0])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.2])
+def test_a_counter_that_ends_in_the_middle_of_the_noise_is_saturated(photons: float, share: float) -> None:
+    """A scene of many brightnesses: its histogram falls slowly, and up to a fifth of the samples are at the end."""
+    rng = np.random.default_rng(3)
+    counts = rng.poisson(photons * rng.uniform(0.1, 1.0, 100_000)).astype(float)
+    limited = np.minimum(counts, np.quantile(counts, 1.0 - share))
+    notes = describe_saturation(replace(detector(limited), unit="counts"))
+    assert len(notes) == (share > 0.0)
 
 
 def test_negative_counts_are_stated_and_negative_volts_are_not() -> None:
