@@ -9,9 +9,10 @@ import numpy as np
 
 from estimation.rail import upper_rail
 from recon.imaging.picture import Grid, detector_names
-from recon.imaging.saturation import COUNT_UNITS, MAX_CHECKED_SAMPLES, detector_rails
+from recon.imaging.saturation import COUNT_UNITS, detector_rails
 from recon.imaging.scan_phase.doubled_frequency import describe_doubled_axes
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions
+from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_wild_samples, wild_limits
 from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment, separate_jump
 from recon.quality.defects import Defect, describe_clipped_positions, describe_held_signals
@@ -21,7 +22,7 @@ from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
 from scanner.recording import Recording
-from scanner.wording import percent
+from scanner.wording import counted, percent
 
 MAX_FRAME_EXCESS = 1e-3
 """Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""
@@ -164,6 +165,7 @@ def describe_intensity(intensity: Channel) -> list[str]:
     """Lines on the values of an intensity that are doubtful."""
     return [
         *describe_infinite(intensity),
+        *describe_wild_samples(intensity),
         *describe_negative_counts(intensity),
         *describe_polarity(intensity),
         *describe_logarithms(intensity),
@@ -179,6 +181,23 @@ def describe_infinite(intensity: Channel) -> list[str]:
         f"intensity: {percent(infinite.mean())} of the samples are infinite and left out: if they were too large for "
         "their type (float16 ends at 65504), bright places are too dark; store them in another type"
     ]
+
+
+def describe_wild_samples(intensity: Channel) -> list[str]:
+    """A line for each detector with single samples far from all others."""
+    values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
+    wild = find_wild_samples(values, wild_limits(values))
+    lines = []
+    for name, column, own in zip(_detector_names(intensity), values.reshape(len(values), -1).T, wild.T, strict=True):
+        if own.any():
+            number, share = counted(int(own.sum()), "single sample"), percent(float(own.mean()))
+            farthest = column[own][np.argmax(np.abs(column[own] - np.nanmedian(column)))]
+            lines.append(
+                f"{name}: {number} ({share}) far from all others, "
+                f"the farthest {farthest:.4g} {intensity.unit} (median {np.nanmedian(column):.4g}): electric pulses or "
+                "errors of a transfer, which make their pixels wrong; replace them by NaN"
+            )
+    return lines
 
 
 def describe_logarithms(intensity: Channel) -> list[str]:

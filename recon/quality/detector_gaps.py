@@ -7,6 +7,7 @@ import numpy as np
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
+from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, WildLimits, find_wild_samples, wild_limits
 from recon.sample_ranges import SampleRanges, runs_of_true, subtract_ranges
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -43,7 +44,8 @@ def find_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: 
     count = intensity.size // length
     if count < 2:
         return []
-    scatter = np.array([_scatter(intensity.read(k * length, (k + 1) * length)) for k in range(count)])
+    limits = wild_limits(intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES)))
+    scatter = np.array([_scatter(intensity.read(k * length, (k + 1) * length), limits) for k in range(count)])
     loud = np.nanpercentile(scatter, 75) if np.isfinite(scatter).any() else 0.0
     quiet = [(a * length, b * length) for a, b in runs_of_true(scatter < QUIET_SD_SHARE * loud)]
     if not quiet:
@@ -68,9 +70,10 @@ def describe_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocat
     ]
 
 
-def _scatter(values: Array) -> float:
-    """Largest standard deviation of a detector in a block; NaN without samples."""
-    known = values[np.isfinite(values).reshape(len(values), -1).all(axis=1)]
+def _scatter(values: Array, limits: WildLimits) -> float:
+    """Largest standard deviation of a detector in a block without its wild samples; NaN without samples."""
+    usable = np.isfinite(values).reshape(len(values), -1) & ~find_wild_samples(values, limits)
+    known = values[usable.all(axis=1)]
     return float(known.reshape(len(known), -1).std(axis=0).max()) if len(known) else np.nan
 
 

@@ -1,0 +1,60 @@
+"""Single samples far from all others are counted, and are neither saturation nor a detector that was off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.imaging.saturation import detector_rails
+from recon.imaging.wild_samples import find_wild_samples, wild_limits
+from recon.notes import describe_wild_samples
+from recon.pipeline import reconstruct
+from recon.reconstruction import Options
+from scanner.channel import Channel
+from tests.support.simulated import imaging
+
+RNG_SEED, WILD = 4, 60
+
+
+def spoiled(values: np.ndarray, level: float) -> np.ndarray:
+    out = values.copy()
+    out[np.random.default_rng(RNG_SEED).choice(values.size // 3, WILD, replace=False) * 3] = level
+    return out
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_wild_samples_are_counted_and_are_no_rail(sign: float) -> None:
+    light = np.random.default_rng(1).gamma(2.0, 1.0, 50_000)
+    channel = Channel("intensity", "V", 1e6, 0.0, spoiled(light, sign * 1e5), 0, light.size)
+    (note,) = describe_wild_samples(channel)
+    assert 0.9 * WILD < int(note.split()[1]) <= WILD  # few lie beside the brightest samples
+    assert "single samples (0.12%) far from all others" in note
+    assert detector_rails(channel) == [None]
+    assert describe_wild_samples(replace(channel, raw=light)) == []
+
+
+def test_a_bright_point_that_is_crossed_in_several_samples_is_not_wild() -> None:
+    light = np.random.default_rng(1).poisson(2.0, 50_000).astype(float)
+    for first in range(100, 50_000, 5_000):
+        light[first : first + 4] = (40.0, 300.0, 280.0, 30.0)
+    assert not find_wild_samples(light, wild_limits(light)).any()
+
+
+@pytest.mark.parametrize("mean", [0.002, 0.05, 1.0])
+def test_few_photons_are_not_wild(mean: float) -> None:
+    light = np.random.default_rng(1).poisson(mean, 200_000).astype(float)
+    assert not find_wild_samples(light, wild_limits(light)).any()
+
+
+def test_wild_samples_are_not_taken_for_a_detector_that_was_off() -> None:
+    """They fall in a third of the scan, so that the rest scatters much less."""
+    recording, _ = imaging()
+    light = recording["intensity"].read()
+    light[: light.size // 2] = spoiled(light[: light.size // 2], 1e3 * float(light.max()))
+    changed = recording.with_channel(replace(recording["intensity"], raw=light, gain=1.0, offset=0.0))
+    result = reconstruct(changed, Options(pixels=(100, 100)), quiet=True)
+    assert not any("off or covered" in limit for limit in result.limits)
+    (note,) = (note for note in result.notes if "single samples" in note)
+    assert 0.9 * WILD < int(note.split()[1]) <= WILD  # few lie beside the brightest places of the scene
