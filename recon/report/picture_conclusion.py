@@ -75,10 +75,12 @@ def _grade(within: float) -> str:
 def _is_readout_unchecked(summary: Mapping[str, Any]) -> bool:
     """Whether only the uncertainty of the readout's phase leaves a part of the scan outside the bound.
 
-    It is no evidence of a blur: the recording did not measure the phase of the readout that precisely.
+    It is no evidence of a blur: the recording did not measure the phase of the readout that precisely. A doubted clock
+    of the intensity is.
     """
     axes = [summary[axis] for axis in summary["axes"]]
-    if _is_truth_known(summary) or any(axis["readout_as_stated"] is None for axis in axes):
+    has_other_evidence = _is_truth_known(summary) or summary["clock_doubted"]
+    if has_other_evidence or any(axis["readout_as_stated"] is None for axis in axes):
         return False
     as_stated = min(axis["readout_as_stated"]["within_bound"] for axis in axes)
     return as_stated >= SHARP_FRACTION > min(axis["within_bound"] for axis in axes)

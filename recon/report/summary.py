@@ -104,9 +104,9 @@ def readout_as_stated_summary(result: Reconstruction, axis: str) -> dict[str, fl
     ``assumed_delay_us`` is the standard deviation of the delay that was assumed; None where the picture measured the
     phase. The result is None where no readout's phase was searched.
     """
-    sd = result.estimator_phase_sd.get(axis)
-    if sd is None:
+    if axis not in result.estimator_phase_sd:
         return None
+    sd = result.estimator_phase_sd[axis][result.motion.axes[axis].known]
     return {
         "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(sd**2)))),
         "within_bound": blur.within_bound(result.phase_bound(axis), sd=sd, noise_sd=angle_noise_phase(result, axis)),

@@ -9,7 +9,7 @@ from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstima
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.pipeline import reconstruct
 from recon.reconstruction import Options
-from recon.report.conclusions import conclude_reconstruction
+from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
