@@ -11,7 +11,7 @@ from typing import Any
 from recon.frame_axis import format_positions
 from recon.imaging.blur import SHARP_FRACTION
 from recon.report.numbers import format_degrees, format_interval, format_value
-from scanner.wording import counted
+from scanner.wording import counted, percent
 
 MIN_USABLE_FRACTION = 0.5
 """Fraction of the scan within the bound below which a picture is called blurred, and no estimator is recommended: most
@@ -53,7 +53,7 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     if not findings and content["verdict"] == "consistent":
         return (
             "The recordings agree with the nominal device within their noise and the tolerances of its values; "
-            "no correction is needed." + untested
+            f"no effect has to be added.{_describe_open_loop(content)}{untested}"
         )
     modes = "".join(
         f" The drive also excites further modes of {name} at "
@@ -69,8 +69,8 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         text = _describe_findings(findings)
     if blur_px is not None and findings and blur_px[0] > blur_px[1]:
         text += (
-            f" Predicted from the drive alone, the nominal motion is wrong by {blur_px[0]:.2g} px rms in a picture of "
-            f"400 pixels, the corrected one by {blur_px[1]:.1g} px."
+            f" Predicted from the drive alone, the nominal motion is wrong by {format_value(blur_px[0], 2)} px rms in "
+            "a picture of 400 pixels."
         )
     text += modes
     loops = content.get("open_loop", {}).values()
@@ -78,10 +78,23 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     if loops and not in_picture and all(loop["improved"] == loop["nominal"] for loop in loops):
         text += " device.toml is the nominal device: a corrected one predicts the held-out samples no better."
     elif findings or modes:
-        text += " Use the corrected device.toml in place of the nominal one."
+        text += f" Use the corrected device.toml in place of the nominal one.{_describe_open_loop(content)}"
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}."
     return text + untested
+
+
+def _describe_open_loop(content: Mapping[str, Any]) -> str:
+    """How well the corrected device predicts, beside the nominal one; empty if they are the same."""
+    errors = [
+        f"{percent(loop['improved']['fraction'])} of {channel} (nominal {percent(loop['nominal']['fraction'])})"
+        for channel, loop in content.get("open_loop", {}).items()
+        if loop["improved"] != loop["nominal"]
+    ]
+    if not errors:
+        return ""
+    listed = ", ".join(errors)
+    return f" From the drive alone, device.toml predicts samples that were not fitted with an error of {listed}."
 
 
 def _describe_findings(findings: Sequence[Mapping[str, Any]]) -> str:

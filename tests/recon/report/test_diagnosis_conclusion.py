@@ -17,12 +17,27 @@ def found(effect: str, probability: float, *rivals: tuple[str, float]) -> dict[s
     }  # fmt: skip
 
 
+def open_loop(rmse: float) -> dict[str, float]:
+    """The error of an open-loop prediction of a signal of 3 V, as in diagnosis.json."""
+    return {"rmse": rmse, "fraction": rmse / 3.0}
+
+
+@pytest.mark.parametrize("verdict", ["consistent", "mismatch"])
+def test_the_error_of_the_corrected_device_is_stated_beside_the_nominal_one(verdict: str) -> None:
+    findings = [found("cubic-stiffness", 0.98)] if verdict == "mismatch" else []
+    loops = {"sense_x": {"nominal": open_loop(0.9), "improved": open_loop(0.06)}}
+    text = conclude_diagnosis({"verdict": verdict, "findings": findings, "open_loop": loops}, (310.0, 0.7))
+    assert "an error of 2% of sense_x (nominal 30%)." in text
+    assert "0.7 px" not in text
+    assert "e+" not in text
+
+
 @pytest.mark.parametrize(
     ("improved", "channel", "text"), [(0.2, "sense", CORRECTED), (0.9, "sense", NOMINAL), (0.9, "intensity", CORRECTED)]
 )
 def test_a_device_that_is_not_corrected_is_not_recommended(improved: float, channel: str, text: str) -> None:
     finding = found("unknown", 1.0) | {"channel": channel}
-    loops = {"sense_x": {"nominal": {"rmse": 0.9}, "improved": {"rmse": improved}}}
+    loops = {"sense_x": {"nominal": open_loop(0.9), "improved": open_loop(improved)}}
     assert text in conclude_diagnosis({"verdict": "mismatch", "findings": [finding], "open_loop": loops})
 
 
