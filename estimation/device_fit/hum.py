@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.device_fit.initial import estimate_whiteners
-from estimation.device_fit.mains import (
-    HUM_HARMONICS,
-    HUM_RELATIVE_SD,
-    NOMINAL_MAINS,
-    STRONG_HUM_RELATIVE_SD,
-    Mains,
-    is_hum,
-)
+from estimation.device_fit.mains import HUM_HARMONICS, NOMINAL_MAINS, Mains, is_hum
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener
 from estimation.least_squares import regress
@@ -41,9 +33,8 @@ FREQUENCY_STEP = 0.01
 def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none.
 
-    Where there is hum, the evidence also chooses between weak and strong, few and many harmonics, and between the
-    nominal and the fitted frequency. Hum before a clip level is not linear: there fits choose between the nominal
-    frequencies and none.
+    Where there is hum, the evidence also chooses between few and many harmonics, and between the nominal and the fitted
+    frequency. Hum before a clip level is not linear: there fits choose between the nominal frequencies and none.
     """
     columns = {mains: _hum_columns(likelihood, fit, mains) for mains in NOMINAL_MAINS}
     if not any(each.size for each in columns.values()):
@@ -82,16 +73,13 @@ def _with_mains(model: Model, *mains: Mains) -> Model:
 
 
 def _refined_mains(likelihood: Likelihood, fit: Fit, beside: _BesideHum, nominal: Mains) -> list[tuple[float, Mains]]:
-    """Weak and strong hum with few and with many harmonics, at the nominal and at the fitted frequency, with -2 log
-    evidence of each.
+    """Hum with few and with many harmonics, at the nominal and at the fitted frequency, with -2 log evidence of each.
 
     All but the frequency is linear around the fit.
     """
     refined = []
-    for harmonics, relative_sd in product(
-        (HUM_HARMONICS, STRONG_HUM_HARMONICS), (HUM_RELATIVE_SD, STRONG_HUM_RELATIVE_SD)
-    ):
-        stated = Mains(nominal.frequency, harmonics, relative_sd=relative_sd)
+    for harmonics in (HUM_HARMONICS, STRONG_HUM_HARMONICS):
+        stated = Mains(nominal.frequency, harmonics)
         refined += [
             (beside.evaluate(_hum_columns(likelihood, fit, stated))[0], stated),
             _with_fitted_frequency(likelihood, fit, beside, stated),

@@ -13,11 +13,7 @@ HUM_HARMONICS = 3
 """Number of harmonics of weak hum, the n-th with a prior of 1/n, as rectifiers cause them."""
 
 HUM_RELATIVE_SD = 0.5
-"""Prior standard deviation of the two quadratures of weak hum in standard deviations of the noise: weaker than it."""
-
-STRONG_HUM_RELATIVE_SD = 2.0
-"""The same of strong hum, which is visible in every sample. With the prior of weak hum alone, a second description of
-one harmonic as ``interference`` gained as much as that prior counted against its amplitude."""
+"""Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
 
 
 class Mains(NamedTuple):
@@ -27,18 +23,16 @@ class Mains(NamedTuple):
         frequency: [Hz].
         harmonics: number of harmonics.
         cost: -2 log of posterior over prior density of a frequency that was fitted; 0 for a nominal one.
-        relative_sd: prior standard deviation of its quadratures, in standard deviations of the noise.
     """
 
     frequency: float
     harmonics: int = HUM_HARMONICS
     cost: float = 0.0
-    relative_sd: float = HUM_RELATIVE_SD
 
 
 NOMINAL_MAINS = (Mains(50.0), Mains(60.0))
-"""Mains at their nominal frequencies. Their harmonics are part of the noise model, not an effect, up to a few standard
-deviations of the noise. A stronger tone is interference."""
+"""Mains at their nominal frequencies. Their harmonics below the noise's standard deviation are part of the noise model,
+not an effect. A stronger tone is interference."""
 
 
 @lru_cache(maxsize=16)
