@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimation.signals import robust_sd
 from scanner.arrays import Array, Index
 
 MIN_SPIKE_SDS = 8.0
@@ -28,9 +29,8 @@ def find_spikes(values: Array) -> Index:
     if values.size <= 4 * REACH:
         return np.zeros(0, np.int64)
     distance = values - _cubic(values)
-    inner = np.abs(distance[REACH:-REACH])
-    scale = float(np.nanmedian(inner)) / 0.6745 if np.isfinite(inner).any() else 0.0
-    limit = MIN_SPIKE_SDS * scale
+    inner = distance[REACH:-REACH]
+    limit = MIN_SPIKE_SDS * robust_sd(inner) if np.isfinite(inner).any() else 0.0
     if not limit > 0.0:
         return np.zeros(0, np.int64)
     found = 2 * REACH + np.flatnonzero(np.abs(distance[2 * REACH : -2 * REACH]) > limit)

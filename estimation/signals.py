@@ -22,6 +22,9 @@ from scanner.errors import BadInput, ChannelMissing, DeviceInvalid
 from scanner.recording import Recording
 from scanner.stages import Acceleration, MotionSensor, Readout, Velocity
 
+NORMAL_MEDIAN_DEVIATION = 0.6745
+"""Median absolute deviation of a normal distribution over its standard deviation."""
+
 WHITE_NOISE_DIFFERENCE_ORDER = 6
 """Order of the differences by which a sensor's noise is measured: sixth differences suppress an oversampled motion
 completely, and of white noise they have sqrt(924) times the standard deviation."""
@@ -97,7 +100,12 @@ def _reference_sensor(recording: Recording, axis: str) -> SenseChannel | None:
 def white_noise_sd(values: Array) -> float:
     """Standard deviation of the white noise of an oversampled signal, from its sixth differences, in its unit."""
     differences = np.diff(values[np.isfinite(values)], n=WHITE_NOISE_DIFFERENCE_ORDER)
-    return float(np.median(np.abs(differences)) / 0.6745 / np.sqrt(924.0)) if differences.size else 0.0
+    return robust_sd(differences) / np.sqrt(924.0) if differences.size else 0.0
+
+
+def robust_sd(deviations: Array) -> float:
+    """Standard deviation of normal deviations from 0, by the median of their absolute values; NaN are left out."""
+    return float(np.nanmedian(np.abs(deviations))) / NORMAL_MEDIAN_DEVIATION
 
 
 def drive_channel(recording: Recording, axis: str, gaps_ok: bool = False) -> Channel | None:

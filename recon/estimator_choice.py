@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from estimation.estimate import default_estimator, estimate
+from estimation.signals import robust_sd
 from recon.imaging.blur import SHARP_FRACTION, within_bound
 from recon.imaging.picture import Grid, grid_of_scan
 from recon.preparation import PreparedRecording
@@ -14,9 +15,6 @@ from recon.reconstruction import Options
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.motion import Motion
-
-MAD_TO_SD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 COMPARED_SAMPLES = 1 << 18
 """Samples from the start of the scan in which two motions are compared: 50 ms at 5 MS/s."""
@@ -73,6 +71,6 @@ def model_error_px(sensed: Motion, tracked: Motion, grid: Grid) -> Mapping[str, 
     for axis, pixel in zip(AXES, grid.pixel_angle, strict=True):
         angles = (motion.axes[axis].angle.read(0, COMPARED_SAMPLES) for motion in (sensed, tracked))
         difference = np.subtract(*angles)
-        variance = (MAD_TO_SD * np.nanmedian(np.abs(difference))) ** 2 - sensed.axes[axis].angle_noise_sd ** 2
+        variance = robust_sd(difference) ** 2 - sensed.axes[axis].angle_noise_sd ** 2
         errors[axis] = float(np.sqrt(max(variance, 0.0))) / pixel
     return errors

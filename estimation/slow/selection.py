@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.device_fit.open_loop import OpenLoop
+from estimation.signals import robust_sd
 from estimation.slow.decay import LAWS, Decay, Law, log_amplitude
 from scanner.arrays import Array
 from scanner.errors import BadInput
@@ -144,7 +145,7 @@ def _white_noise(y: Array) -> Array:
     """Standard deviation of the white noise of a smooth curve at every sample, from second differences."""
     differences = np.diff(y, n=2)
     parts = np.array_split(np.arange(differences.size), 4)
-    sds = [float(np.median(np.abs(differences[part]))) / 0.6745 / np.sqrt(6.0) for part in parts]
+    sds = [robust_sd(differences[part]) / np.sqrt(6.0) for part in parts]
     middles = [part.mean() + 1.0 for part in parts]
     return np.maximum(np.interp(np.arange(y.size), middles, sds), 1e-6)
 

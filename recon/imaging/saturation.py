@@ -32,8 +32,10 @@ def detector_rails(intensity: Channel) -> list[tuple[float, int] | None]:
     values = intensity.read(0, count)
     usable = np.isfinite(values).reshape(count, -1) & ~find_wild_samples(values, wild_limits(values))
     finite = [column[use] for column, use in zip(values.reshape(count, -1).T, usable.T, strict=True)]
-    find_rail = upper_rail_of_counts if intensity.unit in COUNT_UNITS else upper_rail
-    return [upper_rail(each) or find_rail(each) if each.size else None for each in finite]
+    rails = [upper_rail(each) if each.size else None for each in finite]
+    if intensity.unit not in COUNT_UNITS:
+        return rails
+    return [rail or upper_rail_of_counts(each) for rail, each in zip(rails, finite, strict=True)]
 
 
 def sd_without_saturated(

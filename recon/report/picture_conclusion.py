@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from recon.imaging.blur import SHARP_FRACTION
+from recon.imaging.scan_phase.readout_phase import REPORTED_SDS
 from recon.report.conclusions import MIN_USABLE_FRACTION, condition_on_clock
 from recon.report.numbers import format_degrees, format_uncertain
-
-MIN_READOUT_ERROR_SD = 3.0
-"""Phase error of the readout in standard deviations from which it is stated: chance exceeds it in 0.3 % of readouts."""
 
 SIGNALS_BY_ESTIMATOR = {"sensor": "position signal is", "edges": "list of sync edges is"}
 """The signal that an estimator takes the phase from, where it is not the sense signal."""
@@ -184,7 +182,7 @@ def _describe_readout_phase(summary: Mapping[str, Any]) -> str:
     late: dict[str, list[str]] = {}
     for axis in summary["axes"]:
         error = summary[axis].get("readout_phase_deg")
-        if error is not None and abs(error["value"]) > MIN_READOUT_ERROR_SD * error["sd"]:
+        if error is not None and abs(error["value"]) > REPORTED_SDS * error["sd"]:
             word = "late" if error["value"] > 0.0 else "early"
             said = f"{format_uncertain(abs(error['value']), error['sd'], '°')} {word} in {axis}"
             late.setdefault(_signal_of_axis(summary, axis), []).append(said)
