@@ -13,7 +13,7 @@ from recon.imaging.picture import Grid
 from recon.imaging.sample_motion.correction import describe_sample_motion
 from recon.io.output import pixel_size
 from recon.reconstruction import Reconstruction
-from recon.report.conclusions import describe_slices, describe_stack
+from recon.report.conclusions import describe_stack
 from recon.report.figures import (
     blur_figure,
     contrast_limits,
@@ -158,10 +158,13 @@ def axis_table(summary: Mapping[str, Any]) -> Table:
     if all("phase_rmse_deg" in summary[a] for a in AXES):
         rows.append(["true phase error, rms [°]", *(f"{summary[a]['phase_rmse_deg']:.2g}" for a in AXES)])
     measured = (_format_picture_phase(summary[a]["picture_phase_error_deg"]) for a in AXES)
+    contradictory = any(summary[a]["picture_phase_error_deg"]["scatter"] for a in AXES)
+    scatter = (f"{summary[a]['picture_phase_error_deg']['scatter']:.2g}" for a in AXES)
     rows += [
         ["bound p/m [°]", *(f"{summary[a]['bound_deg']:.3f}" for a in AXES)],
         ["scan within the bound", *(f"{summary[a]['within_bound']:.1%}" for a in AXES)],
         ["phase error measured in the picture", *measured],
+        *([["the same, difference between slices of the scan (1 sd) [°]", *scatter]] if contradictory else []),
         ["drift of the phase over the scan [°]", *(f"{summary[a]['phase_drift_deg']:.3g}" for a in AXES)],
         _amplitude_row(summary),
         [
@@ -246,4 +249,4 @@ def _phase_text(result: Reconstruction) -> str:
 def _format_picture_phase(value: Mapping[str, Any]) -> str:
     if value["value"] is None or value["sd"] is None:
         return "not determined"
-    return format_uncertain(value["value"], value["sd"], "°") + describe_slices(value)
+    return format_uncertain(value["value"], value["sd"], "°")
