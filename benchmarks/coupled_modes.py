@@ -20,7 +20,7 @@ from benchmarks.blind.generator import Case, generate_recording, write
 from benchmarks.blind.imaging_score import score_motion
 from benchmarks.blind.noise import KINDS
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.recording import Recording
 
 

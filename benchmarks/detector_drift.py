@@ -20,7 +20,7 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector
 from recon.imaging.intensity_drift import DriftKind
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.recording import Recording

@@ -17,7 +17,7 @@ import numpy as np
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.lidar import add_ranges, measure_wall
 from recon.point_cloud import make_point_cloud
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner import devices
 from scanner.arrays import Array
 from scanner.geometry import Geometry, locate_points, trace_rays

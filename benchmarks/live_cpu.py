@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
-from recon.live_frames import (
+from recon.live.live_frames import (
     FrameSums,
     LiveScan,
     add_part,
@@ -26,7 +26,7 @@ from recon.live_frames import (
     replace_display_and_sd,
     replace_picture,
 )
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.recording import Recording
 
 

@@ -19,7 +19,7 @@ from recon.evaluation import truth_from_simulation
 from recon.imaging import blur
 from recon.imaging.gridding import accumulate_samples, mean_picture
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.device import Device
 from scanner.recording import Recording

@@ -25,8 +25,8 @@ from recon.evaluation import truth_from_simulation
 from recon.imaging.blur import compare_with_scene
 from recon.imaging.gridding import map_samples
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from scanner.arrays import Array
 from scanner.recording import Recording
 

@@ -28,8 +28,8 @@ from phantoms.optics import Detector, blur_by_spot, detect, sample_scene
 from phantoms.targets import TISSUES, make_target
 from recon.imaging.gridding import map_samples
 from recon.pipeline import correct_sample_motion, estimate_motion, reconstruct
-from recon.preparation import prepare
-from recon.reconstruction import Options, Reconstruction
+from recon.steps.preparation import prepare
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.arrays import Array
 from scanner.recording import Recording
 

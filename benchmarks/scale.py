@@ -32,7 +32,7 @@ from estimation.tracker import track
 from phantoms.experiment import Experiment, simulate_experiment
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.device import Device
 from scanner.recording import Recording
 from scanner.stages import Amdm
@@ -217,7 +217,7 @@ def measure_live(folder: Path) -> Results:
     The latency is counted from the writer's flush of a frame's last sample until its image.tif is in place.
     ``cpu_per_frame`` is the processor time of the follower over the number of frames.
     """
-    from recon.follow import follow_recording
+    from recon.live.follow import follow_recording
 
     period_path, results = write_period(simulate_period(), folder), Results()
     with Recording.open(period_path) as period:

@@ -22,7 +22,7 @@ from benchmarks.sample_motion import PIXELS, REST_DURATION_S, SCENES, Scan, load
 from estimation.optics.correction import correct_intensity
 from phantoms.optics import Detector, detect, sample_scene
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.device import Device
 from scanner.recording import Recording
 

@@ -14,11 +14,11 @@ import lissajous
 from recon.evaluation import load_truth
 from recon.io.output import finite, replacing_folder
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.comparison import comparison_report, upright_picture
 from recon.report.figures import data_uri, save_picture
 from recon.report.page import Figure, Section
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from scanner.recording import Recording
 
 SPIRAL = Path(__file__).parent.parent.parent / "shared" / "data" / "afm_spiral"

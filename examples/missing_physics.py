@@ -24,9 +24,9 @@ from phantoms.forward import Plan, simulate
 from recon.evaluation import truth_from_simulation
 from recon.imaging.picture import Picture
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import fill_small_holes, new_figure, normalise_intensity
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.recording import Recording
 

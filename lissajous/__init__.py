@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     )
     from lissajous.planning import ScanDesign, blur_study, design
     from lissajous.simulation import Simulation, simulate
-    from recon.frames import ScanFrames, frames
     from recon.imaging.blur import compare_with_scene, phase_bound
     from recon.imaging.gridding import map_samples
     from recon.imaging.picture import Grid, Picture
     from recon.io.readers import register as register_readers
+    from recon.sequences.frames import ScanFrames, frames
     from scanner.device import Device
     from scanner.errors import BadInput
     from scanner.motion import Motion
@@ -77,12 +77,12 @@ _DEFINED_ELSEWHERE = {
     "Picture": ("recon.imaging.picture", "Picture"),
     "Recording": ("scanner.recording", "Recording"),
     "ScanDesign": ("lissajous.planning", "ScanDesign"),
-    "ScanFrames": ("recon.frames", "ScanFrames"),
+    "ScanFrames": ("recon.sequences.frames", "ScanFrames"),
     "blur_study": ("lissajous.planning", "blur_study"),
     "catalogue": ("scanner.terms", "catalogue"),
     "compare_with_scene": ("recon.imaging.blur", "compare_with_scene"),
     "design": ("lissajous.planning", "design"),
-    "frames": ("recon.frames", "frames"),
+    "frames": ("recon.sequences.frames", "frames"),
     "map_samples": ("recon.imaging.gridding", "map_samples"),
     "phase_bound": ("recon.imaging.blur", "phase_bound"),
     "register_effects": ("scanner.terms", "register"),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from estimation.identification.calibrate import Identification
     from recon.imaging.intensity_drift import DriftKind
     from recon.imaging.picture_kinds.picture_estimate import PictureKind
-    from recon.reconstruction import Reconstruction
+    from recon.steps.reconstruction import Reconstruction
     from scanner.motion import Motion
 
 RecordingSource = Recording | str | Path
@@ -150,7 +150,7 @@ def reconstruct(
     from recon.evaluation import load_truth, truth_from_simulation
     from recon.imaging.intensity_drift import DriftKind
     from recon.pipeline import reconstruct as reconstruct_recording
-    from recon.reconstruction import Options
+    from recon.steps.reconstruction import Options
 
     if not (
         isinstance(pixels, Sequence) and len(pixels) == 2 and all(isinstance(n, Integral) and n > 0 for n in pixels)
@@ -207,7 +207,7 @@ def diagnose(
     """
     from estimation.complete_diagnosis import diagnose_with_optics
     from recon.reference_phase import measure_reference_phase
-    from recon.sign_after_rest import follow_signs
+    from recon.steps.sign_after_rest import follow_signs
 
     opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
     nominal = _stated_device(opened[0]) if device is None else load_device(device)

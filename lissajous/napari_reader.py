@@ -11,7 +11,7 @@ import numpy as np
 from lissajous.napari_live import Layer, read_folder
 
 if TYPE_CHECKING:
-    from recon.reconstruction import Reconstruction
+    from recon.steps.reconstruction import Reconstruction
 
 MAX_PATH_POINTS = 20_000
 """Points of the beam's path that are shown: more cover the picture."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from recon.film_checks import check_repeated_lines, describe_columns, describe_saturation
+from recon.imaging.raster.film_checks import check_repeated_lines, describe_columns, describe_saturation
 from recon.imaging.raster.film_equations import PooledEquations
 from recon.imaging.raster.film_phase import FilmModel, fit_film, frame_phase, share_equations, with_reference
 from recon.imaging.raster.line_phase import BLOCKS_ACROSS, MAX_SHIFT_SD_PX

@@ -15,10 +15,7 @@ from tqdm import tqdm
 
 from estimation.amplitude_calibration import motion_calibration_sd
 from estimation.estimate import estimate
-from recon.estimated_motion import EstimatedMotion
-from recon.estimator_choice import choose_estimator
 from recon.evaluation import Truth, evaluate_axis
-from recon.field_check import check_field, check_units, own_half_angle
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
 from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.picture_kinds.picture_estimate import estimate_picture
@@ -26,17 +23,6 @@ from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.sample_motion.correction import describe_sample_motion, measure_sample_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.imaging.scan_phase.image_phase import refine_motion
-from recon.notes import (
-    describe_clock_jumps,
-    describe_coarse_sampling,
-    describe_intensity,
-    describe_limits,
-    describe_long_frames,
-    describe_motion,
-    describe_unlocated,
-)
-from recon.phase_and_drift import correct_phase_and_drift
-from recon.preparation import PreparedRecording, prepare, prepare_segment
 from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
@@ -45,10 +31,24 @@ from recon.quality.overflow import describe_overflows
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
 from recon.quality.structure import describe_unstructured
-from recon.reconstruction import Options, Reconstruction
-from recon.registration_segments import registration_segments
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
-from recon.sign_after_rest import follow_signs
+from recon.steps.estimated_motion import EstimatedMotion
+from recon.steps.estimator_choice import choose_estimator
+from recon.steps.field_check import check_field, check_units, own_half_angle
+from recon.steps.notes import (
+    describe_clock_jumps,
+    describe_coarse_sampling,
+    describe_intensity,
+    describe_limits,
+    describe_long_frames,
+    describe_motion,
+    describe_unlocated,
+)
+from recon.steps.phase_and_drift import correct_phase_and_drift
+from recon.steps.preparation import PreparedRecording, prepare, prepare_segment
+from recon.steps.reconstruction import Options, Reconstruction
+from recon.steps.registration_segments import registration_segments
+from recon.steps.sign_after_rest import follow_signs
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion

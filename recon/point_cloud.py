@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.rail import upper_rail
-from recon.estimated_motion import EstimatedMotion
-from recon.phase_and_drift import correct_readout_phase
 from recon.pipeline import estimate_motion
-from recon.preparation import prepare
 from recon.quality.defects import unlocated_samples
 from recon.quality.sensor_noise import check_sensor_noise
-from recon.reconstruction import Options
+from recon.steps.estimated_motion import EstimatedMotion
+from recon.steps.phase_and_drift import correct_readout_phase
+from recon.steps.preparation import prepare
+from recon.steps.reconstruction import Options
 from scanner.arrays import Array
 from scanner.channel import Channel, check_signal
 from scanner.device import AXES

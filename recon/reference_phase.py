@@ -6,10 +6,10 @@ import numpy as np
 
 from estimation.optics.readout_effects import ReferencePhase
 from recon.imaging.scan_phase.readout_phase import measured_phase_error
-from recon.phase_and_drift import correct_readout_phase
 from recon.pipeline import estimate_motion
-from recon.preparation import prepare
-from recon.reconstruction import Options
+from recon.steps.phase_and_drift import correct_readout_phase
+from recon.steps.preparation import prepare
+from recon.steps.reconstruction import Options
 from scanner.device import AXES, Device
 from scanner.recording import Recording
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
-from recon.interrupts import StopRequest, handle_interrupts
+from recon.runtime.interrupts import StopRequest, handle_interrupts
 
 COMMANDS = {
     "reconstruct": "track the motion of a recording and map its intensities to a picture",
@@ -147,7 +147,7 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequ
 
             register_readers(args.readers)
         if announce:
-            from recon.compilation import announce_compilation
+            from recon.runtime.compilation import announce_compilation
 
             announce_compilation()
         summary = module.run(args)

@@ -35,7 +35,7 @@ def diagnose_each(
         output: folder of the folders. What an earlier run has completed there is kept.
         device: nominal device of all; None takes that of each recording.
         mapping: of all of them, see :func:`recon.io.convert.open_any`.
-        scheduler, workers: see :func:`recon.executors.open_executor`; a cluster reads and writes the same paths.
+        scheduler, workers: see :func:`recon.runtime.executors.open_executor`; a cluster needs the same paths.
         overwrite: do everything anew.
 
     Returns:
@@ -45,9 +45,9 @@ def diagnose_each(
         BadInput: there is no recording, ``output`` holds results of other options, or no scheduler answers.
         InterruptedError: by the user. The folders of finished recordings remain.
     """
-    from recon.fleet import find_recordings, plan_fleet, run_fleet
     from recon.io.output import finite, replacing_folder, write_json
     from recon.report.fleet import fleet_report
+    from recon.runtime.fleet import find_recordings, plan_fleet, run_fleet
     from scanner import devices
 
     started, paths = time.perf_counter(), find_recordings(places)

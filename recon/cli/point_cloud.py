@@ -25,9 +25,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.io.output import check_folder, finite, replacing_folder, write_json
     from recon.io.point_files import require_format, write_points
     from recon.point_cloud import make_point_cloud
-    from recon.reconstruction import Options
     from recon.report.conclusions import conclude_point_cloud
     from recon.report.point_cloud import point_cloud_report
+    from recon.steps.reconstruction import Options
 
     check_folder(args.output)
     require_format(args.format)

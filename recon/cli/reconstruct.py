@@ -11,7 +11,7 @@ from recon.cli.argument_types import parse_count, parse_positive, parse_size, pa
 from scanner.wording import counted
 
 if TYPE_CHECKING:
-    from recon.reconstruction import Options
+    from recon.steps.reconstruction import Options
 
 
 BY_POSITION = 0
@@ -125,7 +125,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    from recon.reconstruction import Options
+    from recon.steps.reconstruction import Options
     from scanner.errors import BadInput
     from scanner.extras import import_extra
 
@@ -171,7 +171,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         if args.follow and getattr(args, option[2:].replace("-", "_")):
             raise BadInput("needs a whole recording", channel=option, hint="leave out --follow")
     if args.follow:
-        from recon.follow import follow_recording
+        from recon.live.follow import follow_recording
 
         times = {"frame_time": args.frame_time, "quiet_time": args.quiet_time}
         live = follow_recording(args.recordings[0], args.output, options, args.mapping, **times).summary()
@@ -217,17 +217,17 @@ def reconstruct_file(
     import numpy as np
 
     from recon.evaluation import load_truth
-    from recon.frames import write_scan_frames
     from recon.imaging.picture import fill_holes
     from recon.io.convert import open_any
     from recon.io.output import finite, replacing_folder, write_json, write_motion, write_sample_motion, write_tiff
-    from recon.notes import describe_live_frames
     from recon.pipeline import reconstruct
     from recon.report.figures import save_picture
     from recon.report.picture_conclusion import conclude_reconstruction
     from recon.report.reconstruction import reconstruction_report
     from recon.report.summary import summarise
-    from recon.z_slices import find_z_slices
+    from recon.sequences.frames import write_scan_frames
+    from recon.steps.notes import describe_live_frames
+    from recon.steps.z_slices import find_z_slices
 
     growing = live is not None
     with open_any(path, mapping, growing) as recording, replacing_folder(output, options.device, path) as folder:

@@ -16,7 +16,7 @@ from recon.cli.reconstruct import reconstruct_file
 from scanner.wording import counted
 
 if TYPE_CHECKING:
-    from recon.reconstruction import Options
+    from recon.steps.reconstruction import Options
 
 TABLE_KEYS = ("estimator", "samples", "fill", "phase_sd_deg", "within_bound", "sign", "trouble", "notes", "seconds")
 """Keys of one recording's summary that the summary of all repeats."""
@@ -49,7 +49,7 @@ def reconstruct_files(
         output: folder of the folders. What an earlier run has completed there is kept.
         options: of every reconstruction.
         mapping: of all of them, see :func:`recon.io.convert.open_any`.
-        scheduler, workers: see :func:`recon.executors.open_executor`; a cluster reads and writes the same paths.
+        scheduler, workers: see :func:`recon.runtime.executors.open_executor`; a cluster needs the same paths.
         overwrite: do everything anew.
         stack: write the pictures as one stack too, unless a recording fails; None for no stack.
 
@@ -63,10 +63,10 @@ def reconstruct_files(
     """
     from dataclasses import replace
 
-    from recon.fleet import find_recordings, plan_fleet, run_fleet
     from recon.io.output import finite, replacing_folder, write_json
-    from recon.recording_stack import read_planes, write_recording_stack
     from recon.report.many import reconstructions_report
+    from recon.runtime.fleet import find_recordings, plan_fleet, run_fleet
+    from recon.sequences.recording_stack import read_planes, write_recording_stack
 
     started, paths = time.perf_counter(), find_recordings(paths)
     alone = options if options.wants_frames else replace(options, zarr=False, movie=None)  # a stack's own options

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.frame_axis import FrameAxis
+from recon.imaging.frame_axis import FrameAxis
 from recon.imaging.picture import Picture
 from recon.io.output import pixel_size
 from scanner.extras import import_extra

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.frame_axis import FrameAxis
+from recon.imaging.frame_axis import FrameAxis
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from scanner.channel import Channel

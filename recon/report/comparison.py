@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from recon.imaging.picture import Picture
-from recon.reconstruction import Reconstruction
 from recon.report.figures import (
     contrast_limits,
     data_uri,
@@ -28,6 +27,7 @@ from recon.report.reconstruction import (
     scale_bar,
 )
 from recon.report.summary import is_mirrored
+from recon.steps.reconstruction import Reconstruction
 from scanner.device import AXES
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from recon.frame_axis import format_positions
 from recon.imaging.blur import SHARP_FRACTION
+from recon.imaging.frame_axis import format_positions
 from recon.report.numbers import format_degrees, format_interval, format_value
 from scanner.wording import counted, percent
 

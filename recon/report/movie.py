@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.frame_axis import FrameAxis, format_positions
+from recon.imaging.frame_axis import FrameAxis, format_positions
 from recon.imaging.picture import Picture
 from recon.report.figures import to_rgb
 from recon.report.reconstruction import scale_bar

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.quality.defects import unrecoverable_intervals
-from recon.reconstruction import Reconstruction
-from recon.registration_segments import MAX_REGISTERED_PERIODS
 from recon.report.figures import contrast_limits
 from recon.sample_ranges import to_sample_ranges
+from recon.steps.reconstruction import Reconstruction
+from recon.steps.registration_segments import MAX_REGISTERED_PERIODS
 from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.lock_in import block_length, block_phasors

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from recon.imaging.picture import Grid
 from recon.imaging.sample_motion.correction import describe_sample_motion
 from recon.io.output import pixel_size
-from recon.reconstruction import Reconstruction
 from recon.report.conclusions import describe_stack
 from recon.report.figures import (
     blur_figure,
@@ -31,6 +30,7 @@ from recon.report.numbers import format_uncertain
 from recon.report.page import Figure, Section, Table, render
 from recon.report.phase_slider import phase_slider_data
 from recon.report.picture_conclusion import conclude_reconstruction
+from recon.steps.reconstruction import Reconstruction
 from scanner.device import AXES
 
 

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from recon.evaluation import AxisEvaluation
-from recon.frame_axis import position_axis
 from recon.imaging import blur
 from recon.imaging.coverage import fill_against_time
+from recon.imaging.frame_axis import position_axis
 from recon.imaging.picture import fill_factor
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.imaging.scan_phase.readout_phase import UNDESCRIBED_DELAY_SD_S, common_delay
-from recon.reconstruction import Reconstruction
-from recon.z_rests import cut_to_intensity, read_blocks
-from recon.z_slices import ZSlices
+from recon.steps.reconstruction import Reconstruction
+from recon.steps.z_rests import cut_to_intensity, read_blocks
+from recon.steps.z_slices import ZSlices
 from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.errors import BadInput

@@ -16,8 +16,8 @@ from phantoms.waveforms import Sine, Waveform
 from recon.evaluation import truth_from_simulation
 from recon.io.output import finite
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
 from recon.report.summary import axis_summary, summarise
+from recon.steps.reconstruction import Options, Reconstruction
 from recon.study.plan import Job, Scenario, StudyDesign
 from scanner.device import AXES, Device
 from scanner.recording import Recording

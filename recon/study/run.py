@@ -20,9 +20,9 @@ from typing import IO, Any
 
 from tqdm import tqdm
 
-from recon.executors import open_executor, picklable_task
 from recon.io.output import check_folder, finite, replacing_folder, write_json
 from recon.report.conclusions import conclude_study
+from recon.runtime.executors import open_executor, picklable_task
 from recon.study.job import check_scenarios, run_job
 from recon.study.plan import Job, cell_key, plan_jobs, read_study, remaining_jobs
 from recon.study.table import estimator_statistics, require_parquet, table_columns, table_rows, write_csv, write_parquet

@@ -14,7 +14,7 @@ from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.channel import make_channel
 from scanner.errors import BadInput
 from scanner.recording import Recording

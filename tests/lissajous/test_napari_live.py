@@ -13,10 +13,10 @@ import lissajous
 from lissajous import napari_live
 from lissajous.napari_live import FOLLOWED_KEY, read_folder, show_picture, watch_pictures
 from lissajous.napari_reader import get_reader
-from recon.follow import follow_recording
 from recon.imaging.picture import Grid
 from recon.io.output import write_tiff
-from recon.reconstruction import Options
+from recon.live.follow import follow_recording
+from recon.steps.reconstruction import Options
 from scanner.files import replacing
 from tests.support.simulated import imaging
 

@@ -13,7 +13,7 @@ import lissajous
 from benchmarks.blind.generator import BlindRecording, Case, generate_recording, write
 from estimation.estimate import estimate
 from estimation.optics.selection import diagnose_optics
-from recon.sign_after_rest import find_rests, follow_signs
+from recon.steps.sign_after_rest import find_rests, follow_signs
 from scanner.recording import Recording
 
 MODE = {"x": {"mode-coupling": {"g": 0.2786, "f2": 6934.417, "Q2": 113.4, "s": 0.00106}}}

@@ -10,13 +10,13 @@ import tifffile
 
 import lissajous
 from recon.cli import main
-from recon.frame_axis import format_positions, position_axis
-from recon.frames import write_scan_frames
+from recon.imaging.frame_axis import format_positions, position_axis
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
-from recon.z_rests import rest_ranges
-from recon.z_slices import ZSlices, find_z_slices
+from recon.sequences.frames import write_scan_frames
+from recon.steps.reconstruction import Options, Reconstruction
+from recon.steps.z_rests import rest_ranges
+from recon.steps.z_slices import ZSlices, find_z_slices
 from scanner.channel import Channel, make_channel
 from scanner.errors import BadInput
 from tests.support.simulated import imaging
@@ -206,7 +206,7 @@ def test_posterior_slices_use_no_other_slice(result: Reconstruction) -> None:
     own = list(lissajous.frames(posterior).estimates())
     last = find_z_slices(posterior.position_z, posterior.intensity)
     alone = ZSlices(last.positions[2:], last.spans[2:], last.samples[2:], lambda a, b: last.labels(a, b) - 2)
-    from recon.frames import ScanFrames
+    from recon.sequences.frames import ScanFrames
 
     frames = ScanFrames(posterior, position_axis(alone.positions), alone.spans, [], True, alone)
     (single,) = frames.estimates()

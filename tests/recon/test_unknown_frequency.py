@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.reconstruction import reconstruction_report
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from scanner.device import Device
 from scanner.recording import Recording
 

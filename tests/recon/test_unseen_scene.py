@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.frames import frames
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
+from recon.sequences.frames import frames
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.arrays import Array
 from scanner.recording import Recording
 from tests.support.simulated import imaging

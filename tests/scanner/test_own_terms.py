@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from recon.cli import COMMANDS, add_command, main
-from recon.executors import open_executor, picklable_task
+from recon.runtime.executors import open_executor, picklable_task
 from recon.study.plan import plan_jobs, read_study
 from scanner import devices, terms
 from tests.support.user_term import USER_TERM

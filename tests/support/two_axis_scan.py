@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 import lissajous
-from recon.reconstruction import Reconstruction
+from recon.steps.reconstruction import Reconstruction
 from scanner.device import Device
 from scanner.recording import Recording
 

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.interrupts import handle_interrupts
 from recon.io.output import replacing_folder
+from recon.runtime.interrupts import handle_interrupts
 from scanner import devices
 from scanner.files import replacing
 from scanner.recording import Recording
@@ -193,7 +193,7 @@ def test_a_stop_after_the_work_is_no_interruption(
 
 
 def test_a_suppressed_interrupt_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recon.interrupts.REPEAT_INTERVAL_S", 0.05)
+    monkeypatch.setattr("recon.runtime.interrupts.REPEAT_INTERVAL_S", 0.05)
     before = signal.getsignal(signal.SIGINT)
     with handle_interrupts() as stop:
         assert not stop.came

@@ -14,8 +14,8 @@ from estimation.diagnosis.screening import all_candidates
 from phantoms.experiment import Experiment, simulate_experiment
 from recon.evaluation import truth_from_simulation
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from scanner import devices
 from scanner.terms import catalogue
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from recon.executors import open_executor
-from recon.interrupts import handle_interrupts
+from recon.runtime.executors import open_executor
+from recon.runtime.interrupts import handle_interrupts
 from scanner.files import lock_file
 from scanner.hdf5 import check_ends
 

@@ -166,7 +166,7 @@ def test_a_controlled_amplitude_is_constant_and_one_of_zero_is_refused() -> None
 )
 def test_ranges_that_are_no_distances_are_noted(change, words: str | None) -> None:  # type: ignore[no-untyped-def]
     from recon.point_cloud import make_point_cloud
-    from recon.reconstruction import Options
+    from recon.steps.reconstruction import Options
 
     ranges = change(8.0 + 0.01 * np.random.default_rng(776_040).normal(size=SAMPLES))
     made = {**sensors(776_041), "range": (ranges, "m", RATE_HZ)}

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from recon.cli import main
-from recon.preparation import select_device
+from recon.steps.preparation import select_device
 from scanner import devices
 from tests.support.simulated import imaging
 

@@ -8,7 +8,7 @@ import pytest
 
 from recon.cli import main
 from recon.cli.diagnose_each import COLUMNS, diagnose_each
-from recon.fleet import plan_fleet
+from recon.runtime.fleet import plan_fleet
 
 FINDING = {
     "axis": "x",

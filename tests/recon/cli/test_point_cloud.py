@@ -15,8 +15,8 @@ from phantoms.lidar import add_ranges, measure_wall
 from recon.cli import main
 from recon.io.point_files import write_points
 from recon.point_cloud import make_point_cloud
-from recon.reconstruction import Options
 from recon.report.point_cloud import draw_view
+from recon.steps.reconstruction import Options
 from scanner import devices
 from scanner.device import Device
 from scanner.errors import BadInput

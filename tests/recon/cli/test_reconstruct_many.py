@@ -17,8 +17,8 @@ import tifffile
 from recon.cli import main
 from recon.cli.reconstruct import format_summary
 from recon.cli.reconstruct_many import reconstruct_files
-from recon.fleet import find_recordings, plan_fleet
-from recon.reconstruction import Options
+from recon.runtime.fleet import find_recordings, plan_fleet
+from recon.steps.reconstruction import Options
 from scanner.errors import BadInput
 from tests.support.simulated import imaging
 

@@ -11,9 +11,9 @@ from estimation.complete_diagnosis import diagnose_with_optics
 from phantoms.sync import SyncDetector, sync_edges
 from recon.evaluation import Truth, truth_from_simulation
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.recording import Recording
 from tests.support.simulated import imaging
 

@@ -9,9 +9,9 @@ import pytest
 
 from recon.imaging.saturation import detector_rails
 from recon.imaging.wild_samples import find_wild_samples, wild_limits
-from recon.notes import describe_wild_samples
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.notes import describe_wild_samples
+from recon.steps.reconstruction import Options
 from scanner.channel import Channel
 from tests.support.simulated import imaging
 

@@ -11,13 +11,13 @@ import pytest
 import tifffile
 
 from recon.cli import main
-from recon.frame_axis import FrameAxis
-from recon.frames import write_scan_frames
+from recon.imaging.frame_axis import FrameAxis
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
 from recon.io.output import replacing_folder, write_frames, write_tiff
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
+from recon.sequences.frames import write_scan_frames
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.device import Device
 from scanner.errors import BadInput, line_of

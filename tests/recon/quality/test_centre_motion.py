@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.recording import Recording

@@ -19,13 +19,13 @@ from recon.evaluation import truth_from_simulation
 from recon.imaging.gridding import map_samples
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstimate
 from recon.pipeline import reconstruct
-from recon.preparation import prepare
 from recon.quality.clock_jumps import detect_clock_jumps
 from recon.quality.defects import Defect, describe_defects, find_defects
 from recon.quality.dropped_samples import first_late_slice, slice_delays
-from recon.reconstruction import Options, Reconstruction
 from recon.report.summary import summarise
 from recon.sample_ranges import subtract_ranges, to_sample_ranges
+from recon.steps.preparation import prepare
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.recording import Recording
 from tests.support import two_axis_scan

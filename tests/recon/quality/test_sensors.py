@@ -18,12 +18,12 @@ from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.pipeline import reconstruct
 from recon.point_cloud import make_point_cloud
-from recon.preparation import prepare
 from recon.quality import line_search
 from recon.quality.line_search import search_lines
 from recon.quality.sensor_noise import POSITION_ESTIMATORS, SENSE_ESTIMATORS, check_sensor_noise
 from recon.quality.sensor_sign import describe_inverted_sensors, describe_unconfirmed_signs
-from recon.reconstruction import Options
+from recon.steps.preparation import prepare
+from recon.steps.reconstruction import Options
 from scanner.channel import make_channel
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device

@@ -7,8 +7,8 @@ import pytest
 
 from estimation.estimate import check_finite, estimate
 from recon.pipeline import reconstruct
-from recon.preparation import prepare
-from recon.reconstruction import Options
+from recon.steps.preparation import prepare
+from recon.steps.reconstruction import Options
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.errors import BadInput

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.conclusions import conclude_prediction, conclude_study
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from tests.support.simulated import imaging
 
 

@@ -16,13 +16,13 @@ from recon.imaging.gridding import accumulate_samples
 from recon.imaging.picture import Grid
 from recon.pipeline import reconstruct
 from recon.quality.defects import Defect, unrecoverable_intervals
-from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import MAX_CURVE_SEGMENTS, highlight_pixels, min_max_envelope
 from recon.report.page import Section, render
 from recon.report.phase_slider import MISSING_CODE, phase_slider_data
 from recon.report.reconstruction import phase_slider_section, reconstruction_report
 from recon.report.summary import summarise
 from recon.sample_ranges import to_sample_ranges
+from recon.steps.reconstruction import Options, Reconstruction
 from tests.support.simulated import imaging
 
 SCRIPT = Path(recon.report.phase_slider.__file__).parent / "templates" / "sweeps.js"

@@ -10,9 +10,9 @@ import pytest
 
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options, Reconstruction
 from tests.support.simulated import imaging
 
 

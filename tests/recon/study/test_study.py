@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from recon.cli import main
 from recon.evaluation import truth_from_simulation
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from recon.study.job import run_job, sense_rms, simulate_scenario
 from recon.study.plan import cell_key, plan_jobs, read_study, remaining_jobs
 from recon.study.table import table_columns, table_rows

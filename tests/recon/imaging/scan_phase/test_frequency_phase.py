@@ -12,7 +12,7 @@ from recon.imaging.picture import Grid
 from recon.imaging.scan_phase.amplitude_change import measure_amplitude_changes
 from recon.imaging.scan_phase.phase_search import search_phases
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.errors import BadInput

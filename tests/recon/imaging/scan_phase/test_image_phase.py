@@ -20,7 +20,7 @@ from recon.evaluation import evaluate_axis, truth_from_simulation
 from recon.imaging.picture import Grid
 from recon.imaging.scan_phase.image_phase import end_of_rounds, keep_determined, refine_motion
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.errors import BadInput, ChannelMissing
 from scanner.motion import Motion

@@ -24,8 +24,8 @@ from recon.imaging.scan_phase.readout_phase_model import (
     weigh_hypotheses,
 )
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from scanner.recording import Recording
 from tests.support.simulated import imaging, with_sense
 

@@ -8,9 +8,9 @@ import pytest
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstimate
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
+from recon.steps.reconstruction import Options
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 from tests.support.simulated import imaging

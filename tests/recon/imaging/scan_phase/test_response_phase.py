@@ -12,7 +12,7 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.waveforms import Sine
 from recon.evaluation import Truth, truth_from_simulation
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.recording import Recording

@@ -18,7 +18,7 @@ from recon.imaging.scan_phase.slow_gain import (
     join_gains,
 )
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.device import AXES
 from scanner.recording import Recording
 

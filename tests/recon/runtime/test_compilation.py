@@ -8,7 +8,7 @@ from typing import Any
 
 CODE = """
 import numba
-from recon.compilation import announce_compilation
+from recon.runtime.compilation import announce_compilation
 
 announce_compilation()
 
@@ -24,7 +24,7 @@ assert (twice(1), thrice(1)) == (2, 3)
 """
 
 LAWS_CODE = """
-from recon.compilation import announce_compilation
+from recon.runtime.compilation import announce_compilation
 
 announce_compilation()
 

@@ -12,7 +12,7 @@ from recon.imaging.sample_motion.correction import relative_to_sample
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
-from recon.preparation import PreparedRecording
+from recon.steps.preparation import PreparedRecording
 from scanner.arrays import Array
 from scanner.motion import Motion
 

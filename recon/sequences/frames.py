@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.frame_axis import FrameAxis, position_axis
+from recon.imaging.frame_axis import FrameAxis, position_axis
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, fill_holes
 from recon.imaging.picture_kinds.picture_estimate import EstimatedPicture, estimate_picture
@@ -23,10 +23,10 @@ from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
 from recon.quality.defects import unrecoverable_intervals
-from recon.reconstruction import Options, Reconstruction
 from recon.report.movie import write_movie
 from recon.sample_ranges import SampleRanges, to_sample_ranges
-from recon.z_slices import ZSlices, find_z_slices
+from recon.steps.reconstruction import Options, Reconstruction
+from recon.steps.z_slices import ZSlices, find_z_slices
 from scanner.errors import BadInput
 
 if TYPE_CHECKING:

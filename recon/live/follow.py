@@ -23,13 +23,12 @@ import numpy as np
 from tqdm import tqdm
 
 from estimation.estimate import estimate
-from recon.growing_recording import Snapshot, common_time_span, poll_recording
 from recon.imaging import blur
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
-from recon.interrupts import acknowledge_stop
 from recon.io.output import check_folder
-from recon.live_frames import (
+from recon.live.growing_recording import Snapshot, common_time_span, poll_recording
+from recon.live.live_frames import (
     FrameSums,
     LiveScan,
     add_part,
@@ -42,8 +41,9 @@ from recon.live_frames import (
     replace_picture,
     wants_measurement,
 )
-from recon.preparation import select_device
-from recon.reconstruction import Options
+from recon.runtime.interrupts import acknowledge_stop
+from recon.steps.preparation import select_device
+from recon.steps.reconstruction import Options
 from scanner.errors import BadInput
 from scanner.hdf5 import check_ends
 from scanner.motion import AxisMotion, Motion

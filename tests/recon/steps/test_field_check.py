@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.field_check import check_field
 from recon.imaging.picture import Grid, Picture
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
 from recon.report.figures import UNVISITED
+from recon.steps.field_check import check_field
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import AxisMotion, Motion, SampledAngle

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.sample_ranges import SampleRanges
-from recon.z_rests import PositionBlocks, cut_to_intensity, find_rests, read_blocks, rest_times
+from recon.steps.z_rests import PositionBlocks, cut_to_intensity, find_rests, read_blocks, rest_times
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, LazySamples
 from scanner.errors import BadInput

@@ -12,10 +12,10 @@ import tifffile
 import lissajous
 from lissajous.napari_reader import get_reader
 from recon.cli import main
-from recon.frames import frames, write_scan_frames
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options, Reconstruction
 from recon.report.movie import draw_frame
+from recon.sequences.frames import frames, write_scan_frames
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording

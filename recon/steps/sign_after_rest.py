@@ -15,9 +15,9 @@ import numpy as np
 from scipy.ndimage import label
 
 from estimation.optics.correction import beam_motion
-from recon.field_check import own_half_angle
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid, Picture
+from recon.steps.field_check import own_half_angle
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES, Device

@@ -11,7 +11,7 @@ import tifffile
 from recon.cli import main
 from recon.imaging.picture import Grid
 from recon.io.output import write_json, write_tiff
-from recon.recording_stack import read_planes, write_recording_stack
+from recon.sequences.recording_stack import read_planes, write_recording_stack
 from scanner.errors import BadInput
 from tests.support.stacks import lights, recording_of
 

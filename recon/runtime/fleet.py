@@ -15,9 +15,9 @@ from glob import escape
 from pathlib import Path
 from typing import Any
 
-from recon.executors import open_executor, picklable_task
 from recon.io.output import check_folder, write_json
 from recon.io.readers import register, registered
+from recon.runtime.executors import open_executor, picklable_task
 from scanner.errors import BadInput, line_of
 from scanner.files import replacing
 
@@ -125,7 +125,7 @@ def run_fleet(
         fleet: recordings and folders.
         work: function that processes one recording; picklable.
         title: of the progress bar.
-        scheduler, workers: see :func:`recon.executors.open_executor`; a cluster reads and writes the same paths.
+        scheduler, workers: see :func:`recon.runtime.executors.open_executor`; a cluster needs the same paths.
 
     Raises:
         BadInput: no scheduler answers.

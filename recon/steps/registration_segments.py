@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from recon.imaging.scan_phase.bidirectional_phase import PERIODS_PER_SLICE, slow_period
 from recon.sample_ranges import SampleRanges
-from recon.z_rests import rest_ranges
+from recon.steps.z_rests import rest_ranges
 from scanner.channel import Channel
 from scanner.motion import Motion
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.notes import (
+from recon.steps.notes import (
     describe_fast_axes,
     describe_long_frames,
     describe_lower_rail,

@@ -8,7 +8,7 @@ import pytest
 from recon.evaluation import truth_from_simulation
 from recon.imaging.intensity_drift import DriftKind
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.reconstruction import Options
 from scanner.device import AXES
 from tests.support.simulated import imaging
 

@@ -10,12 +10,12 @@ import pytest
 
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.waveforms import Sine
-from recon.estimator_choice import choose_estimator
 from recon.pipeline import reconstruct
-from recon.preparation import prepare
-from recon.reconstruction import Options, Reconstruction
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
+from recon.steps.estimator_choice import choose_estimator
+from recon.steps.preparation import prepare
+from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Axis, Device
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position, Scan

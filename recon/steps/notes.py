@@ -13,11 +13,11 @@ from recon.imaging.saturation import COUNT_UNITS, detector_rails
 from recon.imaging.scan_phase.doubled_frequency import describe_doubled_axes
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions
 from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_wild_samples, wild_limits
-from recon.preparation import PreparedRecording
 from recon.quality.clock_jumps import longest_segment, separate_jump
 from recon.quality.defects import Defect, describe_clipped_positions, describe_held_signals
 from recon.quality.detector_gaps import describe_detector_gaps
 from recon.sample_ranges import SampleRanges
+from recon.steps.preparation import PreparedRecording
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion

@@ -17,8 +17,8 @@ from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
-from recon.preparation import DeviceSource
 from recon.quality.defects import Defect
+from recon.steps.preparation import DeviceSource
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.motion import Motion

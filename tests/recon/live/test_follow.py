@@ -21,10 +21,10 @@ from estimation.estimate import estimate
 from estimation.tracker import track_end
 from recon.cli import main
 from recon.evaluation import evaluate_axis, truth_from_simulation
-from recon.follow import follow_recording, repeat_time
-from recon.growing_recording import Snapshot
 from recon.imaging.scan_phase.carried_readout_phase import apply_readout_phase
-from recon.live_frames import (
+from recon.live.follow import follow_recording, repeat_time
+from recon.live.growing_recording import Snapshot
+from recon.live.live_frames import (
     add_part,
     finish_frame,
     first_picture,
@@ -33,9 +33,9 @@ from recon.live_frames import (
     next_measurement,
     part_edges,
 )
-from recon.notes import describe_live_frames
 from recon.pipeline import reconstruct
-from recon.reconstruction import Options
+from recon.steps.notes import describe_live_frames
+from recon.steps.reconstruction import Options
 from scanner.errors import BadInput
 from scanner.recording import Recording
 from tests.support import sample_files
@@ -182,7 +182,7 @@ def test_each_part_begins_where_the_one_before_ended(tmp_path: Path, monkeypatch
         parts.append((start, stop))
         return add_part(recording, start, stop, *rest)
 
-    monkeypatch.setattr("recon.follow.add_part", record)
+    monkeypatch.setattr("recon.live.follow.add_part", record)
     options = Options(pixels=(50, 50))
     follow_recording(tmp_path / "scan.h5", tmp_path / "out", options, frame_time=0.07, quiet_time=0.1, quiet=True)
     assert len(parts) == 4  # a frame without an earlier one has one part, the next one has three
@@ -204,7 +204,7 @@ def test_frames_that_newer_ones_overtake_are_counted_and_stated(
 ) -> None:
     whole = Recording.open(scan)
     snapshots = [Snapshot(whole.slice(0.0, 0.003), None, 0.0), Snapshot(whole, "closed", 0.0)]
-    monkeypatch.setattr("recon.follow.poll_recording", lambda *_: iter(snapshots))
+    monkeypatch.setattr("recon.live.follow.poll_recording", lambda *_: iter(snapshots))
     live = follow_recording(scan, tmp_path / "out", Options(pixels=(50, 50)), frame_time=0.004, quiet=True)
     assert (live.frames, live.dropped, live.overtaken, live.recorded_before) == (1, 4, 4, 0)
     (note,) = describe_live_frames(live.summary())

@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 
 from estimation.tracker import track_end
-from recon.estimated_motion import EstimatedMotion
 from recon.imaging.intensity_gridding import PixelSums, add_samples, add_scattered, empty_sums
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.picture_kinds.held_out import held_out_ranges
@@ -31,15 +30,16 @@ from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.imaging.scan_phase.carried_readout_phase import apply_readout_phase, update_readout_phase
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.io.output import write_tiff
-from recon.phase_and_drift import measure_phase_errors, wants_readout_phase
 from recon.pipeline import estimate_motion
-from recon.preparation import prepare_frame, select_device
 from recon.quality.defects import unrecoverable_intervals
 from recon.quality.sensor_noise import check_sensor_noise
-from recon.reconstruction import Options
-from recon.registration_segments import MAX_REGISTERED_PERIODS
 from recon.report.figures import save_picture
 from recon.sample_ranges import subtract_ranges, to_sample_ranges
+from recon.steps.estimated_motion import EstimatedMotion
+from recon.steps.phase_and_drift import measure_phase_errors, wants_readout_phase
+from recon.steps.preparation import prepare_frame, select_device
+from recon.steps.reconstruction import Options
+from recon.steps.registration_segments import MAX_REGISTERED_PERIODS
 from scanner.channel import Channel
 from scanner.device import Device
 from scanner.files import replacing

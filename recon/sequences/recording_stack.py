@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.frame_axis import FrameAxis, position_axis
+from recon.imaging.frame_axis import FrameAxis, position_axis
 from recon.imaging.picture import Grid, Picture
 from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from recon.estimated_motion import EstimatedMotion
 from recon.imaging.intensity_correction import (
     correct_drift,
     describe_drift,
@@ -22,8 +21,9 @@ from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.imaging.scan_phase.slow_gain import GainPart, describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice, register_slices_separately
-from recon.reconstruction import Options
-from recon.registration_segments import registration_segments
+from recon.steps.estimated_motion import EstimatedMotion
+from recon.steps.reconstruction import Options
+from recon.steps.registration_segments import registration_segments
 from scanner.motion import Motion
 
 ESTIMATORS_WITH_READOUT_PHASE = ("tracker", "sensor", "edges")

@@ -10,8 +10,8 @@ from estimation.estimate import default_estimator, estimate
 from estimation.signals import robust_sd
 from recon.imaging.blur import SHARP_FRACTION, within_bound
 from recon.imaging.picture import Grid, grid_of_scan
-from recon.preparation import PreparedRecording
-from recon.reconstruction import Options
+from recon.steps.preparation import PreparedRecording
+from recon.steps.reconstruction import Options
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.motion import Motion

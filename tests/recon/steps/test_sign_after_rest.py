@@ -9,7 +9,7 @@ import pytest
 from skimage import data
 from skimage.transform import resize
 
-from recon.sign_after_rest import find_rests, follow_signs
+from recon.steps.sign_after_rest import find_rests, follow_signs
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device

@@ -1,0 +1,1 @@
+"""Pictures of a recording that still grows."""

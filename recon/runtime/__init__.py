@@ -1,0 +1,1 @@
+"""Running the work: processes, interruption, compilation, the same work on many recordings."""

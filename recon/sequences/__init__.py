@@ -1,0 +1,1 @@
+"""Pictures that follow one another: frames of a scan, stacks of recordings."""
