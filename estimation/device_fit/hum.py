@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.device_fit.initial import estimate_whiteners
-from estimation.device_fit.mains import HUM_HARMONICS, NOMINAL_MAINS, Mains, is_hum
+from estimation.device_fit.mains import (
+    HUM_HARMONICS,
+    NOMINAL_MAINS,
+    WEAK_HUM_RELATIVE_SD,
+    Mains,
+    is_hum,
+)
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener
 from estimation.least_squares import regress
@@ -30,19 +37,22 @@ FREQUENCY_STEP = 0.01
 """Difference step of the mains frequency in prior standard deviations."""
 
 
-def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
+def select_mains_hum(likelihood: Likelihood, fit: Fit, relative_sds: Sequence[float] = (WEAK_HUM_RELATIVE_SD,)) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none.
 
     Where there is hum, the evidence also chooses between few and many harmonics, and between the nominal and the fitted
     frequency. Hum before a clip level is not linear: there fits choose between the nominal frequencies and none.
+
+    Args:
+        relative_sds: prior standard deviations of hum between which the evidence chooses, relative to the noise.
     """
     columns = {mains: _hum_columns(likelihood, fit, mains) for mains in NOMINAL_MAINS}
     if not any(each.size for each in columns.values()):
-        return min(fit_hum_variants(likelihood, fit), key=lambda variant: variant.neg2_log_evidence)
+        return min(fit_hum_variants(likelihood, fit, relative_sds), key=lambda variant: variant.neg2_log_evidence)
     beside = _beside_hum(fit)
     without = beside.evaluate(np.zeros((beside.residual.size, 0)))[0]
     lowest, strongest = min((beside.evaluate(each)[0], mains) for mains, each in columns.items())
-    selected = min(_refined_mains(likelihood, fit, beside, strongest))[1:] if lowest < without else ()
+    selected = min(_refined_mains(likelihood, fit, beside, strongest, relative_sds))[1:] if lowest < without else ()
     if selected == fit.model.mains:
         return fit
     model = _with_mains(fit.model, *selected)
@@ -51,9 +61,34 @@ def select_mains_hum(likelihood: Likelihood, fit: Fit) -> Fit:
     return fit if is_possible and fit.neg2_log_evidence < other.neg2_log_evidence else other
 
 
-def fit_hum_variants(likelihood: Likelihood, fit: Fit) -> list[Fit]:
-    """The fit without hum, and with hum of each mains at its nominal frequency alone."""
-    models = [_with_mains(fit.model, *mains) for mains in ((), *((mains,) for mains in NOMINAL_MAINS))]
+def describe_strong_hum(fit: Fit) -> dict[str, dict[str, float]]:
+    """By sense channel whose hum is stronger than the noise: ``frequency`` [Hz] of the mains, ``rms`` of the hum [V],
+    and ``relative``, its ratio to the standard deviation of the noise; of the recording with the strongest."""
+    strong: dict[str, dict[str, float]] = {}
+    model = fit.model
+    for r, run in enumerate(model.runs):
+        for output in run.outputs:
+            lines = [(i, wave) for i, wave in zip(*model.basis[r, output.name], strict=True) if _is_hum(model, i)]
+            if not lines or not output.noise_sd:
+                continue
+            rms = float(np.std(sum(fit.x[i] * wave for i, wave in lines)))
+            relative = rms / output.noise_sd
+            if relative > max(1.0, strong.get(output.name, {}).get("relative", 0.0)):
+                strong[output.name] = {"frequency": model.mains[0].frequency, "rms": rms, "relative": relative}
+    return strong
+
+
+def _is_hum(model: Model, i: int) -> bool:
+    """Whether a parameter of the model is a quadrature of hum."""
+    return model.parameters[i].kind == "additive" and is_hum(model.parameters[i].name)
+
+
+def fit_hum_variants(
+    likelihood: Likelihood, fit: Fit, relative_sds: Sequence[float] = (WEAK_HUM_RELATIVE_SD,)
+) -> list[Fit]:
+    """The fit without hum, and with hum of each mains at its nominal frequency alone, of each strength."""
+    hum = [mains._replace(relative_sd=sd) for mains, sd in product(NOMINAL_MAINS, relative_sds)]
+    models = [_with_mains(fit.model, *mains) for mains in ((), *((one,) for one in hum))]
     return fit_models(
         likelihood, [(model, model.map_parameters_from(fit.model, fit.x)) for model in models], max_iterations=3
     )
@@ -72,14 +107,16 @@ def _with_mains(model: Model, *mains: Mains) -> Model:
     return Model(model.runs, model.device, model.candidates, mains)
 
 
-def _refined_mains(likelihood: Likelihood, fit: Fit, beside: _BesideHum, nominal: Mains) -> list[tuple[float, Mains]]:
-    """Hum with few and with many harmonics, at the nominal and at the fitted frequency, with -2 log evidence of each.
+def _refined_mains(
+    likelihood: Likelihood, fit: Fit, beside: _BesideHum, nominal: Mains, relative_sds: Sequence[float]
+) -> list[tuple[float, Mains]]:
+    """Hum of each strength with few and many harmonics, at the nominal and the fitted frequency, by -2 log evidence.
 
     All but the frequency is linear around the fit.
     """
     refined = []
-    for harmonics in (HUM_HARMONICS, STRONG_HUM_HARMONICS):
-        stated = Mains(nominal.frequency, harmonics)
+    for harmonics, relative_sd in product((HUM_HARMONICS, STRONG_HUM_HARMONICS), relative_sds):
+        stated = Mains(nominal.frequency, harmonics, relative_sd)
         refined += [
             (beside.evaluate(_hum_columns(likelihood, fit, stated))[0], stated),
             _with_fitted_frequency(likelihood, fit, beside, stated),
@@ -133,7 +170,7 @@ class _BesideHum(NamedTuple):
 
 def _beside_hum(fit: Fit) -> _BesideHum:
     """The linearisation of a fit without its hum."""
-    others = [i for i, f in enumerate(fit.model.parameters) if f.kind != "additive" or not is_hum(f.name)]
+    others = [i for i in range(fit.x.size) if not _is_hum(fit.model, i)]
     residual = fit.residual - fit.jacobian @ fit.x
     return _BesideHum(residual[fit.rows], fit.jacobian[fit.rows][:, others], fit.model.precision[others])
 
@@ -150,7 +187,7 @@ def _hum_columns(likelihood: Likelihood, fit: Fit, mains: Mains) -> Array:
     for r, (run, whiteners) in enumerate(zip(model.runs, likelihood.whiteners, strict=True)):
         for output, whitener in zip(run.outputs, whiteners, strict=True):
             for i, waveform in zip(*model.basis[r, output.name], strict=True):
-                if is_hum(model.parameters[i].name):
+                if _is_hum(model, i):
                     column = np.zeros(likelihood.time.size)
                     column[first : first + whitener.samples] = whitener(-waveform)
                     columns.append(column[fit.rows])

@@ -12,8 +12,15 @@ from scanner.arrays import Array
 HUM_HARMONICS = 3
 """Number of harmonics of weak hum, the n-th with a prior of 1/n, as rectifiers cause them."""
 
-HUM_RELATIVE_SD = 0.5
+WEAK_HUM_RELATIVE_SD = 0.5
 """Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
+
+STRONG_HUM_RELATIVE_SD = 3.0
+"""The same for hum that is stronger than the noise."""
+
+HUM_RELATIVE_SDS = (WEAK_HUM_RELATIVE_SD, STRONG_HUM_RELATIVE_SD)
+"""Strengths of hum between which the evidence chooses once laws are selected. Before, strong hum would take what a law
+does to the motion near a harmonic of the mains."""
 
 
 class Mains(NamedTuple):
@@ -22,17 +29,18 @@ class Mains(NamedTuple):
     Attributes:
         frequency: [Hz].
         harmonics: number of harmonics.
+        relative_sd: prior standard deviation of the two quadratures of the first one, relative to that of the noise.
         cost: -2 log of posterior over prior density of a frequency that was fitted; 0 for a nominal one.
     """
 
     frequency: float
     harmonics: int = HUM_HARMONICS
+    relative_sd: float = WEAK_HUM_RELATIVE_SD
     cost: float = 0.0
 
 
 NOMINAL_MAINS = (Mains(50.0), Mains(60.0))
-"""Mains at their nominal frequencies. Their harmonics below the noise's standard deviation are part of the noise model,
-not an effect. A stronger tone is interference."""
+"""Mains at their nominal frequencies. Their harmonics are part of the noise model, not an effect."""
 
 
 @lru_cache(maxsize=16)

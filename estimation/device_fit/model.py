@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.device_fit.data import Output, Run, readout_of
-from estimation.device_fit.mains import HUM_RELATIVE_SD, NOMINAL_MAINS, Mains, hum_quadratures
+from estimation.device_fit.mains import NOMINAL_MAINS, Mains, hum_quadratures
 from estimation.device_fit.parameters import (
     OFFSET_RELATIVE_SD,
     REFERENCE_GAIN_RELATIVE_SD,
@@ -152,7 +152,7 @@ class Model:
             noise = output.noise_sd or 0.0
             for mains in self.mains:
                 lines = hum_quadratures(mains.frequency, mains.harmonics, output.data.size, output.step)
-                waveforms |= {name: HUM_RELATIVE_SD * noise * values for name, values in lines.items()}
+                waveforms |= {name: mains.relative_sd * noise * values for name, values in lines.items()}
         return waveforms
 
     def _additive_basis(self, r: int, output: Output) -> tuple[list[int], Array]:

@@ -9,6 +9,7 @@ from typing import Any
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.further_modes import describe_modes, with_driven_modes
+from estimation.device_fit.hum import describe_strong_hum
 from estimation.device_fit.open_loop import open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, find_effect
@@ -39,6 +40,8 @@ class Diagnosis:
         open_loop: prediction error of the nominal and the improved device, by channel.
         optics: effects on the picture, for every recording with an intensity.
         further_modes: see :func:`estimation.device_fit.further_modes.describe_modes`.
+        hum: mains hum that is stronger than the noise, by channel, see
+            :func:`estimation.device_fit.hum.describe_strong_hum`. It is taken as noise.
         untested: what the recordings do not test, with the reason, in words; None if everything is tested.
     """
 
@@ -52,6 +55,7 @@ class Diagnosis:
     open_loop: Mapping[str, Any] = field(default_factory=dict)
     optics: tuple[Mapping[str, Any], ...] = ()
     further_modes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    hum: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     untested: str | None = None
 
     def __repr__(self) -> str:
@@ -76,6 +80,7 @@ class Diagnosis:
             "open_loop": dict(self.open_loop),
             "optics": list(self.optics),
             "further_modes": {name: dict(modes) for name, modes in self.further_modes.items()},
+            "hum": {name: dict(of) for name, of in self.hum.items()},
             "untested": self.untested,
         }
 
@@ -158,6 +163,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
         {f"{axis}.{name}": {"pull": pull} for pull, axis, name in _pulls(result.final)},
         find_remainder(result, correction),
         improvement.to_json(),
+        hum=describe_strong_hum(result.final),
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.hum import select_mains_hum
+from estimation.device_fit.mains import HUM_RELATIVE_SDS
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import is_linear
@@ -81,10 +82,10 @@ def drop_redundant(likelihood: Likelihood, fit: Fit) -> tuple[Fit, dict[str, Fit
     Returns:
         The fit, and the fits without each of its terms by key, where there are several.
     """
-    fit = select_mains_hum(likelihood, fit)
+    fit = select_mains_hum(likelihood, fit, HUM_RELATIVE_SDS)
     without = {}
     for candidate in uncertain(fit.model) if len(fit.model.candidates) > 1 else ():
-        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate))
+        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate), HUM_RELATIVE_SDS)
         if not evidence_gain(likelihood, reduced, fit):
             return drop_redundant(likelihood, reduced)
         without[candidate.key] = reduced

@@ -22,6 +22,7 @@ from estimation.device_fit.initial import (
     window_schedule,
 )
 from estimation.device_fit.interference import with_interference_line
+from estimation.device_fit.mains import HUM_RELATIVE_SDS
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_anchor, fit_growing, max_residual_ratio, residual_ratio
@@ -236,7 +237,8 @@ def _choose_laws(search: _Search, anchor: Fit) -> SelectedTerms | None:
     if selected is None:
         return None
     fit, without = drop_redundant(selected.likelihood, selected.fit)
-    if not evidence_gain(selected.likelihood, selected.nominal, fit):
+    nominal = select_mains_hum(selected.likelihood, selected.nominal, HUM_RELATIVE_SDS)
+    if not evidence_gain(selected.likelihood, nominal, fit):
         return None
     return replace(selected, fit=fit, without=without)
 

@@ -49,11 +49,13 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
             uncertainty; an error within it is not stated.
     """
     findings = content["findings"]
-    untested = f" Not tested: {content['untested']}." if content.get("untested") else ""
+    remarks = _describe_hum(content)
+    if content.get("untested"):
+        remarks += f" Not tested: {content['untested']}."
     if not findings and content["verdict"] == "consistent":
         return (
             "The recordings agree with the nominal device within their noise and the tolerances of its values; "
-            f"no effect has to be added.{_describe_open_loop(content)}{untested}"
+            f"no effect has to be added.{_describe_open_loop(content)}{remarks}"
         )
     modes = "".join(
         f" The drive also excites further modes of {name} at "
@@ -81,7 +83,16 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         text += f" Use the corrected device.toml in place of the nominal one.{_describe_open_loop(content)}"
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}."
-    return text + untested
+    return text + remarks
+
+
+def _describe_hum(content: Mapping[str, Any]) -> str:
+    """Mains hum that is stronger than the noise; empty if there is none."""
+    return "".join(
+        f" {channel} has mains hum of {of['frequency']:.2f} Hz, {format_value(of['relative'], 2)} times as strong as "
+        "noise; it is taken as noise."
+        for channel, of in content.get("hum", {}).items()
+    )
 
 
 def _describe_open_loop(content: Mapping[str, Any]) -> str:

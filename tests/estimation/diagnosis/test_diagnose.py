@@ -84,6 +84,16 @@ def test_an_offset_drift_is_not_reported_as_hum_or_noise() -> None:
 
 
 @pytest.mark.slow
+def test_hum_stronger_than_the_noise_is_stated_and_no_effect() -> None:
+    amplitude, noise_sd = 3e-2, 2e-3
+    diagnosis = diagnose([bench_recording(hum=amplitude, seed=9)])
+    assert diagnosis.verdict == "consistent"
+    (of,) = diagnosis.hum.values()
+    assert of["frequency"] == pytest.approx(50.0, abs=0.05)
+    assert of["rms"] == pytest.approx(amplitude / 2**0.5, rel=0.02)
+    assert of["relative"] == pytest.approx(of["rms"] / noise_sd)
+
+
 def test_hum_is_clipped_together_with_the_signal() -> None:
     """Hum added after the clipping would leave a residual that interference or an offset drift explains."""
     size = 20.0 * np.abs(bench_signals(0.0, 0.0)[1]).max()

@@ -48,6 +48,12 @@ def test_what_was_not_tested_is_said_and_nothing_else_of_it() -> None:
     assert "pictures agree" not in text
 
 
+def test_hum_that_is_stronger_than_the_noise_is_stated() -> None:
+    hum = {"sense": {"frequency": 49.987, "rms": 0.021, "relative": 10.6}}
+    text = conclude_diagnosis({"verdict": "consistent", "findings": [], "hum": hum})
+    assert text.endswith(" sense has mains hum of 49.99 Hz, 11 times as strong as noise; it is taken as noise.")
+
+
 def test_an_effect_that_is_less_probable_than_another_explanation_is_not_asserted() -> None:
     doubtful = found("second-mode", 0.22, ("unknown", 0.78))
     text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("cubic-stiffness", 0.98), doubtful]})
