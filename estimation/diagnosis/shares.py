@@ -122,7 +122,10 @@ def describe_unexplained(result: SelectionResult) -> str | None:
     """The unexplained misfit in words; None if the final fit is consistent with the noise."""
     if residual_is_noise(result.final):
         return None
-    parts = [f"held-out reduced chi-square is still {result.final.validation_chi2:.2f}"]
+    chi2 = result.final.validation_chi2
+    parts = [
+        f"samples that were not fitted are missed by {chi2**0.5:.3g} times the noise (reduced chi-square {chi2:.3g})"
+    ]
     noise = noise_by_channel(result.likelihood)
     for name, mean_square in misfit_by_channel(result.final).items():
         data = [output.data for run in result.likelihood.runs for output in run.outputs if output.name == name]

@@ -82,8 +82,19 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     elif findings or modes:
         text += f" Use the corrected device.toml in place of the nominal one.{_describe_open_loop(content)}"
     if content.get("unexplained"):
-        text += f" Not explained: {content['unexplained']}."
+        text += f" Not explained: {content['unexplained']}{_describe_remainder(content)}."
     return text + remarks
+
+
+def _describe_remainder(content: Mapping[str, Any]) -> str:
+    """Share and stage of the misfit that the findings leave; empty without findings or a remainder."""
+    rest = content.get("remainder")
+    if not rest or not content["findings"]:
+        return ""
+    return (
+        f"; {percent(rest['share'])} of the nominal misfit of {rest['channel']} are left, and a change of the "
+        f"{rest['stage']} would take most of it"
+    )
 
 
 def _describe_hum(content: Mapping[str, Any]) -> str:

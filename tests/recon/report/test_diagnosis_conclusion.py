@@ -48,6 +48,17 @@ def test_what_was_not_tested_is_said_and_nothing_else_of_it() -> None:
     assert "pictures agree" not in text
 
 
+def test_the_share_of_the_misfit_that_is_left_is_stated_with_its_stage() -> None:
+    rest = {"share": 0.078, "stage": "mechanics", "channel": "angle_x"}
+    content = {"verdict": "mismatch", "unexplained": "samples are missed by 4.8 times the noise", "remainder": rest}
+    text = conclude_diagnosis({**content, "findings": [found("quintic-stiffness", 0.97)]})
+    assert text.endswith(
+        " Not explained: samples are missed by 4.8 times the noise; 7.8% of the nominal misfit of angle_x are left, and "
+        "a change of the mechanics would take most of it."
+    )
+    assert "nominal misfit of angle_x" not in conclude_diagnosis({**content, "findings": []})
+
+
 def test_hum_that_is_stronger_than_the_noise_is_stated() -> None:
     hum = {"sense": {"frequency": 49.987, "rms": 0.021, "relative": 10.6}}
     text = conclude_diagnosis({"verdict": "consistent", "findings": [], "hum": hum})
