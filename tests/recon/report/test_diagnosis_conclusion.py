@@ -50,11 +50,12 @@ def test_what_was_not_tested_is_said_and_nothing_else_of_it() -> None:
 
 def test_the_share_of_the_misfit_that_is_left_is_stated_with_its_stage() -> None:
     rest = {"share": 0.078, "stage": "mechanics", "channel": "angle_x"}
-    content = {"verdict": "mismatch", "unexplained": "samples are missed by 4.8 times the noise", "remainder": rest}
+    unexplained = "samples are missed by 4.8 times the noise"
+    content = {"verdict": "mismatch", "unexplained": unexplained, "remainder": rest}
     text = conclude_diagnosis({**content, "findings": [found("quintic-stiffness", 0.97)]})
     assert text.endswith(
-        " Not explained: samples are missed by 4.8 times the noise; 7.8% of the nominal misfit of angle_x are left, and "
-        "a change of the mechanics would take most of it."
+        " Not explained: samples are missed by 4.8 times the noise; 7.8% of the nominal misfit of angle_x are left, "
+        "and a change of the mechanics would take most of it."
     )
     assert "nominal misfit of angle_x" not in conclude_diagnosis({**content, "findings": []})
 
