@@ -44,6 +44,10 @@ MIN_NOISE_SAMPLES_PER_PERIOD = 20.0
 """Samples per period from which the sixth differences of a signal show its noise: those of the motion itself are then
 below 3e-5 of its amplitude."""
 
+MIN_NOISE_EXCESS = 1.5
+"""White noise in a position signal over ``noise_sd`` of its readout from which the measured noise is used, and a note
+says so. Data sheets state noise to some ten percent."""
+
 MIN_BLOCKS = 2
 """Blocks that a motion's slow clock has at least."""
 
@@ -112,7 +116,24 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
         raise sampled_too_slowly(channel, "a motion", reference.frequency)
     held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
     motion = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel), held)
-    return motion, [*_describe_held(channel, held), *_describe_spikes(channel, spikes)]
+    notes = [*_describe_held(channel, held), *_describe_spikes(channel, spikes)]
+    return motion, [*notes, *_describe_noise(channel, abs(scale), noise_sd, motion.angle_noise_sd)]
+
+
+def _describe_noise(channel: Channel, gain: float, stated: float | None, found: float) -> list[str]:
+    """A line on noise that the device file states too low.
+
+    Args:
+        channel: position signal.
+        gain: unit of the channel per rad.
+        stated, found: noise in single samples [rad]; None where the device file states none.
+    """
+    if stated is None or found <= stated:
+        return []
+    return [
+        f"{channel.name}: the noise in single samples is {found * gain:.3g} {channel.unit} (1 sd), and the device file "
+        f"states noise_sd = {stated * gain:.3g}; the measured noise is used"
+    ]
 
 
 def _describe_spikes(channel: Channel, spikes: Index) -> list[str]:
@@ -199,7 +220,8 @@ def axis_motion_from_angle(
 
     Args:
         angle: at the samples of ``channel``, shape (n,) [rad].
-        noise_sd: white noise of the sensor, per sample [rad]; measured where None.
+        noise_sd: white noise of the sensor, per sample [rad], as stated; measured where None, and where an oversampled
+            motion shows ``MIN_NOISE_EXCESS`` times as much.
         clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
         held: ranges of samples at which the sensor was stopped. The angle in the result is not known there (NaN). Phase
             and amplitude are interpolated through them, and the phase has the standard deviation of an unknown one.
@@ -231,8 +253,10 @@ def axis_motion_from_angle(
         )
     amplitude = np.interp(time, time[known], np.abs(phasors[known]))
     is_noise_known = noise_sd is not None or rate >= MIN_NOISE_SAMPLES_PER_PERIOD * reference.frequency
-    if noise_sd is None:
-        noise_sd = white_noise_sd(angle[:NOISE_SAMPLES][~stopped[:NOISE_SAMPLES]])
+    if noise_sd is None or rate >= MIN_NOISE_SAMPLES_PER_PERIOD * reference.frequency:
+        measured = white_noise_sd(angle[:NOISE_SAMPLES][~stopped[:NOISE_SAMPLES]])
+        if noise_sd is None or measured > MIN_NOISE_EXCESS * noise_sd:
+            noise_sd = measured
     phase = np.interp(time, time[known], reference.relative_phase(time[known], phasors[known]))
     phase_sd = noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block)
     phase_sd[by_block.mean(axis=1) >= 0.5] = UNKNOWN_PHASE_SD_RAD
