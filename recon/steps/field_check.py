@@ -35,6 +35,9 @@ OTHER_UNITS = {"degrees": pi / 180.0, "mrad": 1e-3}
 INSPECTED_PARTS, INSPECTED_SAMPLES = 64, 4096
 """Parts of a scan and samples of each in which the largest angle is looked for: 0.3 million samples of any scan."""
 
+CENTRE_QUANTILES = (0.1, 0.9)
+"""Quantiles of the angle whose mean is the centre of a motion. The noise of single samples does not move them."""
+
 UNIT_MATCH = 2.5
 """Factor within which a half angle, read in another unit, has to agree with the amplitude to be taken for that unit.
 Degrees and mrad differ by 17, so that at most one of them agrees."""
@@ -99,13 +102,27 @@ def _explain_outside(grid: Grid, motion: Motion, sample_moved: bool) -> str:
     half_angles = dict(zip(AXES, (grid.half_angle_x, grid.half_angle_y), strict=True))
     if sample_moved and _share_outside(half_angles, motion) <= MAX_OUTSIDE_FRACTION:
         return "the sample moved there during the scan; a larger field in [scan] shows them"
-    of_sines = (
-        2.0 / pi * acos(min(half_angles[name] / float(np.mean(motion.axes[name].amplitude)), 1.0)) for name in AXES
-    )
+    centres = {name: _centre(motion.axes[name]) for name in AXES}
+    centred = _share_of_sines(half_angles, motion, dict.fromkeys(AXES, 0.0))
+    off_centre = _share_of_sines(half_angles, motion, centres)
+    if centred <= MAX_OUTSIDE_FRACTION < off_centre:
+        name = max(AXES, key=lambda each: abs(centres[each]) / half_angles[each])
+        centre = grid.angle_scale * centres[name]
+        return f"{name} is centred at {centre:+.4g} rad: check offset in [{name}.readout] of the device"
     noisy = any(axis.angle_noise_sd for axis in motion.axes.values())
-    if noisy and sum(of_sines) <= MAX_OUTSIDE_FRACTION:
+    if noisy and off_centre <= MAX_OUTSIDE_FRACTION:
         return "the noise of the position signals moves them there; --estimator tracker filters it"
     return "check [scan] and the gain"
+
+
+def _share_of_sines(half_angles: Mapping[str, float], motion: Motion, centres: Mapping[str, float]) -> float:
+    """Share of the time that sines of the motion's amplitudes about ``centres`` are outside the field, all in rad."""
+    share = 0.0
+    for name, half in half_angles.items():
+        amplitude = float(np.mean(motion.axes[name].amplitude))
+        for side in (1.0, -1.0):
+            share += acos(min(max((half - side * centres[name]) / amplitude, -1.0), 1.0)) / pi
+    return share
 
 
 def _share_outside(half_angles: Mapping[str, float], motion: Motion) -> float:
@@ -136,7 +153,7 @@ def _describe_centres(grid: Grid, motion: Motion) -> list[str]:
 
 def _describe_sizes(amplitude: Sequence[float], half: Sequence[float]) -> str:
     return ", ".join(
-        f"{name}: amplitude {a:.4g} rad, half angle {h:.4g} rad"
+        f"{name}: largest angle {a:.4g} rad, half angle {h:.4g} rad"
         for name, a, h in zip(AXES, amplitude, half, strict=True)
     )
 
@@ -163,6 +180,13 @@ def _angle_range(axis: AxisMotion) -> tuple[float, float]:
     if not np.isfinite(angles).any():
         return -float(np.max(axis.amplitude)), float(np.max(axis.amplitude))
     return float(np.nanmin(angles)), float(np.nanmax(angles))
+
+
+def _centre(axis: AxisMotion) -> float:
+    """Centre of a motion that is symmetric about it [rad], from quantiles, which average over noise."""
+    angles = _inspected_angles(axis)
+    known = angles[np.isfinite(angles)]
+    return float(np.mean(np.quantile(known, CENTRE_QUANTILES))) if known.size else 0.0
 
 
 def _inspected_angles(axis: AxisMotion) -> Array:

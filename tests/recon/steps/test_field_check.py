@@ -38,20 +38,22 @@ def test_most_samples_outside_are_refused_unless_allowed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("half_angle", "noise_sd", "moved", "reason"),
+    ("half_angle", "noise_sd", "offset", "moved", "reason"),
     [
-        (0.1, 0.0, True, "the sample moved there"),
-        (0.1, 0.01, False, "the noise of the position signals moves them there"),
-        (0.095, 0.01, True, "check [scan] and the gain"),
+        (0.1, 0.0, 0.0, True, "the sample moved there"),
+        (0.1, 0.01, 0.0, False, "the noise of the position signals moves them there"),
+        (0.1, 1e-4, 0.015, False, "check offset in [x.readout] of the device"),
+        (0.095, 0.01, 0.0, True, "check [scan] and the gain"),
     ],
 )
 def test_the_note_on_samples_outside_names_what_moves_them(
-    half_angle: float, noise_sd: float, moved: bool, reason: str
+    half_angle: float, noise_sd: float, offset: float, moved: bool, reason: str
 ) -> None:
     """A motion of 0.1 rad, and a picture that has lost a tenth of the samples."""
     rng = np.random.default_rng(0)
     angles = 0.1 * np.sin(2 * np.pi * np.outer([0.011, 0.0137], np.arange(20_000)))
     angles += rng.normal(0.0, noise_sd, angles.shape) if noise_sd else 0.0
+    angles[0] += offset
     time, ones = np.array([0.0, 0.02]), np.ones(2)
     axes = {
         name: AxisMotion(
