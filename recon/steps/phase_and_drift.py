@@ -16,6 +16,8 @@ from recon.imaging.intensity_correction import (
     measure_intensity_drift,
 )
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_motion_phase_errors
+from recon.imaging.scan_phase.contradicted_phase import include_contradictions
+from recon.imaging.scan_phase.phase_agreement import Contradiction, find_contradictions
 from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
@@ -88,24 +90,36 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
 
     errors = register(motion)
     if not wants_readout_phase(motion, options):
-        return replace(estimated, phase_errors=errors)
+        contradictions = _find_contradictions(estimated, {})
+        return replace(estimated, motion=include_contradictions(motion, contradictions), phase_errors=errors)
     sensed = motion
     readout_phase: Mapping[str, ReadoutPhase] = {}
     notes: list[str] = []
+    contradictions = []
     if not _loses_timing(estimated, errors):
         one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
         motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
-        notes = describe_readout_phase(motion, readout_phase)
+        contradictions = _find_contradictions(replace(estimated, motion=motion), readout_phase)
+        notes = describe_readout_phase(motion, readout_phase, {each.axis for each in contradictions})
     motion, remaining_notes = include_remaining_errors(motion, errors)
     without_readout, _ = include_remaining_errors(sensed, errors)
+    without_readout = include_contradictions(without_readout, contradictions)
     return replace(
         estimated,
-        motion=motion,
+        motion=include_contradictions(motion, contradictions),
         phase_errors=errors,
         readout_phase=readout_phase,
         estimator_phase_sd={name: axis.phase_sd for name, axis in without_readout.axes.items()},
         motion_notes=[*notes, *remaining_notes, *estimated.motion_notes],
     )
+
+
+def _find_contradictions(estimated: EstimatedMotion, measured: Mapping[str, ReadoutPhase]) -> list[Contradiction]:
+    """The axes whose motion the picture contradicts; those whose phase it ``measured`` agree with it."""
+    if set(measured) >= set(estimated.motion.axes):
+        return []
+    found, _ = find_contradictions(estimated.beam, estimated.prepared.intensity)
+    return [each for each in found if each.axis not in measured]
 
 
 def _loses_timing(estimated: EstimatedMotion, errors: Sequence[PhaseError]) -> bool:

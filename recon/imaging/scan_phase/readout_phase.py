@@ -8,7 +8,7 @@ combines both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -181,12 +181,15 @@ def _undescribed_variance(axis: AxisMotion) -> Array:
     return np.square(2.0 * np.pi * axis.frequency * UNDESCRIBED_DELAY_SD_S)
 
 
-def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) -> list[str]:
+def describe_readout_phase(
+    motion: Motion, found: Mapping[str, ReadoutPhase], contradicted: Collection[str] = ()
+) -> list[str]:
     """What a reader has to know of the phase error of the readout, a line each.
 
     Args:
         motion: corrected.
         found: the error that was removed, by axis.
+        contradicted: axes whose motion the picture contradicts, which is stated elsewhere.
     """
     notes = [
         f"the picture determines no phase of {name}: no feature across it, a pattern that repeats, or too few photons. "
@@ -194,7 +197,7 @@ def describe_readout_phase(motion: Motion, found: Mapping[str, ReadoutPhase]) ->
         f"the device file does not state; without such a delay it is {_sd_as_stated(motion.axes[name]):.2g}°. "
         "A scene with detail, more light or a longer scan narrows it"
         for name in AXES
-        if name not in found
+        if name not in found and name not in contradicted
     ]
     notes += [
         f"the picture determines no phase of {name}; the delay that it shows in the other axis, whose signal passes "
