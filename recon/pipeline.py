@@ -26,7 +26,13 @@ from recon.imaging.scan_phase.image_phase import refine_motion
 from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
-from recon.quality.dropped_samples import find_timing_break, restore_timing, slices_aligned
+from recon.quality.dropped_samples import (
+    TimingBreak,
+    find_timing_break,
+    find_timing_break_between,
+    restore_timing,
+    slices_aligned,
+)
 from recon.quality.overflow import describe_overflows
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs
@@ -244,10 +250,7 @@ def _repair_dropped_samples(
     prepared: PreparedRecording, result: Reconstruction, options: Options, truth: Truth | None, quiet: bool
 ) -> Reconstruction:
     """Reconstruct again with the timing restored if the picture shows that samples of the intensity were dropped."""
-    segments = registration_segments(result.motion, result.intensity, result.position_z)
-    if len(segments) > 1:  # the slices do not cover the whole scan
-        return result
-    timing_break = find_timing_break(result.phase_errors, result.motion, result.intensity, result.picture.grid)
+    timing_break = _find_timing_break(result)
     if timing_break is None:
         return result
     dropped, recorded = timing_break.dropped, prepared.uncorrected["intensity"]
@@ -270,6 +273,18 @@ def _repair_dropped_samples(
     if result.limits:  # they state why the picture does not show the scene; this follows from them
         return replace(result, notes=[*result.notes, doubt])
     return replace(result, limits=[doubt])
+
+
+def _find_timing_break(result: Reconstruction) -> TimingBreak | None:
+    """Where the intensity loses its timing, as the picture shows; None where it does not, and for a stack."""
+    segments = registration_segments(result.motion, result.intensity, result.position_z)
+    scan = result.phase_errors, result.motion, result.intensity, result.picture.grid
+    if len(segments) <= 1:
+        return find_timing_break(*scan)
+    if result.position_z is not None or not result.phase_errors:
+        return None
+    measured = sum(stop - first for first, stop in segments)
+    return find_timing_break_between(*scan, measured // len(result.phase_errors))
 
 
 def _unlocated(estimated: EstimatedMotion) -> SampleRanges:

@@ -98,6 +98,37 @@ def find_timing_break(
     return TimingBreak(late_slice * intensity.size / slices, dropped)
 
 
+def find_timing_break_between(
+    phase_errors: Sequence[PhaseError], motion: Motion, intensity: Channel, grid: Grid, slice_samples: int
+) -> TimingBreak | None:
+    """As :func:`find_timing_break`, for a long scan of which only parts were measured.
+
+    The slice in which the timing is lost is found by bisection between the last slice that is aligned and the first
+    that is late, so that the cost grows with the logarithm of the length.
+
+    Args:
+        phase_errors: of equal time slices in parts of the scan, in order of time, each in a picture of its part.
+        motion, intensity, grid: as above.
+        slice_samples: length of a slice.
+    """
+    late = first_late_slice(phase_errors, motion)
+    if late is None:
+        return None
+    slices = intensity.size // slice_samples
+    edges = _slice_edges(intensity, slices)
+    begin, end = (
+        min(int(phase_errors[at].time * intensity.sample_rate * slices / intensity.size), slices - 2)
+        for at in (late - 1, late)
+    )
+    while end - begin > 1:
+        middle = (begin + end) // 2
+        part = [(edges[middle], edges[middle + 1])]
+        aligned = slices_aligned(measure_motion_phase_errors(motion, intensity, grid, part), motion).all()
+        begin, end = (middle, end) if aligned else (begin, middle)
+    dropped = locate_dropped_samples(motion, intensity, grid, slices, end)
+    return None if dropped is None else TimingBreak(edges[end], dropped)
+
+
 def slice_delays(phase_errors: Sequence[PhaseError], motion: Motion) -> Array:
     """Return by how many samples the intensity is early in each slice, shape (slices,); NaN where undetermined.
 
