@@ -112,7 +112,7 @@ def _explain_outside(grid: Grid, motion: Motion, sample_moved: bool) -> str:
     noisy = any(axis.angle_noise_sd for axis in motion.axes.values())
     if noisy and off_centre <= MAX_OUTSIDE_FRACTION:
         return "the noise of the position signals moves them there; --estimator tracker filters it"
-    return "check [scan] and the gain"
+    return "the motion is larger than the field: check [scan] and the gain, unless that is intended"
 
 
 def _share_of_sines(half_angles: Mapping[str, float], motion: Motion, centres: Mapping[str, float]) -> float:

@@ -43,7 +43,7 @@ def test_most_samples_outside_are_refused_unless_allowed() -> None:
         (0.1, 0.0, 0.0, True, "the sample moved there"),
         (0.1, 0.01, 0.0, False, "the noise of the position signals moves them there"),
         (0.1, 1e-4, 0.015, False, "check offset in [x.readout] of the device"),
-        (0.095, 0.01, 0.0, True, "check [scan] and the gain"),
+        (0.095, 0.01, 0.0, True, "the motion is larger than the field: check [scan]"),
     ],
 )
 def test_the_note_on_samples_outside_names_what_moves_them(
