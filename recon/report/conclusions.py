@@ -177,7 +177,8 @@ def conclude_prediction(summary: Mapping[str, Any]) -> str:
     text = (
         f"From the drive alone {summary['device']} predicts "
         + {1: "the channel", 2: "both channels"}.get(len(channels), f"all {len(channels)} channels")
-        + f" to {100 * channel['nrmse']:.2g} % of the signal or better (worst: {worst}, "
+        + f" with an error of {100 * channel['nrmse']:.2g} % of the signal{' or less' if len(channels) > 1 else ''} "
+        + f"({f'largest in {worst}' if len(channels) > 1 else worst}, "
         f"{format_value(channel['rmse'], 3)} {channel['unit']} rms)"
     )
     if channel["noise_sd"] and channel["rmse"] > 1.5 * channel["noise_sd"]:
