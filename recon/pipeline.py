@@ -35,7 +35,7 @@ from recon.quality.dropped_samples import (
 )
 from recon.quality.overflow import describe_overflows
 from recon.quality.sensor_noise import check_sensor_noise
-from recon.quality.sensor_sign import describe_unconfirmed_signs
+from recon.quality.sensor_sign import describe_unconfirmed_signs, without_contradicted_signs
 from recon.quality.structure import describe_unstructured
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from recon.steps.estimated_motion import EstimatedMotion
@@ -154,6 +154,7 @@ def estimate_motion(
     motion, sign_notes = follow_signs(motion, device, prepared.intensity, recording.start)
     grid, field_notes = _picture_grid(device, motion, options)
     notes = [*notes, *sign_notes, *motion.notes, *describe_unconfirmed_signs(recording, device, motion)]
+    motion = without_contradicted_signs(recording, device, motion)
     return EstimatedMotion(prepared, motion, grid, field_notes, notes)
 
 

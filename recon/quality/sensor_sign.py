@@ -8,6 +8,8 @@ the motion itself comes from edges, its sign rests on what is stated of them.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,23 +52,53 @@ GAIN_UNITS = ("V/rad", "V s/rad", "V s2/rad")
 """Unit of the gain of a sensor by the number of time derivatives."""
 
 
-def describe_inverted_sensors(recording: Recording, device: Device) -> Iterator[str]:
-    """Yield a line for every sensor whose sign contradicts its linear drive or the angle channel."""
+class ContradictedSign(NamedTuple):
+    """An axis whose sensor leads its linear drive, which no passive scanner does.
+
+    Attributes:
+        axis: its name.
+        channel: name of the sensor's channel.
+        lead: phase by which the motion leads the torque [rad].
+    """
+
+    axis: str
+    channel: str
+    lead: float
+
+
+def find_contradicted_signs(recording: Recording, device: Device) -> Iterator[ContradictedSign]:
+    """Yield the axes in which the linear drive contradicts the sign of the sensor."""
     for axis in AXES:
         sensor = _sensor(recording, device.axis(axis), axis)
         if sensor is None:
             continue
-        channel, gain, order = sensor
-        lead = _lead_of_torque(recording, device.axis(axis), axis, channel, gain, order)
+        lead = _lead_of_torque(recording, device.axis(axis), axis, *sensor)
         if lead is not None and _sign_by_torque(device, axis, *lead) < 0:
-            yield (
-                f"{channel.name}: the motion leads drive_{axis} by {np.degrees(lead[0]):.0f}°, and a passive scanner "
-                f"lags: the signal, its gain or the drive is inverted; if it is the signal or the gain, the picture is "
-                f"mirrored in {axis}, and --flip-{axis} turns it"
-            )
+            yield ContradictedSign(axis, sensor[0].name, lead[0])
+
+
+def describe_inverted_sensors(recording: Recording, device: Device) -> Iterator[str]:
+    """Yield a line for every sensor whose sign contradicts its linear drive or the angle channel."""
+    for axis, channel, lead in find_contradicted_signs(recording, device):
+        yield (
+            f"{channel}: the motion leads drive_{axis} by {np.degrees(lead):.0f}°, and a passive scanner lags: the "
+            f"signal, its gain or the drive is inverted; if it is the signal or the gain, the picture is mirrored in "
+            f"{axis}, and --flip-{axis} turns it"
+        )
     for axis in AXES:
         if f"angle_{axis}" in recording and _sign_by_angle(recording, device.axis(axis), axis) < 0:
             yield f"sense_{axis}: moves opposite to angle_{axis}: one of the signals or the gain is inverted"
+
+
+def without_contradicted_signs(recording: Recording, device: Device, motion: Motion) -> Motion:
+    """The motion with the sign "ambiguous" in each axis whose linear drive contradicts the sensor that it is from."""
+    axes = dict(motion.axes)
+    for axis, channel, _ in find_contradicted_signs(recording, device):
+        readout = device.axis(axis).readout
+        own = {f"known: {channel}"} | ({f"known: {readout.kind} readout"} if readout is not None else set())
+        if axis in axes and axes[axis].sign in own:
+            axes[axis] = replace(axes[axis], sign="ambiguous")
+    return replace(motion, axes=axes)
 
 
 def describe_unconfirmed_signs(recording: Recording, device: Device, motion: Motion) -> Iterator[str]:

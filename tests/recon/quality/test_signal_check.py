@@ -70,6 +70,18 @@ def test_an_inverted_sensor_is_noted_where_the_drive_shows_it() -> None:
     assert "--flip-x" in note
 
 
+@pytest.mark.parametrize(
+    ("gain", "flip", "sign"),
+    [(1.0, False, "known: sense_x"), (-1.0, False, "ambiguous"), (-1.0, True, "known: --flip-x")],
+)
+def test_a_sign_that_the_drive_contradicts_is_ambiguous_unless_the_user_states_it(
+    gain: float, flip: bool, sign: str
+) -> None:
+    motion = reconstruct(driven_scan(gain), Options(pixels=(20, 20), flips={"x": flip}), quiet=True).motion
+    assert motion.axes["x"].sign == sign
+    assert motion.axes["y"].sign == "known: sense_y"
+
+
 def test_a_sensor_at_twice_the_rate_of_its_drive_is_named() -> None:
     with pytest.raises(BadInput, match=r"sense_x: moves at 4000.*, 2 times the 2000.* Hz of drive_x; check the sample"):
         prepare(driven_scan(rate=2 * RATE))
