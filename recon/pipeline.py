@@ -23,6 +23,7 @@ from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.sample_motion.correction import describe_sample_motion, measure_sample_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.imaging.scan_phase.image_phase import refine_motion
+from recon.imaging.scan_phase.start_shift import describe_start_shift
 from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
@@ -223,6 +224,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         limits=[
             *describe_overflows(prepared.uncorrected),
             *describe_limits(*samples, prepared.defects),
+            *describe_start_shift(prepared.uncorrected, motion, estimated.contradictions),
             *describe_centre_motion(prepared.recording, prepared.device, motion, estimated.grid, options.p),
             *(estimate.limits or describe_unstructured(gridded.picture, intensity)),
         ],

@@ -11,6 +11,7 @@ from recon.imaging.picture import Grid
 from recon.imaging.sample_motion.correction import relative_to_sample
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.phase_agreement import Contradiction
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.steps.preparation import PreparedRecording
 from scanner.arrays import Array
@@ -27,6 +28,7 @@ class EstimatedMotion:
         grid: the pixels over the device's field of view, else over the range of the motion.
         field_notes, motion_notes: what a reader has to know of the field and of the motion, a line each.
         phase_errors: of the motion, as the picture shows them; None where they were not measured.
+        contradictions: axes whose motion the picture contradicts.
         readout_phase, estimator_phase_sd, intensity_drift, sample_motion: as in ``Reconstruction``.
     """
 
@@ -36,6 +38,7 @@ class EstimatedMotion:
     field_notes: list[str]
     motion_notes: list[str]
     phase_errors: list[PhaseError] | None = None
+    contradictions: Sequence[Contradiction] = ()
     readout_phase: Mapping[str, ReadoutPhase] = field(default_factory=dict)
     estimator_phase_sd: Mapping[str, Array] = field(default_factory=dict)
     intensity_drift: Sequence[IntensityDrift | None] = ()

@@ -91,7 +91,8 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     errors = register(motion)
     if not wants_readout_phase(motion, options):
         contradictions = _find_contradictions(estimated, {})
-        return replace(estimated, motion=include_contradictions(motion, contradictions), phase_errors=errors)
+        motion = include_contradictions(motion, contradictions)
+        return replace(estimated, motion=motion, phase_errors=errors, contradictions=contradictions)
     sensed = motion
     readout_phase: Mapping[str, ReadoutPhase] = {}
     notes: list[str] = []
@@ -108,6 +109,7 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         estimated,
         motion=include_contradictions(motion, contradictions),
         phase_errors=errors,
+        contradictions=contradictions,
         readout_phase=readout_phase,
         estimator_phase_sd={name: axis.phase_sd for name, axis in without_readout.axes.items()},
         motion_notes=[*notes, *remaining_notes, *estimated.motion_notes],

@@ -21,3 +21,14 @@ def test_the_phase_sd_contains_a_start_that_is_stated_wrong(sense_only: bool) ->
     assert summary["x"]["within_bound"] < 0.05
     assert not any("determines no phase of x" in note for note in result.notes)
     assert "--sense-only" not in conclude_reconstruction(summary)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "lost", "stated", "right_s"), [(100e-6, 0, "0.0001 s", 0.0), (0.0, 2350, "0 s", 2350e-6)]
+)
+def test_a_start_that_explains_both_axes_is_named(start_s: float, lost: int, stated: str, right_s: float) -> None:
+    """Of an intensity that is stated 100 µs late, and of one that lacks its first 2.35 ms because of its trigger."""
+    result = reconstruct(position_scan(60_000, 1e6, start_s, slice(0, lost)), Options(), quiet=True)
+    (line,) = (limit for limit in result.limits if limit.startswith("intensity: a start of"))
+    assert f"in place of {stated} explains the disagreement in both axes" in line
+    assert float(line.split("a start of ")[1].split(" s ")[0]) == pytest.approx(right_s, abs=5e-6)
