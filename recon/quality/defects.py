@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -33,6 +33,10 @@ EXTRAPOLATION_BLOCKS = 2.0
 MAX_CLIPPED_SHARE = 0.01
 """Share of clipped samples of a position signal from which the picture is wrong. A sine that is clipped at both peaks
 for so long loses 1.2e-4 of its amplitude, 0.02 of 400 pixels."""
+
+MAX_LEVEL_RATIO = 4.0
+"""Samples at the largest value of a converter over those at the value next to it up to which it is no rail. The peak of
+a sine that is not clipped has up to 2.4 times as many; one that is cut by a step of the converter has 4.4."""
 
 ESTIMATORS_WITHOUT_GAPS = ("ekf", "ukf", "hyb", "acm", "sine-ukf", "constant")
 """Estimators that follow a sense signal sample by sample. The others leave held samples out."""
@@ -231,7 +235,10 @@ def _find_gaps(channel: Channel) -> SampleRanges:
 
 
 def _find_clipped_runs(channel: Channel) -> SampleRanges:
-    """Runs of MIN_CLIPPED_RUN_SAMPLES or more equal samples at the smallest and the largest value of the channel."""
+    """Runs of MIN_CLIPPED_RUN_SAMPLES or more equal samples at the smallest and the largest value of the channel.
+
+    The steps of a converter give such runs at the peaks of a sine too, which are left out.
+    """
     extremes = [np.inf, -np.inf]
     clipped: tuple[SampleRanges, SampleRanges] = ([], [])
     for first, values in _read_chunks(channel):
@@ -245,4 +252,28 @@ def _find_clipped_runs(channel: Channel) -> SampleRanges:
                 clipped[side].extend(
                     (first + a, first + b) for a, b in runs_of_true(at_extreme) if b - a >= MIN_CLIPPED_RUN_SAMPLES
                 )
-    return sorted(clipped[0] + clipped[1])
+    rails = [
+        side for side in (0, 1) if clipped[side] and _is_rail(channel, extremes[side], (np.less, np.greater)[side])
+    ]
+    return sorted(run for side in rails for run in clipped[side])
+
+
+def _is_rail(channel: Channel, extreme: float, is_beyond: Callable[[float, float], bool]) -> bool:
+    """Whether more samples stand at an extreme value than at the peaks of a sine in steps of a converter.
+
+    Args:
+        channel: with the signal.
+        extreme: its largest or smallest stored value.
+        is_beyond: whether a value is nearer to the extreme than another.
+    """
+    nearest, at_nearest, at_extreme = np.nan, 0, 0
+    for _, values in _read_chunks(channel):
+        at_extreme += int(np.count_nonzero(values == extreme))
+        inside = values[np.isfinite(values) & (values != extreme)]
+        if not inside.size:
+            continue
+        value = float(inside.max() if is_beyond(1.0, 0.0) else inside.min())
+        if np.isnan(nearest) or is_beyond(value, nearest):
+            nearest, at_nearest = value, 0
+        at_nearest += int(np.count_nonzero(inside == nearest))
+    return at_extreme > MAX_LEVEL_RATIO * at_nearest
