@@ -107,7 +107,7 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
         reference = reference_of_any_waveform(recording, device, name, channel)
         return axis_motion_from_angle(angle, channel, reference, None, intensity_clock(recording, channel)), []
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
-    check_signal(channel)
+    _check_position_signal(channel, device.axis(name))
     angle = (channel.read() - zero) / scale
     spikes = find_spikes(angle)
     angle = without_spikes(angle, spikes)
@@ -118,6 +118,22 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     motion = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel), held)
     notes = [*_describe_held(channel, held), *_describe_spikes(channel, spikes)]
     return motion, [*notes, *_describe_noise(channel, abs(scale), noise_sd, motion.angle_noise_sd)]
+
+
+def _check_position_signal(channel: Channel, axis: Axis) -> None:
+    """Check that every sample is an angle.
+
+    Raises:
+        BadInput: as ``check_signal``; the hint names the estimator that leaves missing samples out where it has a model
+            of the motion.
+    """
+    try:
+        check_signal(channel)
+    except BadInput as error:
+        if axis.mechanics is None or not channel.name.startswith("sense") or np.isfinite(channel.read()).all():
+            raise
+        hint = f"{error.hint}, or use --estimator tracker, which leaves such samples out"
+        raise BadInput(error.what, file=error.file, channel=error.channel, hint=hint) from error
 
 
 def _describe_noise(channel: Channel, gain: float, stated: float | None, found: float) -> list[str]:
