@@ -47,6 +47,11 @@ class Mechanics(Checked):
         """Quality factor ``sqrt(k J) / b``."""
         return sqrt(self.k * self.J) / self.b
 
+    @property
+    def fastest_pole(self) -> float:
+        """Frequency of the fastest free motion [Hz]: the resonance, or the faster exponential of an overdamped axis."""
+        return self.resonance * max(1.0, (0.5 + sqrt(max(0.25 - self.quality**2, 0.0))) / self.quality)
+
 
 @dataclass(frozen=True)
 class Capacitance(Checked):

@@ -226,7 +226,7 @@ def _rest_voltage(device: Device, axis: str, drives: list[Channel]) -> float:
 def _grid(clock: Channel, start: float, end: float, axes: tuple[str, ...], device: Device,
           drives: Mapping[str, list[Channel]], oversample: int) -> tuple[float, int, float]:  # fmt: skip
     """Step [s], number of steps, and start of the integration [s]."""
-    fastest = max(device.axis(name).resonance for name in axes)
+    fastest = max(device.axis(name).require_mechanics().fastest_pole for name in axes)
     line = max((strongest_line(c.read(), c.sample_rate) for name in axes for c in drives[name]), default=0.0)
     min_rate = max(MIN_STEPS_PER_PERIOD * fastest, MIN_STEPS_PER_DRIVE_PERIOD * line) * oversample
     rate = clock.sample_rate
@@ -261,7 +261,7 @@ def _output(channel: Channel, axes: tuple[str, ...], device: Device, step: float
     interval = decimation / channel.sample_rate
     offset = (channel.start + first / channel.sample_rate - start) / step
     data = data[: fast_transform_length(floor((n - offset) * step / interval + 1e-6) + 1)]
-    fastest = max(device.axis(name).resonance for name in axes)
+    fastest = max(device.axis(name).require_mechanics().fastest_pole for name in axes)
     drive = max((lines[name].max() for name in axes if lines[name].size), default=0.0)
     band = min(0.35 / interval, max(BAND_HARMONICS * fastest, 1.5 * drive))
     edge = FILTER_EDGE_SAMPLES if decimation > 1 else 2
