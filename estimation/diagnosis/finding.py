@@ -223,7 +223,8 @@ def parameter_estimates(
         if index is not None:
             interval = profile_interval(likelihood, fit, index)
             interval = corrected.widen(index, interval) if corrected else interval
-            ends = [parameter.value(end, scales) for end in interval]
+            # along nominal values that the recording does not determine, the value may leave the interval of the fit
+            ends = [value, *(parameter.value(end, scales) for end in interval)]
         estimates.append(
             ParameterEstimate(parameter.name, float(value), (float(min(ends)), float(max(ends))), parameter.unit)
         )

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.finding import _advice, find_probabilities
+from estimation.diagnosis import finding
+from estimation.diagnosis.finding import _advice, find_probabilities, parameter_estimates
 from scanner.terms import catalogue
 
 
@@ -53,3 +54,14 @@ def test_a_rival_on_both_axes_gets_its_advice_once() -> None:
     text = _advice(SimpleNamespace(), drift, {})  # type: ignore[arg-type]
     assert text is not None
     assert text.count("carrier-torque") == 1
+
+
+def test_the_interval_contains_the_value_of_the_improved_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    delay = Candidate(catalogue()["readout-lag"], "x", "sense")
+    model = SimpleNamespace(
+        scales=lambda axis: SimpleNamespace(rate=100.0), values=lambda candidate, x: (7.0,), index=lambda *key: 0
+    )
+    monkeypatch.setattr(finding, "profile_interval", lambda likelihood, fit, i: (2.0, 3.0))
+    monkeypatch.setattr(finding, "determined_parameters", lambda fit: None)
+    (estimate,) = parameter_estimates(SimpleNamespace(runs=()), SimpleNamespace(model=model), delay, None)  # type: ignore[arg-type]
+    assert estimate.ci95[0] <= estimate.value <= estimate.ci95[1]
