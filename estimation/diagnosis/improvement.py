@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import Fit, fit_model, misfit
+from estimation.device_fit.fit import TIME_BLOCKS, Fit, fit_model, held_out_samples, misfit
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
@@ -15,6 +17,7 @@ from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from estimation.diagnosis.significance import residual_is_noise
+from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.stages import MotionSensor
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
@@ -154,13 +157,37 @@ def improved_device(fit: Fit) -> Device:
 
 
 def _with_fitted_offset(fit: Fit, name: str, axis: Axis) -> Axis:
-    """An axis with the mean over all runs of the constant that was fitted beside the stated offset of its sensor."""
+    """An axis with the mean over all runs of the constant that was fitted beside the stated offset of its sensor.
+
+    Under noise that rises towards 0 Hz a fit leaves a part of a constant in the residual; see ``remaining_offset``.
+    """
     model, readout, values = fit.model, axis.readout, list[float]()
-    for r, run in enumerate(model.runs):
-        for output in run.outputs:
+    if not isinstance(readout, MotionSensor):
+        return axis
+    for r, (run, signals) in enumerate(zip(model.runs, model.outputs(fit.x), strict=True)):
+        for output, signal in zip(run.outputs, signals, strict=True):
             index = model.index("additive", output.name, "offset", r)
             if output.kind == "sense" and output.axes == (name,) and index is not None:
-                values.append(float(fit.x[index] * model.additive_terms(output)["offset"][0]))
-    if not values or not isinstance(readout, MotionSensor):
+                fitted = float(fit.x[index] * model.additive_terms(output)["offset"][0])
+                values.append(fitted + remaining_offset(output.data - signal, output.guard))
+    if not values:
         return axis
     return replace(axis, readout=replace(readout, offset=readout.offset + sum(values) / len(values)))
+
+
+def remaining_offset(residual: Array, guard: tuple[int, int] = (0, 0)) -> float:
+    """Constant in a residual, as far as it exceeds the scatter of slow noise between the fitted blocks of time.
+
+    Args:
+        residual: in the unit of its channel, shape (n,).
+        guard: samples at the start and at the end that are not compared.
+
+    Source: positive-part estimator, James & Stein, Proc. 4th Berkeley Symp. 1, 361 (1961).
+    """
+    size = residual.size
+    block = np.floor((np.arange(size) + 0.5) / size * TIME_BLOCKS)
+    used = ~held_out_samples(size)
+    used[: guard[0]] = used[size - guard[1] :] = False
+    means = np.array([residual[used & (block == one)].mean() for one in np.unique(block[used])])
+    mean = float(means.mean())
+    return mean * max(0.0, 1.0 - float(means.var()) / max(mean**2, 1e-300))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from estimation.diagnosis.diagnose import diagnose
+from estimation.diagnosis.improvement import _with_fitted_offset, remaining_offset
 from scanner.active_terms import stated_terms
 from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, simulate_axis
@@ -47,3 +50,25 @@ def test_the_offset_of_a_position_sensor_is_part_of_the_improved_device() -> Non
     assert readout.offset == pytest.approx(np.mean(offsets), abs=4 * NOISE_SD / np.sqrt(2400))
     loop = diagnosis.open_loop["sense_x"]
     assert loop["improved"]["rmse"] < 1.2 * NOISE_SD < 4 * NOISE_SD < loop["nominal"]["rmse"]
+
+
+def test_a_constant_that_slow_noise_hides_from_the_fit_is_part_of_the_offset() -> None:
+    residual = 0.02 + 3e-3 * np.random.default_rng(4).standard_normal(4000)
+    output = SimpleNamespace(name="sense_x", kind="sense", axes=("x",), data=residual, guard=(10, 10))
+    model = SimpleNamespace(
+        runs=[SimpleNamespace(outputs=(output,))],
+        outputs=lambda x: [[np.zeros(4000)]],
+        index=lambda *key: 0,
+        additive_terms=lambda output: {"offset": np.full(4000, 1.0)},
+    )
+    fit = SimpleNamespace(model=model, x=np.zeros(1))  # the fit has left the constant in the residual
+    readout = _with_fitted_offset(fit, "x", STAGE).readout  # type: ignore[arg-type]
+    assert isinstance(readout, Position)
+    assert readout.offset == pytest.approx(0.02, rel=0.02)
+
+
+def test_the_mean_of_a_random_walk_is_no_offset() -> None:
+    rng = np.random.default_rng(5)
+    walks = np.cumsum(rng.standard_normal((40, 2000)), axis=1) / 2000**0.5
+    walks -= walks.mean(axis=1, keepdims=True) - rng.normal(0.0, 0.1, (40, 1))
+    assert all(abs(remaining_offset(walk)) < 0.5 * abs(walk.mean()) + 0.01 for walk in walks)
