@@ -23,6 +23,7 @@ from scanner.device import Axis, Device
 from scanner.integrator.nodes import nodes_to_samples
 from scanner.stages import Acceleration
 from scanner.terms.driven_modes import EFFECT, mode_response
+from scanner.terms.term import MIN_MODE_QUALITY
 
 MIN_FURTHER_MODES = 2
 """Further modes from which they are stated together. One is left to ``second-mode``, and a direct part of the drive to
@@ -233,6 +234,7 @@ def _heights(columns: _Columns, modes: Array) -> tuple[Array, Array]:
     """Heights of the modes' responses and of the drive by linear least squares, and the residual."""
     table = columns.table(modes)
     size = np.linalg.norm(table, axis=0)
+    size[size == 0.0] = 1.0  # a critically damped mode has no decay in quadrature
     heights = np.linalg.lstsq(table / size, columns.data, rcond=None)[0] / size
     return heights[: 2 * len(modes) + 1], columns.data - table @ heights
 
@@ -250,11 +252,10 @@ def _fit(columns: _Columns, modes: Array) -> tuple[Array, Array]:
 
     start = np.log(modes).ravel()
     reach = np.tile([0.2, 3.0], len(modes))
-    high = start + reach
+    low, high = start - reach, start + reach
+    low[1::2] = np.maximum(low[1::2], np.minimum(np.log(MIN_MODE_QUALITY), start[1::2] - 1e-6))
     high[1::2] = np.maximum(np.log(MAX_QUALITY), start[1::2] + 1e-6)
-    best = least_squares(
-        residual, start, bounds=(start - reach, high), x_scale=0.1 * reach, diff_step=1e-4, max_nfev=FIT_STEPS
-    )
+    best = least_squares(residual, start, bounds=(low, high), x_scale=0.1 * reach, diff_step=1e-4, max_nfev=FIT_STEPS)
     return np.exp(best.x.reshape(-1, 2)), best.fun
 
 

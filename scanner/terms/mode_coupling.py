@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from scanner.integrator.abi import TORQUE_LAW
-from scanner.terms.term import Parameter, Term
+from scanner.terms.term import MIN_MODE_QUALITY, Parameter, Term
 
 
 @njit(TORQUE_LAW, cache=True)
@@ -29,7 +29,7 @@ TERM = Term(
     parameters=(
         Parameter("g", "1/rad", lambda s: 0.08 / s.amplitude, starts=(0.4, -0.4, 1.0, -1.0, 2.0, -2.0)),
         Parameter("f2", "Hz", lambda s: s.rate / (4.0 * np.pi), kind="log", spread=0.01, starts=(-0.2, 0.0, 0.2)),
-        Parameter("Q2", "1", lambda s: 80.0, kind="log", spread=0.5),
+        Parameter("Q2", "1", lambda s: 80.0, kind="log", spread=0.5, minimum=MIN_MODE_QUALITY),
         # Small, but the mode grows from it, and its size sets the time at which the mode has grown.
         Parameter("s", "rad^0.5", lambda s: 0.01 * s.amplitude**0.5, starts=(1.0,)),
     ),

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from scanner.integrator.abi import TORQUE_LAW
-from scanner.terms.term import Parameter, Term
+from scanner.terms.term import MIN_MODE_QUALITY, Parameter, Term
 
 
 @njit(TORQUE_LAW, cache=True)
@@ -30,7 +30,7 @@ TERM = Term(
             spread=0.3,
             starts=(-0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4),
         ),
-        Parameter("Q2", "1", lambda s: 100.0, kind="log"),
+        Parameter("Q2", "1", lambda s: 100.0, kind="log", minimum=MIN_MODE_QUALITY),
     ),
     hidden_state_scales=(lambda s: s.amplitude**2, lambda s: 2.0 * s.rate * s.amplitude**2),
     source="Antonio, Zanette & López, Nat. Commun. 3, 806 (2012)",

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from scanner.integrator.abi import TORQUE_LAW
-from scanner.terms.term import Parameter, Term
+from scanner.terms.term import MIN_MODE_QUALITY, Parameter, Term
 
 
 @njit(TORQUE_LAW, cache=True)
@@ -26,7 +26,7 @@ TERM = Term(
             "f2", "Hz", lambda s: s.rate / (2.0 * np.pi), kind="log", starts=tuple(0.08 * i for i in range(-17, 18))
         ),
         Parameter(
-            "Q2", "1", lambda s: 40.0, kind="log", starts=(-0.7,)
+            "Q2", "1", lambda s: 40.0, kind="log", starts=(-0.7,), minimum=MIN_MODE_QUALITY
         ),  # broad enough to be detected between two start values of f2
     ),
     hidden_state_scales=(lambda s: s.amplitude, lambda s: s.amplitude * s.rate),

@@ -43,6 +43,11 @@ MAX_LOG_RATIO = 60.0
 exponents, which a fit may try, would overflow."""
 
 
+MIN_MODE_QUALITY = 0.5
+"""Quality factor of critical damping. Below it a mode does not oscillate: it is a relaxation, which has names of its
+own."""
+
+
 @dataclass(frozen=True)
 class NaturalScales:
     """Natural sizes of one axis in one recording, which set the prior ranges of parameters.
@@ -100,6 +105,7 @@ class Parameter:
         spread: standard deviation a priori of the logarithm, for ``factor`` and ``log``.
         sign: +1 or -1 where physics allows only x of that sign, 0 where both.
         starts: values of x to start a search from, for a ``log`` parameter.
+        minimum: lower bound of a ``log`` parameter, which is added to the above, in its unit.
     """
 
     name: str
@@ -109,6 +115,7 @@ class Parameter:
     spread: float = 1.0
     sign: int = 0
     starts: tuple[float, ...] = (0.0,)
+    minimum: float = 0.0
 
     def value(self, x: float, scales: NaturalScales) -> float:
         """Return the physical value for ``x`` in a recording with the given scales."""
@@ -121,7 +128,7 @@ class Parameter:
             return size
         if self.kind == "line":
             return size + x / scales.duration
-        return size * float(np.exp(np.clip(self.spread * x, -MAX_LOG_RATIO, MAX_LOG_RATIO)))
+        return self.minimum + size * float(np.exp(np.clip(self.spread * x, -MAX_LOG_RATIO, MAX_LOG_RATIO)))
 
 
 @dataclass(frozen=True)

@@ -324,3 +324,11 @@ def test_clipping_applies_to_the_input_of_the_converter() -> None:
     assert np.array_equal(*both)
     assert both[0].max() <= 0.6 < 0.9 < late.max()
     assert np.allclose(both[0], np.clip(late, -0.6, 0.6), atol=2e-3)
+
+
+@pytest.mark.parametrize("effect", ["second-mode", "overtone-coupling", "mode-coupling"])
+def test_a_further_mode_is_an_oscillation_whatever_a_fit_tries(effect: str) -> None:
+    scales = NaturalScales(amplitude=0.1, rate=1e3, J=1e-6, b=1e-5, k=1.0, duration=1.0)
+    (quality,) = (parameter for parameter in catalogue()[effect].parameters if parameter.name == "Q2")
+    assert all(quality.value(x, scales) >= 0.5 for x in np.linspace(-30.0, 5.0, 36))
+    assert quality.value(0.0, scales) > 20.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation.device_fit.data import Run, prepare_run
-from estimation.device_fit.further_modes import find_modes, with_driven_modes
+from estimation.device_fit.further_modes import _band, _Columns, _fit, _heights, find_modes, with_driven_modes
 from estimation.diagnosis import diagnose as diagnosing
 from recon.report.conclusions import conclude_diagnosis
 from scanner.active_terms import stated_terms
@@ -115,3 +115,13 @@ def test_the_aircraft_has_six_further_modes(measured_data: Path) -> None:
     assert found is not None
     assert {3.4, 5.1, 6.4, 9.0} <= {round(f, 1) for f in found["frequency"]}  # type: ignore[union-attr]
     assert found["direct"] == pytest.approx(0.011, abs=0.003)
+
+
+def test_a_mode_stays_an_oscillation_and_a_critically_damped_one_has_finite_heights() -> None:
+    runs, nominal, _ = prepared({}, Acceleration(1.0, 1e-3))
+    columns = _Columns([band for run in runs if (band := _band(run, nominal)) is not None])
+    own = [nominal.resonance, nominal.quality]
+    assert np.all(np.isfinite(_heights(columns, np.array([own, [12.0, 0.5]]))[0]))
+    modes, residual = _fit(columns, np.array([own, [12.0, 0.6]]))
+    assert np.all(modes[:, 1] >= 0.5)
+    assert np.all(np.isfinite(residual))
