@@ -27,15 +27,12 @@ from estimation.diagnosis.linear_model import (
 )
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.diagnosis.necessity import NO_LAWS, Need, need_of_laws
+from estimation.diagnosis.rival_laws import MAX_ALTERNATIVES, near_rivals, stated_confounders
 from estimation.diagnosis.significance import DETECTION_THRESHOLD, satisfies_sign_constraints
 from estimation.parallel import map_fits
 
 MAX_LINEARISATIONS = 8
 """Fits around which laws are selected, each with the laws selected before."""
-
-MAX_ALTERNATIVES = 6
-"""Laws that are fitted in the place of each other, the best in the linear model: single laws around a discrepancy, as
-sensitivities do not rank them well, and near rivals of selected laws. Each costs a fit."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +170,7 @@ def _iterate_selection(
         if not fitted and present:
             fits[present] = centre.fit
         fits = {effects: fit for effects, fit in fits.items() if centre.is_followed_by(fit)}
-        if _has_no_addition(centre, options, fits) and not centre.takes_bulk(nominal):
+        if _addition_failed(centre, options, fits, nominal):
             more = _fit_sets(centre, _further_additions(centre, fitted.keys() | options.keys()), fitted)
             fits |= {effects: fit for effects, fit in more.items() if centre.is_followed_by(fit)}
         if not fits:
@@ -211,10 +208,15 @@ def _propose_laws(centre: _Centre, kept: tuple[int, ...], first: bool) -> list[t
     return [linear.select().laws, linear.strongest_together(), *alone]
 
 
-def _has_no_addition(centre: _Centre, options: Collection[Effects], fits: Mapping[Effects, Fit]) -> bool:
-    """Whether laws were added to those of a fit, and none of the new fits has a better evidence."""
-    are_additions = all(centre.effects and centre.effects < effects for effects in options)
-    return are_additions and all(fit.neg2_log_evidence > centre.fit.neg2_log_evidence for fit in fits.values())
+def _addition_failed(centre: _Centre, options: Collection[Effects], fits: Mapping[Effects, Fit], nominal: Fit) -> bool:
+    """Whether laws were added to those of a fit in vain, so that other ones may be added.
+
+    The new fits are not possible, or not better while the laws so far leave much.
+    """
+    if not all(centre.effects and centre.effects < effects for effects in options):
+        return False
+    is_better = any(fit.neg2_log_evidence <= centre.fit.neg2_log_evidence for fit in fits.values())
+    return not fits or not (is_better or centre.takes_bulk(nominal))
 
 
 def _further_additions(centre: _Centre, fitted: Collection[Effects]) -> dict[Effects, tuple[int, ...]]:
@@ -291,8 +293,9 @@ def _exchange_near_rival(
 
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
     ``DETECTION_THRESHOLD`` are fitted, each once, the best in the place of every law first, and compared around their
-    own fits. Where corrections gain no more than that beside the laws, they have no part in the comparison: beside a
-    fit that leaves only noise, one that leaves more to corrections is not a better one.
+    own fits. Where the laws leave more than noise, so are the confounders that their terms state. Where corrections
+    gain no more than that beside the laws, they have no part in the comparison: beside a fit that leaves only noise,
+    one that leaves more to corrections is not a better one.
 
     Returns:
         that fit, and all fits that were compared under the same noise.
@@ -300,7 +303,10 @@ def _exchange_near_rival(
     discrepancies = [] if centre.leaves_noise else list(filter(is_discrepancy, candidates))
     present = centre.alone if centre.leaves_noise else centre.beside
     best, lowest = None, present.neg2_log_evidence - MIN_EXCHANGE_GAIN
-    rivals = _fit_sets(centre, _near_rivals(centre.linear, centre.beside, fitted), fitted)
+    near = near_rivals(centre.linear, centre.beside, fitted)
+    if not centre.leaves_noise:
+        near |= stated_confounders(centre.linear, centre.laws, fitted.keys() | near.keys())
+    rivals = _fit_sets(centre, near, fitted)
     fitted |= rivals
     compared = {effects: fit for effects, fit in rivals.items() if centre.is_followed_by(fit)}
     for fit in compared.values():
@@ -310,22 +316,3 @@ def _exchange_near_rival(
         if score < lowest:
             best, lowest = fit, score
     return best, {centre.effects: centre.fit, **compared}
-
-
-def _near_rivals(
-    linear: LinearModel, hypothesis: Hypothesis, fitted: Collection[Effects]
-) -> dict[Effects, tuple[int, ...]]:
-    """Laws with one exchanged that are within ``DETECTION_THRESHOLD`` of a hypothesis and have not been fitted.
-
-    The first are the best ones in the place of every law, then the second ones, up to ``MAX_ALTERNATIVES``.
-    """
-    ranked: list[tuple[int, float, tuple[int, ...]]] = []
-    for removed in hypothesis.laws:
-        rest = tuple(law for law in hypothesis.laws if law != removed)
-        best: dict[Effects, Hypothesis] = {}
-        for rival in sorted(linear.beside(rest, hypothesis.scales), key=lambda one: one.neg2_log_evidence):
-            if rival.neg2_log_evidence < hypothesis.neg2_log_evidence + DETECTION_THRESHOLD:
-                best.setdefault(linear.effects(rival.laws), rival)
-        new = [rival for effects, rival in best.items() if effects not in fitted]
-        ranked += [(rank, rival.neg2_log_evidence, rival.laws) for rank, rival in enumerate(new)]
-    return {linear.effects(laws): laws for _, _, laws in sorted(ranked)[:MAX_ALTERNATIVES]}
