@@ -132,5 +132,12 @@ def describe_unexplained(result: SelectionResult) -> str | None:
         deviation = float(np.sqrt(np.mean([samples.var() for samples in data])))
         residual = float(np.sqrt(max(0.0, mean_square - noise[name])))
         if residual > MAX_UNEXPLAINED_SHARE * deviation:
-            parts.append(f"{residual / deviation:.0%} of {name} is not explained")
+            parts.append(_describe_residual(name, residual / deviation))
     return "; ".join(parts)
+
+
+def _describe_residual(channel: str, ratio: float) -> str:
+    """The residual of a channel over its standard deviation, in words."""
+    if ratio >= 1.0:
+        return f"the residual of {channel} is {ratio:.2g} times the signal"
+    return f"{ratio:.0%} of {channel} is not explained"

@@ -17,6 +17,9 @@ MIN_USABLE_FRACTION = 0.5
 """Fraction of the scan within the bound below which a picture is called blurred, and no estimator is recommended: most
 samples are then in a wrong pixel."""
 
+MIN_CERTAIN_PROBABILITY = 0.9
+"""Probability of a finding from which it is stated without its probability."""
+
 
 def condition_on_clock(summary: Mapping[str, Any]) -> str:
     """The condition on which standard deviations of the phase hold, for a list in brackets; empty without a doubt."""
@@ -108,25 +111,35 @@ def _describe_hum(content: Mapping[str, Any]) -> str:
 
 def _describe_open_loop(content: Mapping[str, Any]) -> str:
     """How well the corrected device predicts, beside the nominal one; empty if they are the same."""
-    errors = [
-        f"{percent(loop['improved']['fraction'])} of {channel} (nominal {percent(loop['nominal']['fraction'])})"
+    changed = {
+        channel: (loop["improved"]["fraction"], loop["nominal"]["fraction"])
         for channel, loop in content.get("open_loop", {}).items()
         if loop["improved"] != loop["nominal"]
-    ]
-    if not errors:
+    }
+    if not changed:
         return ""
-    listed = ", ".join(errors)
-    return f" From the drive alone, device.toml predicts samples that were not fitted with an error of {listed}."
+    listed = ", ".join(
+        f"{percent(after)} of {name} (nominal {percent(before)})" for name, (after, before) in changed.items()
+    )
+    text = (
+        " From drive and initial state alone, device.toml predicts samples that were not fitted with an error of "
+        f"{listed}."
+    )
+    useless = [name for name, (after, _) in changed.items() if after >= 1.0]
+    if useless:
+        text += f" That is no better than no prediction of {' and '.join(useless)}."
+    return text
 
 
 def _describe_findings(findings: Sequence[Mapping[str, Any]]) -> str:
-    """What the device lacks, then what it may lack: effects that are less probable than another explanation."""
-    probable = [finding for finding in findings if finding["probability"] >= 0.5]
-    parts = ["The nominal device lacks " + "; and ".join(map(_describe_finding, probable)) + "."] if probable else []
+    """What the device lacks, then what it may lack: effects of which other explanations are not excluded."""
+    certain = [finding for finding in findings if finding["probability"] >= MIN_CERTAIN_PROBABILITY]
+    parts = ["The nominal device lacks " + "; and ".join(map(_describe_finding, certain)) + "."] if certain else []
     for finding in findings:
-        if finding not in probable:
+        if finding not in certain:
             others = "".join(f" ({rival['effect']}: {rival['probability']:.0%})" for rival in finding["rivals"][:1])
-            what = f"may lack {_describe_finding(finding)}, with a probability of {finding['probability']:.0%}{others}."
+            verb = "probably lacks" if finding["probability"] >= 0.5 else "may lack"
+            what = f"{verb} {_describe_finding(finding)}, with a probability of {finding['probability']:.0%}{others}."
             parts.append(f"{'It' if parts else 'The nominal device'} {what}")
     return " ".join(parts)
 

@@ -192,3 +192,11 @@ def test_a_recording_that_cannot_serve_is_refused(rate: float, samples: int, wha
     recording = Recording.from_arrays({"sense_x": (decay, "V", rate, 0.0)}, Device("beam", {"x": axis}))
     with pytest.raises(BadInput, match=what):
         prepare_run(recording, Device("beam", {"x": axis}))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "text"),
+    [(1.96, "the residual of sense_x is 2 times the signal"), (0.19, "19% of sense_x is not explained")],
+)
+def test_an_unexplained_part_is_never_more_than_all_of_a_channel(ratio: float, text: str) -> None:
+    assert shares._describe_residual("sense_x", ratio) == text

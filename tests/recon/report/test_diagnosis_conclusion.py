@@ -79,3 +79,18 @@ def test_an_effect_that_is_less_probable_than_another_explanation_is_not_asserte
 def test_a_blur_within_its_uncertainty_is_not_stated(blur_px: tuple[float, float], stated: bool) -> None:
     content = {"verdict": "mismatch", "findings": [found("second-mode", 0.98)]}
     assert ("Predicted from the drive alone" in conclude_diagnosis(content, blur_px)) is stated
+
+
+@pytest.mark.parametrize(("probability", "verb"), [(0.97, "lacks "), (0.52, "probably lacks "), (0.3, "may lack ")])
+def test_a_name_is_asserted_as_far_as_it_is_probable(probability: float, verb: str) -> None:
+    finding = found("viscoelastic", probability, ("unknown", 1.0 - probability))
+    text = conclude_diagnosis({"verdict": "mismatch", "findings": [finding]})
+    assert text.startswith(f"The nominal device {verb}viscoelastic")
+    assert (f"with a probability of {probability:.0%}" in text) is (probability < 0.9)
+
+
+@pytest.mark.parametrize(("rmse", "useless"), [(4.5, True), (0.3, False)])
+def test_a_prediction_that_misses_the_signal_is_called_so(rmse: float, useless: bool) -> None:
+    loops = {"sense_x": {"nominal": open_loop(9.0), "improved": open_loop(rmse)}}
+    text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("unknown", 1.0)], "open_loop": loops})
+    assert ("That is no better than no prediction of sense_x." in text) is useless
