@@ -16,7 +16,7 @@ from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.significance import residual_is_noise
+from estimation.diagnosis.significance import DETECTION_THRESHOLD, held_out_gain, residual_is_noise
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.stages import MotionSensor
@@ -49,14 +49,15 @@ class Improvement:
 def improve(result: SelectionResult) -> Improvement:
     """Improve the device by the findings that its open-loop prediction bears out.
 
-    The weakest finding is removed as long as the prediction rejects it; a rail at which samples stand is certain and
-    stays. If the findings leave noise alone, they are rejected by a prediction that is worse than that of the nominal
-    device, beyond the uncertainty of the comparison; within it they stay, but the nominal device takes the place of one
-    with a larger error. If they leave more than noise, they have to lower the error, and the weakest of them too. A
-    discrepancy term always remains a finding, but if the device with its measured law predicts any channel of any run
-    worse, the device with the named laws alone is returned, or the nominal one if that is worse too.
+    Findings beside others that the held-out samples contradict are rejected first. The weakest finding is removed as
+    long as the prediction rejects it; a rail at which samples stand is certain and stays. If the findings leave noise
+    alone, they are rejected by a prediction that is worse than that of the nominal device, beyond the uncertainty of
+    the comparison; within it they stay, but the nominal device takes the place of one with a larger error. If they
+    leave more than noise, they have to lower the error, and the weakest of them too. A discrepancy term always remains
+    a finding, but if the device with its measured law predicts any channel of any run worse, the device with the named
+    laws alone is returned, or the nominal one if that is worse too.
     """
-    result = _settled(result)
+    result = without_contradicted(_settled(result))
     runs, stated = result.likelihood.runs, result.final.model.device
     nominal = open_loop(runs, stated)
     while True:
@@ -117,10 +118,32 @@ def _fit_static_law(result: SelectionResult) -> Fit:
 
 def without_weakest(result: SelectionResult) -> SelectionResult:
     """The result of a selection without the fitted finding whose removal raises the misfit least, refitted."""
-    fitted = [step for step in result.steps if step.candidate.term.free_parameters]
-    weakest = min(fitted, key=lambda step: misfit(step.before))
-    remaining = [step for step in result.steps if step is not weakest]
-    final = refit_without(result.likelihood, result.final, weakest.candidate) if remaining else result.nominal
+    return _without(result, min(_fitted(result), key=lambda step: misfit(step.before)))
+
+
+def without_contradicted(result: SelectionResult) -> SelectionResult:
+    """The result of a selection without findings beside others that the held-out samples contradict, refitted.
+
+    Without such a finding the misfit of these samples is lower by more than a law has to gain: it follows the noise, or
+    what no law describes, in the fitted samples alone.
+    """
+    while len(_fitted(result)) > 1:
+        gain, i = min((held_out_gain(step.before, step.after), i) for i, step in enumerate(_fitted(result)))
+        if gain >= -DETECTION_THRESHOLD:
+            break
+        result = _without(result, _fitted(result)[i])
+    return result
+
+
+def _fitted(result: SelectionResult) -> list[SelectionStep]:
+    """The steps whose terms have parameters that are fitted; a rail at which samples stand has none."""
+    return [step for step in result.steps if step.candidate.term.free_parameters]
+
+
+def _without(result: SelectionResult, removed: SelectionStep) -> SelectionResult:
+    """The result of a selection without one of its findings, refitted."""
+    remaining = [step for step in result.steps if step is not removed]
+    final = refit_without(result.likelihood, result.final, removed.candidate) if remaining else result.nominal
 
     def refit(step: SelectionStep) -> SelectionStep:
         before = refit_without(result.likelihood, final, step.candidate) if len(remaining) > 1 else result.nominal

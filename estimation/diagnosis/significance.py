@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.slow_noise import steeper_noise_gain
 
@@ -35,6 +37,12 @@ def evidence_gain(likelihood: Likelihood, before: Fit, after: Fit) -> float:
     gain = before.neg2_log_evidence - after.neg2_log_evidence
     gain += steeper_noise_gain(likelihood, after) - steeper_noise_gain(likelihood, before)
     return gain if gain >= DETECTION_THRESHOLD else 0.0
+
+
+def held_out_gain(before: Fit, after: Fit) -> float:
+    """Fall of the misfit of the held-out samples from ``before`` to ``after``, fits under one likelihood."""
+    rows = after.validation_rows
+    return float(np.sum(before.residual[rows] ** 2) - np.sum(after.residual[rows] ** 2))
 
 
 def residual_is_noise(fit: Fit) -> bool:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from estimation.diagnosis import improvement
 from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.improvement import _with_fitted_offset, remaining_offset
+from estimation.diagnosis.improvement import _with_fitted_offset, remaining_offset, without_contradicted
+from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from scanner.active_terms import stated_terms
 from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, simulate_axis
@@ -72,3 +75,22 @@ def test_the_mean_of_a_random_walk_is_no_offset() -> None:
     walks = np.cumsum(rng.standard_normal((40, 2000)), axis=1) / 2000**0.5
     walks -= walks.mean(axis=1, keepdims=True) - rng.normal(0.0, 0.1, (40, 1))
     assert all(abs(remaining_offset(walk)) < 0.5 * abs(walk.mean()) + 0.01 for walk in walks)
+
+
+def fit_with_residual(size: float) -> Any:
+    """A fit with 100 held-out samples that it misses by ``size`` [sigma]."""
+    return SimpleNamespace(residual=np.full(100, size), validation_rows=np.ones(100, bool))
+
+
+@pytest.mark.parametrize(("without_imitation", "kept"), [(1.0, 2), (1.05, 2), (0.8, 1)])
+def test_a_finding_that_held_out_samples_contradict_is_rejected(
+    without_imitation: float, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    final, reduced = fit_with_residual(1.0), fit_with_residual(without_imitation)
+    monkeypatch.setattr(improvement, "refit_without", lambda likelihood, fit, candidate: reduced)
+    before = {"true": fit_with_residual(5.0), "imitation": reduced}
+    candidates = {name: SimpleNamespace(term=SimpleNamespace(free_parameters=("size",)), name=name) for name in before}
+    steps = tuple(SelectionStep(cast(Any, candidates[name]), fit, final, ()) for name, fit in before.items())
+    result = without_contradicted(SelectionResult(cast(Any, None), fit_with_residual(9.0), final, steps))
+    assert [step.candidate.name for step in result.steps] == ["true", "imitation"][:kept]  # type: ignore[attr-defined]
+    assert result.final is (final if kept == 2 else reduced)
