@@ -21,6 +21,10 @@ MAX_UNEXPLAINED_SHARE = 0.1
 """Largest residual, without the noise and as a share of a channel's standard deviation, of a fit that is called
 consistent: a tenth of the signal is visible in a plot whatever its chi-square."""
 
+MAX_NOISE_RATIO = 10.0
+"""Noise over the stated one up to which a residual that is visible in a plot may be noise. Flicker noise, hum or a data
+sheet account for some times the stated noise; the residual of a broad drive may resemble noise at any size."""
+
 MIN_REMAINDER_SHARE = 1e-3
 """Share of the misfit below which no remainder is stated: held-out samples scatter by as much."""
 
@@ -120,20 +124,25 @@ def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dic
 
 def describe_unexplained(result: SelectionResult) -> str | None:
     """The unexplained misfit in words; None if the final fit is consistent with the noise."""
-    if residual_is_noise(result.final):
-        return None
-    chi2 = result.final.validation_chi2
-    parts = [
-        f"samples that were not fitted are missed by {chi2**0.5:.3g} times the noise (reduced chi-square {chi2:.3g})"
-    ]
+    is_noise, chi2 = residual_is_noise(result.final), result.final.validation_chi2
+    parts = []
+    if not is_noise:
+        parts.append(
+            f"samples not used in the fit are missed by {chi2**0.5:.3g} times the noise (chi-square {chi2:.3g})"
+        )
     noise = noise_by_channel(result.likelihood)
     for name, mean_square in misfit_by_channel(result.final).items():
-        data = [output.data for run in result.likelihood.runs for output in run.outputs if output.name == name]
-        deviation = float(np.sqrt(np.mean([samples.var() for samples in data])))
+        outputs = [output for run in result.likelihood.runs for output in run.outputs if output.name == name]
+        deviation = float(np.sqrt(np.mean([output.data.var() for output in outputs])))
         residual = float(np.sqrt(max(0.0, mean_square - noise[name])))
-        if residual > MAX_UNEXPLAINED_SHARE * deviation:
+        if not is_noise and residual > MAX_UNEXPLAINED_SHARE * deviation:
             parts.append(_describe_residual(name, residual / deviation))
-    return "; ".join(parts)
+        as_noise = float(np.sqrt(min(noise[name], mean_square)))
+        stated = max(output.noise_sd or np.inf for output in outputs)
+        if as_noise > max(MAX_UNEXPLAINED_SHARE * deviation, MAX_NOISE_RATIO * stated):
+            share, ratio = as_noise / deviation, as_noise / stated
+            parts.append(f"{share:.0%} of {name} (rms) counts as noise, {ratio:.0f} times the stated noise")
+    return "; ".join(parts) or None
 
 
 def _describe_residual(channel: str, ratio: float) -> str:

@@ -20,7 +20,13 @@ from estimation.diagnosis.clipping import find_rail
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.screening import ScoreTest
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.shares import explained_share, find_remainder, remaining_share, share_of_finding
+from estimation.diagnosis.shares import (
+    describe_unexplained,
+    explained_share,
+    find_remainder,
+    remaining_share,
+    share_of_finding,
+)
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -51,6 +57,21 @@ def test_the_share_is_that_of_the_channel_that_shows_the_effect(monkeypatch: pyt
     step = SimpleNamespace(before=without)
     share = share_of_finding(cast(SelectionResult, result), cast(SelectionStep, step))
     assert share == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(("noise_sd", "said"), [(None, None), (0.02, None), (1e-3, "150 times the stated noise")])
+def test_a_visible_residual_is_no_noise_where_much_less_noise_is_stated(
+    monkeypatch: pytest.MonkeyPatch, noise_sd: float | None, said: str | None
+) -> None:
+    """Under a broad drive the residual of a wrong law resembles noise, and the noise is measured from it."""
+    data = np.sqrt(2.0) * np.sin(0.1 * np.arange(6283))
+    run = SimpleNamespace(outputs=[SimpleNamespace(name="sense_x", data=data, noise_sd=noise_sd)])
+    monkeypatch.setattr(shares, "residual_is_noise", lambda fit: True)
+    monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: {"sense_x": 0.15**2})
+    monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 0.2**2})
+    result = SimpleNamespace(final=SimpleNamespace(validation_chi2=0.9), likelihood=SimpleNamespace(runs=[run]))
+    text = describe_unexplained(cast(SelectionResult, result))
+    assert text == (said and f"15% of sense_x (rms) counts as noise, {said}")
 
 
 @pytest.mark.parametrize(("remaining", "stated"), [(-5.0, False), (9.0, False), (800.0, True)])
