@@ -11,3 +11,9 @@ def counted(number: int, noun: str) -> str:
 def percent(share: float) -> str:
     """A share in percent; small ones with two significant digits, so that they never read as none."""
     return f"{100.0 * share:.0f}%" if share >= 0.1 else f"{100.0 * share:.2g}%"
+
+
+def sentence(text: str) -> str:
+    """Text with a capital first letter and a full stop; the name of a channel before a colon stays as it is."""
+    first = text.split(maxsplit=1)[0]
+    return f"{text if first.endswith(':') else text[0].upper() + text[1:]}."

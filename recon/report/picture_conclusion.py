@@ -9,6 +9,7 @@ from recon.imaging.blur import SHARP_FRACTION
 from recon.imaging.scan_phase.readout_phase import REPORTED_SDS
 from recon.report.conclusions import MIN_USABLE_FRACTION, condition_on_clock
 from recon.report.numbers import format_degrees, format_uncertain
+from scanner.wording import sentence
 
 SIGNALS_BY_ESTIMATOR = {"sensor": "position signal is", "edges": "list of sync edges is"}
 """The signal that an estimator takes the phase from, where it is not the sense signal."""
@@ -38,7 +39,7 @@ def conclude_reconstruction(summary: Mapping[str, Any]) -> str:
     Args:
         summary: content of summary.json.
     """
-    limits = "".join(f"{limit[0].upper()}{limit[1:]}. " for limit in summary["limits"])
+    limits = "".join(f"{sentence(limit)} " for limit in summary["limits"])
     text = f"{limits}{_describe_readout_phase(summary)}"
     if _is_readout_unchecked(summary):
         causes = [each for each in _sample_displacements(summary) if each.within < SHARP_FRACTION]

@@ -32,6 +32,7 @@ from recon.report.phase_slider import phase_slider_data
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.steps.reconstruction import Reconstruction
 from scanner.device import AXES
+from scanner.wording import sentence
 
 
 def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fill_radius: int = 0) -> str:
@@ -200,7 +201,7 @@ def sample_motion_sections(result: Reconstruction) -> list[Section]:
     uri = sample_motion_figure(motion.times(result.intensity), motion.shift, motion.sd)
     figure = Figure(uri, "displacement of the sample with ±2 standard deviations; its mean is not determined")
     text = describe_sample_motion(motion, result.intensity.sample_rate)
-    return [Section("Motion of the sample", f"{text[0].upper()}{text[1:]}.", figures=[figure], least="26rem")]
+    return [Section("Motion of the sample", sentence(text), figures=[figure], least="26rem")]
 
 
 def blur_figure_of(parts: Mapping[str, Mapping[str, float]], p: float) -> Figure:

@@ -4,12 +4,17 @@ import numpy as np
 import pytest
 
 from lissajous import Recording
-from scanner.wording import counted
+from scanner.wording import counted, sentence
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "0 values"), (1, "1 value"), (2, "2 values")])
 def test_one_is_singular(number: int, text: str) -> None:
     assert counted(number, "value") == text
+
+
+def test_a_sentence_keeps_the_name_of_its_channel() -> None:
+    assert sentence("the picture is mirrored") == "The picture is mirrored."
+    assert sentence("sense_x: is clipped in 3 %") == "sense_x: is clipped in 3 %."
 
 
 def test_a_recording_counts_its_edges() -> None:

@@ -24,7 +24,7 @@ def test_only_a_picture_that_shows_its_scene_is_called_sharp() -> None:
     saturated = conclude(np.minimum(light, np.quantile(light, 0.3)))
     assert "the detector is saturated" in saturated.split(". ")[0]
     noise = np.random.default_rng(0).normal(1.0, 0.1, light.size)
-    assert conclude(noise).startswith("Intensity: no structure beyond the noise")
+    assert conclude(noise).startswith("intensity: no structure beyond the noise")
     assert "The motion alone would give a picture that is" in saturated
     for text in (saturated, conclude(noise)):
         assert "The picture is" not in text
