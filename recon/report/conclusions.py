@@ -195,8 +195,8 @@ def conclude_prediction(summary: Mapping[str, Any]) -> str:
         f"{format_value(channel['rmse'], 3)} {channel['unit']} rms)"
     )
     if channel["noise_sd"] and channel["rmse"] > 1.5 * channel["noise_sd"]:
-        ratio = channel["rmse"] / channel["noise_sd"]
-        return text + f", {ratio:.2g} times its noise. Run lissajous diagnose to find what the device lacks."
+        ratio = format_value(channel["rmse"] / channel["noise_sd"], 2)
+        return text + f", {ratio} times its noise. Run lissajous diagnose to find what the device lacks."
     return text + "."
 
 
@@ -284,7 +284,7 @@ def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
     points, shots = counted(summary["points"], "point"), counted(summary["shots"], "shot")
     return (
         f"{points} from {shots}, up to {reach:.3g} m away, with a standard deviation of "
-        f"at most {1e3 * sd:.2g} mm (rms of an axis{of_angles}). Use {file}."
+        f"at most {format_value(1e3 * sd, 2)} mm (rms of an axis{of_angles}). Use {file}."
     )
 
 
