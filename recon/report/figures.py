@@ -232,21 +232,17 @@ def sample_motion_figure(time: Array, shift: Array, sd: Array) -> str:
 
 def blur_figure(parts: Mapping[str, Mapping[str, float]], p: float) -> str:
     """Blur by cause [px], one group of bars a cause with one bar for each entry of ``parts``, and the tolerated p."""
-    drawing, axes = new_figure(size=(NARROW_WIDTH_IN, 2.4))
+    drawing, axes = new_figure(size=(NARROW_WIDTH_IN, 2.8))
     panel = axes[0, 0]
     causes = list(next(iter(parts.values())))
-    width = 0.8 / len(parts)
+    height = 0.8 / len(parts)
     for i, ((name, values), colour) in enumerate(zip(parts.items(), COLOURS, strict=False)):
-        panel.bar(
-            np.arange(len(causes)) + (i - (len(parts) - 1) / 2) * width,
-            list(values.values()),
-            width,
-            color=colour,
-            label=name,
-        )
-    panel.axhline(p, color="#444", lw=0.8, ls="--")
-    panel.text(len(causes) - 0.5, p, " p", va="center")
-    panel.set(xticks=np.arange(len(causes)), xticklabels=causes, ylabel="blur, rms [px]")
+        rows = np.arange(len(causes)) + (i - (len(parts) - 1) / 2) * height
+        panel.barh(rows, list(values.values()), height, color=colour, label=name)
+    panel.axvline(p, color="#444", lw=0.8, ls="--")
+    panel.text(p, 1.0, "p", ha="center", va="bottom", transform=panel.get_xaxis_transform())
+    panel.set(yticks=np.arange(len(causes)), yticklabels=causes, xlabel="blur, rms [px]")
+    panel.invert_yaxis()
     panel.legend(frameon=False, fontsize=8)
     return figure_uri(drawing)
 
