@@ -32,12 +32,15 @@ MIN_REMAINDER_SHARE = 1e-3
 def explained_share(without: float, complete: float, nominal: float, noise: float) -> float:
     """Share of the nominal misfit by which the misfit rises if one finding is removed from the complete model.
 
+    Without it the others may follow the motion worse than the nominal model; that counts as the nominal misfit, so that
+    no finding explains more than all together do.
+
     Args:
         without: mean square misfit of the complete model without the finding.
         complete, nominal: of the complete and of the nominal model.
         noise: variance of the noise.
     """
-    return float(np.clip((without - complete) / max(nominal - noise, 1e-300), 0.0, 1.0))
+    return float(np.clip((min(without, nominal) - complete) / max(nominal - noise, 1e-300), 0.0, 1.0))
 
 
 def remaining_share(complete: float, nominal: float, noise: float) -> float:

@@ -39,6 +39,7 @@ def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
     assert explained_share(without=5.0, complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.95)
     assert remaining_share(complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.05)
     assert explained_share(without=1.0, complete=1.2, nominal=5.0, noise=1.0) == 0.0
+    assert explained_share(without=90.0, complete=1.2, nominal=5.0, noise=1.0) == pytest.approx(0.95)
 
 
 def test_the_share_is_that_of_the_channel_that_shows_the_effect(monkeypatch: pytest.MonkeyPatch) -> None:
