@@ -60,6 +60,13 @@ def test_the_share_of_the_misfit_that_is_left_is_stated_with_its_stage() -> None
     assert "nominal misfit of angle_x" not in conclude_diagnosis({**content, "findings": []})
 
 
+@pytest.mark.parametrize(("share", "leads"), [(0.4, False), (0.98, True)])
+def test_a_remainder_of_more_than_half_of_the_misfit_leads_the_conclusion(share: float, leads: bool) -> None:
+    rest = {"share": share, "stage": "drive", "channel": "sense_x"}
+    text = conclude_diagnosis({"verdict": "mismatch", "remainder": rest, "findings": [found("feedthrough", 0.999)]})
+    assert text.startswith("Most of the difference between recording and nominal device is not explained.") == leads
+
+
 def test_hum_that_is_stronger_than_the_noise_is_stated() -> None:
     hum = {"sense": {"frequency": 49.987, "rms": 0.021, "relative": 10.6}}
     text = conclude_diagnosis({"verdict": "consistent", "findings": [], "hum": hum})
