@@ -33,6 +33,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from recon.imaging.sample_motion.gradient_noise import calibrate_gradients
 from recon.imaging.sample_motion.residual_noise import ResidualNoise, fit_residual_noise
 from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
@@ -233,6 +234,7 @@ def fold_references(
     references = np.empty((FOLDS, *shape, 5), np.float32)
     for reference, own in zip(references, sums, strict=True):
         reference[:] = _reference(total - own, width)
+    calibrate_gradients(references)
     return references
 
 
