@@ -214,6 +214,20 @@ def measure_residual_noise(
     return fit_residual_noise(*found[np.isfinite(found[:, 0])].T)
 
 
+def sample_log_likelihoods(
+    samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int], width: float
+) -> NDArray[np.float32]:
+    """Return the log likelihood of each sample under the picture of the other blocks, but for a constant, shape (n,).
+
+    It is NaN where a sample is not compared. Args as in :func:`block_equations`.
+    """
+    reference = fold_references(samples, shift, length, shape, width)
+    noise = measure_residual_noise(samples, shift, length, reference)
+    found = np.full(samples.x.size, np.nan, np.float32)
+    _log_likelihoods(*samples, shift, length, reference, 0.5 * np.array(shape[::-1], float), noise, found)
+    return found
+
+
 def by_shape(displacement: Array) -> Array:
     """Return displacements of the parts, shape (blocks, PARTS, 2, …), as those of ``SHAPES``, shape (blocks, 6, …)."""
     shapes = np.einsum("kp,bp...->bk...", SHAPES, displacement) / PARTS
@@ -288,6 +302,14 @@ def _residuals(x, y, value, shift, length, reference, centre, step, found):  # t
         i = 1 + k * step
         if _row(x, y, value, shift, length, reference, centre, UNIT_NOISE, i, row)[3]:
             found[k, 0], found[k, 1], found[k, 2] = row[7], row[0] ** 2 + row[1] ** 2, row[8]
+
+
+@njit(cache=True)
+def _log_likelihoods(x, y, value, shift, length, reference, centre, noise, found):  # type: ignore[no-untyped-def]
+    row = np.empty(2 + NUISANCES + 1)
+    for i in range(1, x.size - 1):
+        if _row(x, y, value, shift, length, reference, centre, noise, i, row)[3]:
+            found[i] = np.log(row[6]) - 0.5 * row[8] ** 2
 
 
 @njit(cache=True)
