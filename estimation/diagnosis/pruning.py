@@ -18,7 +18,7 @@ from estimation.device_fit.mains import HUM_RELATIVE_SDS
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import is_linear
-from estimation.diagnosis.significance import evidence_gain
+from estimation.diagnosis.significance import evidence_gain, residual_is_noise
 from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
 from scanner.arrays import Array
 
@@ -82,14 +82,23 @@ def drop_redundant(likelihood: Likelihood, fit: Fit) -> tuple[Fit, dict[str, Fit
     Returns:
         The fit, and the fits without each of its terms by key, where there are several.
     """
-    fit = select_mains_hum(likelihood, fit, HUM_RELATIVE_SDS)
+    fit = select_hum(likelihood, fit)
     without = {}
     for candidate in uncertain(fit.model) if len(fit.model.candidates) > 1 else ():
-        reduced = select_mains_hum(likelihood, refit_without(likelihood, fit, candidate), HUM_RELATIVE_SDS)
+        reduced = select_hum(likelihood, refit_without(likelihood, fit, candidate))
         if not evidence_gain(likelihood, reduced, fit):
             return drop_redundant(likelihood, reduced)
         without[candidate.key] = reduced
     return fit, without
+
+
+def select_hum(likelihood: Likelihood, fit: Fit) -> Fit:
+    """The fit with the hum that the recordings show, stronger than the noise only if the fit then leaves noise alone.
+
+    Beside a misfit, strong hum would take a part of it.
+    """
+    strong = select_mains_hum(likelihood, fit, HUM_RELATIVE_SDS)
+    return strong if residual_is_noise(strong) else select_mains_hum(likelihood, fit)
 
 
 def fit_to_convergence(likelihood: Likelihood, model: Model, x: Array) -> Fit:

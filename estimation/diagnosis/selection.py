@@ -22,7 +22,6 @@ from estimation.device_fit.initial import (
     window_schedule,
 )
 from estimation.device_fit.interference import with_interference_line
-from estimation.device_fit.mains import HUM_RELATIVE_SDS
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.anchor import fit_anchor, fit_growing, max_residual_ratio, residual_ratio
@@ -38,7 +37,13 @@ from estimation.diagnosis.law_selection import SelectedTerms, choose_laws
 from estimation.diagnosis.linear_model import RivalFit
 from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.diagnosis.necessity import least_explained, need_of_laws
-from estimation.diagnosis.pruning import drop_redundant, fit_to_convergence, prune_by_evidence, refit_without
+from estimation.diagnosis.pruning import (
+    drop_redundant,
+    fit_to_convergence,
+    prune_by_evidence,
+    refit_without,
+    select_hum,
+)
 from estimation.diagnosis.screening import all_candidates, damped_start
 from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
 from estimation.parallel import map_fits
@@ -237,8 +242,7 @@ def _choose_laws(search: _Search, anchor: Fit) -> SelectedTerms | None:
     if selected is None:
         return None
     fit, without = drop_redundant(selected.likelihood, selected.fit)
-    nominal = select_mains_hum(selected.likelihood, selected.nominal, HUM_RELATIVE_SDS)
-    if not evidence_gain(selected.likelihood, nominal, fit):
+    if not evidence_gain(selected.likelihood, select_hum(selected.likelihood, selected.nominal), fit):
         return None
     return replace(selected, fit=fit, without=without)
 

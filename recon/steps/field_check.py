@@ -112,7 +112,7 @@ def _explain_outside(grid: Grid, motion: Motion, sample_moved: bool) -> str:
     noisy = any(axis.angle_noise_sd for axis in motion.axes.values())
     if noisy and off_centre <= MAX_OUTSIDE_FRACTION:
         return "the noise of the position signals moves them there; --estimator tracker filters it"
-    return "the motion is larger than the field: check [scan] and the gain, unless that is intended"
+    return "check [scan] and the gain, unless intended"
 
 
 def _share_of_sines(half_angles: Mapping[str, float], motion: Motion, centres: Mapping[str, float]) -> float:
@@ -152,10 +152,7 @@ def _describe_centres(grid: Grid, motion: Motion) -> list[str]:
 
 
 def _describe_sizes(amplitude: Sequence[float], half: Sequence[float]) -> str:
-    return ", ".join(
-        f"{name}: largest angle {a:.4g} rad, half angle {h:.4g} rad"
-        for name, a, h in zip(AXES, amplitude, half, strict=True)
-    )
+    return ", ".join(f"{name} up to {a:.4g} of {h:.4g} rad" for name, a, h in zip(AXES, amplitude, half, strict=True))
 
 
 def _amplitudes(grid: Grid, motion: Motion) -> list[float]:

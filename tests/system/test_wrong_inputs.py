@@ -86,7 +86,7 @@ def swapped_drives(file: h5py.File) -> None:
 REFUSED_RECORDINGS: dict[str, tuple[str, Change | None, str]] = {
     "field in degrees": (field(6.3, 6.3), None, "looks like degrees"),
     "field in mrad": (field(110.0, 110.0), None, "looks like mrad"),
-    "field far too small": (field(0.005, 0.005), None, "lie outside the field of view (x: amplitude 0.1"),
+    "field far too small": (field(0.005, 0.005), None, "lie outside the field of view (x up to 0.1"),
     "negative field": (field(-0.1, 0.1), None, "scan.half_angle_x: is -0.1 and must be a number greater than 0"),
     "unknown kind of angle": (DEVICE + 'angle = "beam"', None, "scan.angle: 'beam' is unknown"),
     "gain of zero": (DEVICE.replace("gain = 1.0", "gain = 0.0", 1), None, "x.readout.gain: is 0.0"),
@@ -121,7 +121,7 @@ REFUSED_RECORDINGS: dict[str, tuple[str, Change | None, str]] = {
     "edges of an unknown event": (FIELD, edges(event="rising"), "sync_x: event 'rising' is unknown"),
     "drive frequency in kHz": (DRIVEN.format(2.0, 0.8), None, "0.04 periods of a motion at 2 Hz in x; check frequency"),
     "intensity transposed": (DEVICE, values("intensity", lambda v: np.stack([v, v])), "2 samples of 20000 detectors"),
-    "counts of a converter as V": (DEVICE, values("sense_x", lambda v: (1e5 * v).astype(np.int16)), "amplitude 1e+04"),
+    "counts of a converter as V": (DEVICE, values("sense_x", lambda v: (1e5 * v).astype(np.int16)), "no mirror turns"),
     "a sensor used twice": (DEVICE, lambda file: file["channels/sense_y"].write_direct(
         file["channels/sense_x"][:]), "hold the same samples"),
     "newer format": (DEVICE, lambda file: file.attrs.update({"version": 99}), "version"),

@@ -86,4 +86,4 @@ def test_the_amplitude_that_a_note_states_is_without_the_noise() -> None:
     result = reconstruct(scan(NOISE_PX), Options(device=device, pixels=PIXELS, estimator="sensor"), quiet=True)
     (note,) = (note for note in result.notes if "outside the field" in note)
     amplitude = summarise(result)["x"]["amplitude_rad"]
-    assert float(note.split("x: largest angle ")[1].split(" rad")[0]) == pytest.approx(amplitude, rel=0.005)
+    assert float(note.split("x up to ")[1].split(" of")[0]) == pytest.approx(amplitude, rel=0.005)

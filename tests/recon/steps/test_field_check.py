@@ -30,7 +30,7 @@ def with_field(scan: Scan | None, allow_outside: bool = False) -> Reconstruction
 
 
 def test_most_samples_outside_are_refused_unless_allowed() -> None:
-    with pytest.raises(DeviceInvalid, match=r"(9\d|100)% of the samples lie outside .*half angle 0\.02"):
+    with pytest.raises(DeviceInvalid, match=r"(9\d|100)% of the samples lie outside .*of 0\.02"):
         with_field(Scan(0.02, 0.02))
     result = with_field(Scan(0.02, 0.02), allow_outside=True)
     assert any("lie outside the field of view" in note for note in result.notes)
@@ -43,7 +43,7 @@ def test_most_samples_outside_are_refused_unless_allowed() -> None:
         (0.1, 0.0, 0.0, True, "the sample moved there"),
         (0.1, 0.01, 0.0, False, "the noise of the position signals moves them there"),
         (0.1, 1e-4, 0.015, False, "check offset in [x.readout] of the device"),
-        (0.095, 0.01, 0.0, True, "the motion is larger than the field: check [scan]"),
+        (0.095, 0.01, 0.0, True, "check [scan] and the gain, unless intended"),
     ],
 )
 def test_the_note_on_samples_outside_names_what_moves_them(

@@ -55,7 +55,7 @@ def test_both_directions_stated_as_one_are_named_from_the_picture(
 ) -> None:
     text = report(tmp_path, "usaf_bars", axis, 1, capsys)
     f = FREQUENCY_HZ[axis]
-    assert text.startswith(f"{axis.upper()}: samples of one place agree in every second period only")
+    assert text.startswith(f"{axis}: samples of one place agree in every second period only")
     assert f"as if {axis} moved at {f:.0f}" in text
     assert f"sync_{axis} states zero-crossing-up" in text
 
