@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from estimation.device_fit.initial import estimate_whiteners
 from estimation.device_fit.mains import (
     HUM_HARMONICS,
     NOMINAL_MAINS,
+    STRONG_HUM_RELATIVE_SD,
     WEAK_HUM_RELATIVE_SD,
     Mains,
     is_hum,
@@ -26,6 +26,13 @@ STRONG_HUM_HARMONICS = 7
 """Number of harmonics of strong hum. The eighth is an even one, which rectifiers hardly cause, and has an eighth of the
 amplitude of the first."""
 
+WEAK_HUM = tuple((harmonics, WEAK_HUM_RELATIVE_SD) for harmonics in (HUM_HARMONICS, STRONG_HUM_HARMONICS))
+STRONG_HUM = tuple((harmonics, STRONG_HUM_RELATIVE_SD) for harmonics in (HUM_HARMONICS, STRONG_HUM_HARMONICS))
+"""Numbers of harmonics and relative standard deviations of hum below and above the noise."""
+
+TONE = (1, STRONG_HUM_RELATIVE_SD)
+"""A tone at the frequency of the mains without harmonics. It is no hum, but interference."""
+
 MAINS_RELATIVE_SD = 5e-4
 """Prior standard deviation of the mains frequency, relative: grids keep it within 0.02 to 0.03 Hz for most of a day."""
 
@@ -37,22 +44,22 @@ FREQUENCY_STEP = 0.01
 """Difference step of the mains frequency in prior standard deviations."""
 
 
-def select_mains_hum(likelihood: Likelihood, fit: Fit, relative_sds: Sequence[float] = (WEAK_HUM_RELATIVE_SD,)) -> Fit:
+def select_mains_hum(likelihood: Likelihood, fit: Fit, kinds: Sequence[tuple[int, float]] = WEAK_HUM) -> Fit:
     """The fit with hum of the one mains frequency that the recordings show, or of none.
 
     Where there is hum, the evidence also chooses between few and many harmonics, and between the nominal and the fitted
     frequency. Hum before a clip level is not linear: there fits choose between the nominal frequencies and none.
 
     Args:
-        relative_sds: prior standard deviations of hum between which the evidence chooses, relative to the noise.
+        kinds: numbers of harmonics and standard deviations relative to the noise between which the evidence chooses.
     """
     columns = {mains: _hum_columns(likelihood, fit, mains) for mains in NOMINAL_MAINS}
     if not any(each.size for each in columns.values()):
-        return min(fit_hum_variants(likelihood, fit, relative_sds), key=lambda variant: variant.neg2_log_evidence)
+        return min(fit_hum_variants(likelihood, fit), key=lambda variant: variant.neg2_log_evidence)
     beside = _beside_hum(fit)
     without = beside.evaluate(np.zeros((beside.residual.size, 0)))[0]
     lowest, strongest = min((beside.evaluate(each)[0], mains) for mains, each in columns.items())
-    selected = min(_refined_mains(likelihood, fit, beside, strongest, relative_sds))[1:] if lowest < without else ()
+    selected = min(_refined_mains(likelihood, fit, beside, strongest, kinds))[1:] if lowest < without else ()
     if selected == fit.model.mains:
         return fit
     model = _with_mains(fit.model, *selected)
@@ -83,12 +90,9 @@ def _is_hum(model: Model, i: int) -> bool:
     return model.parameters[i].kind == "additive" and is_hum(model.parameters[i].name)
 
 
-def fit_hum_variants(
-    likelihood: Likelihood, fit: Fit, relative_sds: Sequence[float] = (WEAK_HUM_RELATIVE_SD,)
-) -> list[Fit]:
-    """The fit without hum, and with hum of each mains at its nominal frequency alone, of each strength."""
-    hum = [mains._replace(relative_sd=sd) for mains, sd in product(NOMINAL_MAINS, relative_sds)]
-    models = [_with_mains(fit.model, *mains) for mains in ((), *((one,) for one in hum))]
+def fit_hum_variants(likelihood: Likelihood, fit: Fit) -> list[Fit]:
+    """The fit without hum, and with hum of each mains at its nominal frequency alone."""
+    models = [_with_mains(fit.model, *mains) for mains in ((), *((mains,) for mains in NOMINAL_MAINS))]
     return fit_models(
         likelihood, [(model, model.map_parameters_from(fit.model, fit.x)) for model in models], max_iterations=3
     )
@@ -108,14 +112,14 @@ def _with_mains(model: Model, *mains: Mains) -> Model:
 
 
 def _refined_mains(
-    likelihood: Likelihood, fit: Fit, beside: _BesideHum, nominal: Mains, relative_sds: Sequence[float]
+    likelihood: Likelihood, fit: Fit, beside: _BesideHum, nominal: Mains, kinds: Sequence[tuple[int, float]]
 ) -> list[tuple[float, Mains]]:
-    """Hum of each strength with few and many harmonics, at the nominal and the fitted frequency, by -2 log evidence.
+    """Hum of each kind, at the nominal and at the fitted frequency, with -2 log evidence of each.
 
     All but the frequency is linear around the fit.
     """
     refined = []
-    for harmonics, relative_sd in product((HUM_HARMONICS, STRONG_HUM_HARMONICS), relative_sds):
+    for harmonics, relative_sd in kinds:
         stated = Mains(nominal.frequency, harmonics, relative_sd)
         refined += [
             (beside.evaluate(_hum_columns(likelihood, fit, stated))[0], stated),

@@ -18,10 +18,6 @@ WEAK_HUM_RELATIVE_SD = 0.5
 STRONG_HUM_RELATIVE_SD = 3.0
 """The same for hum that is stronger than the noise."""
 
-HUM_RELATIVE_SDS = (WEAK_HUM_RELATIVE_SD, STRONG_HUM_RELATIVE_SD)
-"""Strengths of hum between which the evidence chooses once laws are selected. Before, strong hum would take what a law
-does to the motion near a harmonic of the mains."""
-
 
 class Mains(NamedTuple):
     """Mains whose hum is part of the noise model.

@@ -13,8 +13,7 @@ from math import comb, log
 import numpy as np
 
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
-from estimation.device_fit.hum import select_mains_hum
-from estimation.device_fit.mains import HUM_RELATIVE_SDS
+from estimation.device_fit.hum import STRONG_HUM, TONE, WEAK_HUM, select_mains_hum
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.screening import is_linear
@@ -95,10 +94,11 @@ def drop_redundant(likelihood: Likelihood, fit: Fit) -> tuple[Fit, dict[str, Fit
 def select_hum(likelihood: Likelihood, fit: Fit) -> Fit:
     """The fit with the hum that the recordings show, stronger than the noise only if the fit then leaves noise alone.
 
-    Beside a misfit, strong hum would take a part of it.
+    Beside a misfit, strong hum would take a part of it. A tone without harmonics is interference.
     """
-    strong = select_mains_hum(likelihood, fit, HUM_RELATIVE_SDS)
-    return strong if residual_is_noise(strong) else select_mains_hum(likelihood, fit)
+    strong = select_mains_hum(likelihood, fit, (*WEAK_HUM, *STRONG_HUM, TONE))
+    is_tone = any((mains.harmonics, mains.relative_sd) == TONE for mains in strong.model.mains)
+    return strong if residual_is_noise(strong) and not is_tone else select_mains_hum(likelihood, fit)
 
 
 def fit_to_convergence(likelihood: Likelihood, model: Model, x: Array) -> Fit:

@@ -77,8 +77,14 @@ def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
     """Share that a finding alone explains of the misfit of the channel whose whitened misfit it lowers most."""
     reduction = chi2_reduction_by_channel(result.likelihood, step.before, result.final)
     name, noise = max(reduction, key=lambda key: reduction[key]), noise_by_channel(result.likelihood)
-    without, complete, nominal = (misfit_by_channel(fit)[name] for fit in (step.before, result.final, result.nominal))
+    reference = step.before if _is_rail(result, step) else result.nominal
+    without, complete, nominal = (misfit_by_channel(fit)[name] for fit in (step.before, result.final, reference))
     return explained_share(without, complete, nominal, noise[name])
+
+
+def _is_rail(result: SelectionResult, step: SelectionStep) -> bool:
+    """Whether a finding is a rail at which samples stand. The nominal fit has it; shares are of the fit without."""
+    return step.candidate in result.nominal.model.candidates
 
 
 def leaves_noise_alone(result: SelectionResult) -> bool:
@@ -113,7 +119,9 @@ def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dic
     if leaves_noise_alone(result):
         return None
     noise = noise_by_channel(result.likelihood)
-    complete, nominal = misfit_by_channel(result.final), misfit_by_channel(result.nominal)
+    only_rail = len(result.steps) == 1 and _is_rail(result, result.steps[0])
+    reference = result.steps[0].before if only_rail else result.nominal
+    complete, nominal = misfit_by_channel(result.final), misfit_by_channel(reference)
     name = max(complete, key=lambda key: complete[key] / max(noise[key], 1e-300))
     share = remaining_share(complete[name], nominal[name], noise[name])
     if residual_is_noise(result.final):

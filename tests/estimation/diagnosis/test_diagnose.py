@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,14 +84,27 @@ def test_an_offset_drift_is_not_reported_as_hum_or_noise() -> None:
 
 
 @pytest.mark.slow
+def with_hum(amplitudes: Sequence[float]) -> Recording:
+    """A recording of the bench without an effect, with harmonics of 50 Hz in its sense channel [V]."""
+    recording = bench_recording(seed=9)
+    sense = recording["sense_x"]
+    time = np.arange(sense.size) / sense.sample_rate
+    hum = sum(a * np.cos(2 * np.pi * 50.0 * n * time + n) for n, a in enumerate(amplitudes, 1))
+    return recording.with_channel(replace(sense, raw=sense.read() + hum, gain=1.0, offset=0.0))
+
+
 def test_hum_stronger_than_the_noise_is_stated_and_no_effect() -> None:
-    amplitude, noise_sd = 3e-2, 2e-3
-    diagnosis = diagnose([bench_recording(hum=amplitude, seed=9)])
+    noise_sd, amplitudes = 2e-3, (1.5e-2, 2e-3, 5e-3, 1e-3, 3e-3)
+    diagnosis = diagnose([with_hum(amplitudes)])
     assert diagnosis.verdict == "consistent"
     (of,) = diagnosis.hum.values()
     assert of["frequency"] == pytest.approx(50.0, abs=0.05)
-    assert of["rms"] == pytest.approx(amplitude / 2**0.5, rel=0.02)
+    assert of["rms"] == pytest.approx(np.hypot.reduce(amplitudes) / 2**0.5, rel=0.03)
     assert of["relative"] == pytest.approx(of["rms"] / noise_sd)
+
+
+def test_a_tone_at_the_frequency_of_the_mains_is_interference() -> None:
+    assert [finding.effect for finding in diagnose([with_hum((1.5e-2,))]).findings] == ["interference"]
 
 
 def test_hum_is_clipped_together_with_the_signal() -> None:

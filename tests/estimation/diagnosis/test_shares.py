@@ -44,7 +44,7 @@ def test_shares_and_the_remainder_of_one_finding_add_up() -> None:
 
 def test_the_share_is_that_of_the_channel_that_shows_the_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """A law of the mechanics moves both channels, but the steps of popcorn noise hide it in the sense signal."""
-    without, complete, nominal = object(), object(), object()
+    without, complete, nominal = object(), object(), SimpleNamespace(model=SimpleNamespace(candidates=()))
     misfits = {
         id(without): {"sense_x": 7.9, "angle_x": 4.6},
         id(complete): {"sense_x": 8.0, "angle_x": 1.0},
@@ -55,7 +55,7 @@ def test_the_share_is_that_of_the_channel_that_shows_the_effect(monkeypatch: pyt
     reduction = {"sense_x": 20.0, "angle_x": 900.0}
     monkeypatch.setattr(shares, "chi2_reduction_by_channel", lambda likelihood, before, after: reduction)
     result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None)
-    step = SimpleNamespace(before=without)
+    step = SimpleNamespace(before=without, candidate="law")
     share = share_of_finding(cast(SelectionResult, result), cast(SelectionStep, step))
     assert share == pytest.approx(0.9)
 
@@ -81,15 +81,32 @@ def test_what_a_correction_beside_named_laws_still_takes_is_stated(
 ) -> None:
     """The residual is near the noise: the share is that of the whitened misfit, and the angle fits within its noise."""
     complete = SimpleNamespace(validation_chi2=1.1, chi2=1000.0, penalty=3.0)
-    nominal = SimpleNamespace(validation_chi2=50.0, chi2=50000.0, penalty=3.0)
+    model = SimpleNamespace(candidates=())
+    nominal = SimpleNamespace(validation_chi2=50.0, chi2=50000.0, penalty=3.0, model=model)
+    steps = (SimpleNamespace(candidate="a law"),)
     misfits = {id(complete): {"sense_x": 1.2, "angle_x": 1.01}, id(nominal): {"sense_x": 41.0, "angle_x": 1.02}}
     monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: misfits[id(fit)])
     monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 1.0, "angle_x": 1.0})
-    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, remaining=remaining, steps=("a law",))
+    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, remaining=remaining, steps=steps)
     correction = SimpleNamespace(predicted_gain=1000.0, candidate=SimpleNamespace(term=SimpleNamespace(stage="drive")))
     remainder = find_remainder(cast(SelectionResult, result), cast(ScoreTest, correction))
     expected = {"share": pytest.approx(0.02), "stage": "drive", "channel": "sense_x"}
     assert remainder == (expected if stated else None)
+
+
+def test_the_share_of_a_rail_and_the_remainder_are_of_the_fit_without_the_rail(monkeypatch: pytest.MonkeyPatch) -> None:
+    complete = SimpleNamespace(validation_chi2=9.0)
+    without, nominal = object(), SimpleNamespace(model=SimpleNamespace(candidates=("rail",)))
+    misfits = {id(without): {"sense_x": 9.0}, id(complete): {"sense_x": 3.0}, id(nominal): {"sense_x": 3.0}}
+    monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: misfits[id(fit)])
+    monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 1.0})
+    monkeypatch.setattr(shares, "chi2_reduction_by_channel", lambda likelihood, before, after: {"sense_x": 5.0})
+    step = SimpleNamespace(before=without, candidate="rail")
+    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, steps=(step,), remaining=0.0)
+    assert share_of_finding(cast(SelectionResult, result), cast(SelectionStep, step)) == pytest.approx(0.75)
+    remainder = find_remainder(cast(SelectionResult, result), None)
+    assert remainder is not None
+    assert remainder["share"] == pytest.approx(0.25)
 
 
 def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> None:
