@@ -10,7 +10,7 @@ import numpy as np
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.device_fit.initial import estimate_whiteners
 from estimation.device_fit.mains import (
-    HUM_HARMONICS,
+    FEW_HARMONICS,
     NOMINAL_MAINS,
     STRONG_HUM_RELATIVE_SD,
     WEAK_HUM_RELATIVE_SD,
@@ -22,13 +22,13 @@ from estimation.device_fit.noise import Whitener
 from estimation.least_squares import regress
 from scanner.arrays import Array
 
-STRONG_HUM_HARMONICS = 7
-"""Number of harmonics of strong hum. The eighth is an even one, which rectifiers hardly cause, and has an eighth of the
-amplitude of the first."""
+MANY_HARMONICS = 7
+"""Number of harmonics of hum from a rectifier. The eighth is an even one, which rectifiers hardly cause, and has an
+eighth of the amplitude of the first."""
 
-WEAK_HUM = tuple((harmonics, WEAK_HUM_RELATIVE_SD) for harmonics in (HUM_HARMONICS, STRONG_HUM_HARMONICS))
-STRONG_HUM = tuple((harmonics, STRONG_HUM_RELATIVE_SD) for harmonics in (HUM_HARMONICS, STRONG_HUM_HARMONICS))
-"""Numbers of harmonics and relative standard deviations of hum below and above the noise."""
+WEAK_HUM = tuple((harmonics, WEAK_HUM_RELATIVE_SD) for harmonics in (FEW_HARMONICS, MANY_HARMONICS))
+STRONG_HUM = tuple((harmonics, STRONG_HUM_RELATIVE_SD) for harmonics in (FEW_HARMONICS, MANY_HARMONICS))
+"""Numbers of harmonics and relative standard deviations of hum below, and of hum above the noise."""
 
 TONE = (1, STRONG_HUM_RELATIVE_SD)
 """A tone at the frequency of the mains without harmonics. It is no hum, but interference."""

@@ -9,8 +9,8 @@ import numpy as np
 
 from scanner.arrays import Array
 
-HUM_HARMONICS = 3
-"""Number of harmonics of weak hum, the n-th with a prior of 1/n, as rectifiers cause them."""
+FEW_HARMONICS = 3
+"""Number of harmonics of most hum, the n-th with a prior of 1/n, as rectifiers cause them."""
 
 WEAK_HUM_RELATIVE_SD = 0.5
 """Prior standard deviation of the two quadratures of hum in standard deviations of the noise: weaker than the noise."""
@@ -30,13 +30,14 @@ class Mains(NamedTuple):
     """
 
     frequency: float
-    harmonics: int = HUM_HARMONICS
+    harmonics: int = FEW_HARMONICS
     relative_sd: float = WEAK_HUM_RELATIVE_SD
     cost: float = 0.0
 
 
 NOMINAL_MAINS = (Mains(50.0), Mains(60.0))
-"""Mains at their nominal frequencies. Their harmonics are part of the noise model, not an effect."""
+"""Mains at their nominal frequencies. Their harmonics are part of the noise model, not an effect; a strong tone without
+harmonics is interference."""
 
 
 @lru_cache(maxsize=16)

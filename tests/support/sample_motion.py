@@ -41,3 +41,16 @@ def error_of(found: SampleMotion, displacement: np.ndarray) -> np.ndarray:
     true = np.column_stack([np.interp(at, np.arange(len(displacement)), each) for each in displacement.T])
     error = found.shift - true
     return np.asarray(error - np.median(error, axis=0))
+
+
+def beads(number: int, sd: float) -> np.ndarray:
+    """Beads of a standard deviation [px] before a dark background, some of them outside the field."""
+    side = PIXELS + 64
+    down, across = np.mgrid[:side, :side].astype(float)
+    rng = np.random.default_rng(7)
+    places, peaks = rng.uniform(0, side, (number, 2)), rng.uniform(0.3, 1.0, number)
+    spots = [
+        peak * np.exp(-0.5 * ((across - x) ** 2 + (down - y) ** 2) / sd**2)
+        for (x, y), peak in zip(places, peaks, strict=True)
+    ]
+    return np.asarray(0.02 + np.sum(spots, axis=0))

@@ -6,21 +6,15 @@ import pytest
 from recon.imaging.sample_motion.coarse_search import search_motion
 from recon.imaging.sample_motion.residual_noise import fit_residual_noise
 from recon.imaging.sample_motion.rigid_motion import MIN_LOG_LIKELIHOOD_GAIN, estimate_sample_motion
-from tests.support.sample_motion import BLOCKS, PERIOD, PIXELS, error_of, scan
+from tests.support.sample_motion import BLOCKS, PERIOD, PIXELS, beads, error_of, scan
 
 SIDE = PIXELS + 64
 DOWN, ACROSS = np.mgrid[:SIDE, :SIDE].astype(float)
 
 
-def beads() -> np.ndarray:
+def many_beads() -> np.ndarray:
     """Fluorescent beads of 3 pixels before a background of a fiftieth of their brightness."""
-    rng = np.random.default_rng(7)
-    places, peaks = rng.uniform(0, SIDE, (24, 2)), rng.uniform(0.3, 1.0, 24)
-    spots = [
-        peak * np.exp(-0.5 * ((ACROSS - x) ** 2 + (DOWN - y) ** 2) / 1.3**2)
-        for (x, y), peak in zip(places, peaks, strict=True)
-    ]
-    return np.asarray(0.02 + np.sum(spots, axis=0))
+    return beads(24, sd=1.3)
 
 
 def edge() -> np.ndarray:
@@ -33,7 +27,7 @@ def checker() -> np.ndarray:
     return np.asarray(0.1 + 0.9 * ((ACROSS // 13 + DOWN // 17) % 2))
 
 
-@pytest.mark.parametrize("picture", [beads, edge])
+@pytest.mark.parametrize("picture", [many_beads, edge])
 def test_bright_places_at_rest_are_reported_at_rest(picture) -> None:  # type: ignore[no-untyped-def]
     samples = scan(np.zeros((2, 2)), 1000.0, 2 * BLOCKS, picture())
     found = estimate_sample_motion(samples, PERIOD, (PIXELS, PIXELS))
@@ -45,7 +39,7 @@ def test_bright_places_at_rest_are_reported_at_rest(picture) -> None:  # type: i
 def test_beads_that_vibrate_in_x_rest_in_y() -> None:
     time = np.linspace(0.0, 2.0 * np.pi * 6.0, 20 * BLOCKS)
     displacement = np.column_stack([np.sin(time), np.zeros_like(time)])
-    found = estimate_sample_motion(scan(displacement, 100.0, picture=beads()), PERIOD, (PIXELS, PIXELS))
+    found = estimate_sample_motion(scan(displacement, 100.0, picture=many_beads()), PERIOD, (PIXELS, PIXELS))
     assert found is not None
     assert found.moving
     x, y = np.sqrt(np.mean(error_of(found, displacement) ** 2, axis=0))
@@ -60,7 +54,7 @@ def test_a_lattice_that_drifts_does_not_slip_by_a_period() -> None:
     assert np.sqrt(np.mean(error_of(found, displacement) ** 2)) < 0.1
 
 
-@pytest.mark.parametrize("picture", [beads, edge, checker, lambda: np.full((SIDE, SIDE), 0.5)])
+@pytest.mark.parametrize("picture", [many_beads, edge, checker, lambda: np.full((SIDE, SIDE), 0.5)])
 def test_the_search_leaves_a_sample_at_rest(picture) -> None:  # type: ignore[no-untyped-def]
     samples = scan(np.zeros((2, 2)), 200.0, picture=picture())
     found = search_motion(samples, round(12 * PERIOD), BLOCKS // 12, (PIXELS, PIXELS))

@@ -5,26 +5,14 @@ import pytest
 
 from recon.imaging.sample_motion.block_equations import PARTS, sample_log_likelihoods
 from recon.imaging.sample_motion.rigid_motion import estimate_sample_motion
-from tests.support.sample_motion import BLOCKS, PERIOD, PIXELS, scan
-
-SIDE = PIXELS + 64
-DOWN, ACROSS = np.mgrid[:SIDE, :SIDE].astype(float)
-
-
-def eight_beads() -> np.ndarray:
-    """Beads of 3.5 pixels, some of them outside the field, before a dark background."""
-    rng = np.random.default_rng(7)
-    places, peaks = rng.uniform(0, SIDE, (8, 2)), rng.uniform(0.3, 1.0, 8)
-    spots = [
-        peak * np.exp(-0.5 * ((ACROSS - x) ** 2 + (DOWN - y) ** 2) / 1.5**2)
-        for (x, y), peak in zip(places, peaks, strict=True)
-    ]
-    return np.asarray(0.02 + np.sum(spots, axis=0))
+from tests.support.sample_motion import BLOCKS, PERIOD, PIXELS, beads, scan
 
 
 def test_few_beads_at_rest_are_reported_at_rest() -> None:
     """Their detail agrees with a motion that the picture follows, with a gain of 22 in the equations around it."""
-    found = estimate_sample_motion(scan(np.zeros((2, 2)), 300.0, 2 * BLOCKS, eight_beads()), PERIOD, (PIXELS, PIXELS))
+    found = estimate_sample_motion(
+        scan(np.zeros((2, 2)), 300.0, 2 * BLOCKS, beads(8, sd=1.5)), PERIOD, (PIXELS, PIXELS)
+    )
     assert found is not None
     assert not found.moving
     assert not found.shift.any()
