@@ -160,7 +160,7 @@ def _iterate_selection(
         if not options:
             break
         if list(options) == [present]:
-            exchanged, near = _exchange_near_rival(centre, candidates, fitted)
+            exchanged, near = _exchange_near_rival(centre, candidates, fitted, nominal)
             compared.append(near)
             if exchanged is None:
                 return centre, compared
@@ -287,15 +287,16 @@ def _with_fitted_rivals(
 
 
 def _exchange_near_rival(
-    centre: _Centre, candidates: Sequence[Candidate], fitted: dict[Effects, Fit]
+    centre: _Centre, candidates: Sequence[Candidate], fitted: dict[Effects, Fit], nominal: Fit
 ) -> tuple[Fit | None, dict[Effects, Fit]]:
     """The fit with one law exchanged that has a better evidence around itself; None where there is none.
 
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
     ``DETECTION_THRESHOLD`` are fitted, each once, the best in the place of every law first, and compared around their
-    own fits. Where the laws leave more than noise, so are the confounders that their terms state. Where corrections
-    gain no more than that beside the laws, they have no part in the comparison: beside a fit that leaves only noise,
-    one that leaves more to corrections is not a better one.
+    own fits. Where the laws take the bulk of a misfit and leave more than noise, so are the confounders that their
+    terms state; laws that take a part of what no law describes have none. Where corrections gain no more than that
+    beside the laws, they have no part in the comparison: beside a fit that leaves only noise, one that leaves more to
+    corrections is not a better one.
 
     Returns:
         that fit, and all fits that were compared under the same noise.
@@ -304,7 +305,7 @@ def _exchange_near_rival(
     present = centre.alone if centre.leaves_noise else centre.beside
     best, lowest = None, present.neg2_log_evidence - MIN_EXCHANGE_GAIN
     near = near_rivals(centre.linear, centre.beside, fitted)
-    if not centre.leaves_noise:
+    if not centre.leaves_noise and centre.takes_bulk(nominal):
         near |= stated_confounders(centre.linear, centre.laws, fitted.keys() | near.keys())
     rivals = _fit_sets(centre, near, fitted)
     fitted |= rivals

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from scanner.arrays import Array
 from scanner.device import Axis
@@ -53,18 +54,38 @@ def _transition(frequency: float, quality: float, step: float) -> tuple[Array, A
     return np.ascontiguousarray(whole[:2, :2]), whole[:2, 2] - whole[:2, 3], np.ascontiguousarray(whole[:2, 3])
 
 
+@register_jitable(forceinline=True)
+def _advance(q, rate, before, after, matrix, first, last):  # type: ignore[no-untyped-def]
+    return (
+        matrix[0, 0] * q + matrix[0, 1] * rate + first[0] * before + last[0] * after,
+        matrix[1, 0] * q + matrix[1, 1] * rate + first[1] * before + last[1] * after,
+    )
+
+
 @njit(cache=True, nogil=True)
 def _run(voltage, matrix, first, last, q, rate):  # type: ignore[no-untyped-def]
     out = np.empty((2, voltage.size))
     for i in range(voltage.size):
         if i:
-            u0, u1 = voltage[i - 1], voltage[i]
-            q, rate = (
-                matrix[0, 0] * q + matrix[0, 1] * rate + first[0] * u0 + last[0] * u1,
-                matrix[1, 0] * q + matrix[1, 1] * rate + first[1] * u0 + last[1] * u1,
-            )
+            q, rate = _advance(q, rate, voltage[i - 1], voltage[i], matrix, first, last)
         out[0, i], out[1, i] = q, rate
     return out
+
+
+@njit(cache=True, nogil=True)
+def _add_mode(total, voltage, slope, matrix, first, last, square, damping, gain, gain_rate, order):  # type: ignore[no-untyped-def]
+    """Add a mode in the time derivative ``order``, and ``gain_rate`` times the next one, without arrays in between."""
+    q, rate = voltage[0] / square, 0.0
+    for i in range(voltage.size):
+        if i:
+            q, rate = _advance(q, rate, voltage[i - 1], voltage[i], matrix, first, last)
+        acceleration = voltage[i] - damping * rate - square * q
+        if order == 0:
+            total[i] += gain * q + gain_rate * rate
+        elif order == 1:
+            total[i] += gain * rate + gain_rate * acceleration
+        else:
+            total[i] += gain * acceleration + gain_rate * (slope[i] - damping * acceleration - square * rate)
 
 
 def mode_response(voltage: Array, frequency: float, quality: float, step: float) -> Array:
@@ -85,11 +106,12 @@ def mode_response(voltage: Array, frequency: float, quality: float, step: float)
 
 def _motion(values: Sequence[float], context: SignalContext, order: int) -> Array:
     """Sum of all modes, in the time derivative ``order``, shape (n,)."""
-    total = np.zeros_like(context.voltage)
+    voltage, step = np.ascontiguousarray(context.voltage), context.step
+    total, slope = np.zeros_like(voltage), np.gradient(voltage, step)
     for i in range(int(values[0])):
         frequency, quality, gain, gain_rate = values[2 + 4 * i : 6 + 4 * i]
-        response = mode_response(context.voltage, frequency, quality, context.step)
-        total += gain * response[order] + gain_rate / (2.0 * np.pi * frequency) * response[order + 1]
+        rate, transition = 2.0 * np.pi * frequency, _transition(frequency, quality, step)
+        _add_mode(total, voltage, slope, *transition, rate**2, rate / quality, gain, gain_rate / rate, order)
     return total
 
 
