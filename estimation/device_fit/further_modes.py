@@ -1,8 +1,9 @@
-"""Further modes of the structure in an acceleration signal, which the drive excites beside the mirror's own mode.
+"""Further modes of the structure in the signal of a sensor of motion, which the drive excites beside the mirror's own.
 
-An accelerometer weighs a mode with the square of its frequency, so it shows every mode in the band of the drive, and
-all modes below the band as a part of the drive itself. Their sum is linear and is fitted before the selection: no
-single effect of the catalogue is several modes, and effects of the mirror's own mode would only be seen beside them.
+A sensor shows every mode in the band of the drive, an accelerometer those at high frequencies most, as it weighs a mode
+with the square of its frequency; modes beyond the band appear as a part of the drive itself. Their sum is linear. Two
+and more are fitted before the selection: no effect of the catalogue is several modes, and effects of the mirror's
+own mode would only be seen beside them. A single one is sought where the catalogue does not explain the misfit.
 
 Source: Ewins, Modal Testing, Research Studies Press (2000), section 4.3 (modes and residual terms).
 """
@@ -21,13 +22,13 @@ from estimation.device_fit.open_loop import is_worse, open_loop
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.integrator.nodes import nodes_to_samples
-from scanner.stages import Acceleration
+from scanner.stages import MotionSensor
 from scanner.terms.driven_modes import EFFECT, mode_response
 from scanner.terms.term import MIN_MODE_QUALITY
 
-MIN_FURTHER_MODES = 2
-"""Further modes from which they are stated together. One is left to ``second-mode``, and a direct part of the drive to
-``feedthrough``."""
+SEVERAL_MODES = 2
+"""Number of further modes that are stated before laws are selected. A single one is left to ``second-mode`` at first,
+and a direct part of the drive to ``feedthrough``."""
 
 MAX_FURTHER_MODES = 8
 """Bound on the search. A band with more modes has a residual that the diagnosis then reports."""
@@ -71,6 +72,7 @@ class _Band:
         output: the channel.
         voltage: of the drive at the integration grid, shape (n,) [V].
         step: of the grid [s].
+        order: time derivative of the motion that the channel holds.
         bins: of the Hann-windowed Fourier transform of the channel.
         data: the channel in them, shape (bins,).
         low, high: ends of the band [Hz].
@@ -79,6 +81,7 @@ class _Band:
     output: Output
     voltage: Array
     step: float
+    order: int
     bins: NDArray[np.intp]
     data: Array
     low: float
@@ -89,9 +92,9 @@ class _Band:
         return _transform(self.output.sampled(signal))[self.bins]
 
     def driven(self, frequency: float, quality: float) -> Array:
-        """Acceleration of a mode of unit gain, and of one driven by the voltage's rate, shape (bins, 2)."""
-        response = mode_response(self.voltage, frequency, quality, self.step)
-        return np.array([self.transform(response[2]), self.transform(response[3] / (2.0 * np.pi * frequency))]).T
+        """Motion of a mode of unit gain, and of one driven by the voltage's rate, as sensed, shape (bins, 2)."""
+        motion = mode_response(self.voltage, frequency, quality, self.step)[self.order : self.order + 2]
+        return np.array([self.transform(motion[0]), self.transform(motion[1] / (2.0 * np.pi * frequency))]).T
 
     def decay(self, frequency: float, quality: float) -> Array:
         """Free decay of a mode in two phases, shape (bins, 2)."""
@@ -104,13 +107,13 @@ def _transform(values: Array) -> Array:
     return np.asarray(np.fft.rfft(np.hanning(values.size) * (values - values.mean())))
 
 
-def with_driven_modes(runs: Sequence[Run], device: Device) -> Device:
-    """The device with the further modes that its acceleration signals show, as ``[x.terms.driven-modes]``.
+def with_driven_modes(runs: Sequence[Run], device: Device, at_least: int = SEVERAL_MODES) -> Device:
+    """The device with the further modes that its sensors of motion show, as ``[x.terms.driven-modes]``.
 
-    It is the same one if there are none, or if it would predict worse with them.
+    It is the same one if there are fewer than ``at_least``, or if it would predict worse with them.
     """
     for name, axis in device.axes.items():
-        if _may_show_modes(axis) and (table := find_modes(runs, axis)) is not None:
+        if _may_show_modes(axis) and (table := find_modes(runs, axis, at_least)) is not None:
             extended = device.with_terms({name: {EFFECT: table}})
             if not is_worse(open_loop(runs, device), open_loop(runs, extended)):
                 device = extended
@@ -133,11 +136,11 @@ def describe_modes(runs: Sequence[Run], nominal: Device, device: Device) -> dict
 
 def _may_show_modes(axis: Axis) -> bool:
     linear = axis.drive is not None and axis.drive.kind == "linear" and axis.mechanics is not None
-    return linear and isinstance(axis.readout, Acceleration) and EFFECT not in axis.terms
+    return linear and isinstance(axis.readout, MotionSensor) and EFFECT not in axis.terms
 
 
-def find_modes(runs: Sequence[Run], axis: Axis) -> dict[str, float | list[float]] | None:
-    """Further modes of one axis as the table of their term, None where the recordings show fewer than two.
+def find_modes(runs: Sequence[Run], axis: Axis, at_least: int = SEVERAL_MODES) -> dict[str, float | list[float]] | None:
+    """Further modes of one axis as the table of their term, None where the recordings show fewer than ``at_least``.
 
     Modes are added to the mirror's own one where they take the most of the remaining power, and all are then fitted
     together, until none takes ``MIN_GAIN``.
@@ -152,10 +155,10 @@ def find_modes(runs: Sequence[Run], axis: Axis) -> dict[str, float | list[float]
         if _power(left) > (1.0 - MIN_GAIN) * _power(residual) or not _is_further(more):
             break
         modes, residual = more, left
-    if len(modes) - 1 < MIN_FURTHER_MODES or _power(residual) > MAX_RESIDUAL_RATIO**2 * columns.power:
+    if len(modes) - 1 < at_least or _power(residual) > MAX_RESIDUAL_RATIO**2 * columns.power:
         return None
     heights, readout = _heights(columns, modes)[0], axis.readout
-    assert isinstance(readout, Acceleration)
+    assert isinstance(readout, MotionSensor)
     return {
         "frequency": modes[1:, 0].tolist(),
         "quality": modes[1:, 1].tolist(),
@@ -174,7 +177,7 @@ def _is_further(modes: Array) -> bool:
 def _band(run: Run, axis: Axis) -> _Band | None:
     """The sense signal of an axis in the band of its drive, None where the drive is no broad band."""
     outputs = [output for output in run.outputs if output.kind == "sense" and axis.name in output.axes]
-    if not outputs or axis.name not in run.inputs:
+    if not outputs or axis.name not in run.inputs or not isinstance(axis.readout, MotionSensor):
         return None
     (output,), inputs = outputs, run.inputs[axis.name]
     voltage = nodes_to_samples(inputs.voltage)
@@ -189,8 +192,8 @@ def _band(run: Run, axis: Axis) -> _Band | None:
     low, high = frequency[driven].min(), frequency[driven].max()
     if np.log2(high / low) < MIN_BAND_OCTAVES or driven.sum() < 0.5 * ((frequency >= low) & (frequency <= high)).sum():
         return None
-    bins = np.flatnonzero(driven)
-    return _Band(output, voltage, inputs.step, bins, _transform(output.data)[bins], float(low), float(high))
+    bins, order = np.flatnonzero(driven), axis.readout.order
+    return _Band(output, voltage, inputs.step, order, bins, _transform(output.data)[bins], float(low), float(high))
 
 
 class _Columns:

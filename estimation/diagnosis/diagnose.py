@@ -24,6 +24,10 @@ from scanner.terms import Term, catalogue
 
 SCHEMA = "lissajous-diagnosis/1"
 
+MIN_SHARE_OF_LAWS = 0.5
+"""Share of the misfit that laws with a name explain, below which a single further mode is sought: then most of the
+misfit has another cause, and ``second-mode``, which may be the same mode, has not been found."""
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -106,12 +110,20 @@ def diagnose(
     runs = [prepare_run(recording, nominal) for recording in recordings]
     extended = with_driven_modes(runs, nominal)
     diagnosis = _diagnose_runs(runs, extended, progress, excluded)
+    if extended is nominal and diagnosis.verdict == "mismatch" and _share_of_laws(diagnosis) < MIN_SHARE_OF_LAWS:
+        extended = with_driven_modes(runs, nominal, at_least=1)
+        diagnosis = diagnosis if extended is nominal else _diagnose_runs(runs, extended, progress, excluded)
     if extended is nominal:
         return diagnosis
     nominal_loops = {name: loop.to_json() for name, loop in open_loop(runs, nominal).items()}
     loops = {name: {**both, "nominal": nominal_loops[name]} for name, both in diagnosis.open_loop.items()}
     modes = describe_modes(runs, nominal, extended)
     return replace(diagnosis, verdict="mismatch", open_loop=loops, further_modes=modes)
+
+
+def _share_of_laws(diagnosis: Diagnosis) -> float:
+    """Share of the misfit that findings with a name explain."""
+    return sum(finding.share or 0.0 for finding in diagnosis.findings if finding.effect != "unknown")
 
 
 def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress, excluded: Collection[str]) -> Diagnosis:

@@ -1,4 +1,4 @@
-"""Further modes in an acceleration signal: found where there are several, never in place of an effect of one mode."""
+"""Further modes in the signal of a sensor of motion: stated where no effect of one mode explains them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation.device_fit.data import Run, prepare_run
-from estimation.device_fit.further_modes import _band, _Columns, _fit, _heights, find_modes, with_driven_modes
+from estimation.device_fit.further_modes import _band, _Columns, _fit, _heights, find_modes
 from estimation.diagnosis import diagnose as diagnosing
 from recon.report.conclusions import conclude_diagnosis
 from scanner.active_terms import stated_terms
@@ -18,7 +18,7 @@ from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.integrator.nodes import to_nodes
 from scanner.recording import Recording
-from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position
+from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position, Velocity
 from scanner.terms import catalogue
 
 RATE, DURATION, RESONANCE = 400.0, 60.0, 2 * np.pi * 7.3
@@ -79,16 +79,34 @@ def test_the_further_modes_of_a_structure_are_found_beside_a_softening_one() -> 
         {"second-mode": {"c": 0.02, "f2": 9.0, "Q2": 40.0}},
     ],
 )
-def test_one_mode_and_effects_of_the_catalogue_are_no_further_modes(terms: dict[str, dict[str, float]]) -> None:
-    runs, nominal, _ = prepared(terms, Acceleration(1.0, 0.02))
+@pytest.mark.parametrize("readout", [Acceleration(1.0, 0.02), Position(1000.0, 0.01)])
+def test_one_mode_and_effects_of_the_catalogue_are_no_further_modes(
+    terms: dict[str, dict[str, float]], readout: MotionSensor
+) -> None:
+    runs, nominal, _ = prepared(terms, readout)
     assert find_modes(runs, nominal) is None
 
 
-def test_only_acceleration_signals_are_searched_for_modes() -> None:
-    runs, _, recording = prepared({"driven-modes": MODES}, Position(300.0, 1e-4))
-    device = recording.device
-    assert device is not None
-    assert with_driven_modes(runs, device) is device
+@pytest.mark.parametrize("readout", [Velocity(30.0, 1e-3), Position(1000.0, 1e-3)])
+def test_every_sensor_of_motion_shows_further_modes(readout: MotionSensor) -> None:
+    runs, nominal, _ = prepared({"driven-modes": {**MODES, "direct": 0.0}}, readout)
+    found = find_modes(runs, nominal)
+    assert found is not None
+    assert found["frequency"] == pytest.approx(MODES["frequency"], rel=0.01)
+    assert found["gain"] == pytest.approx(MODES["gain"], rel=0.05)
+
+
+def test_a_single_mode_that_no_law_explains_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In opposite phase to the mirror's own: ``second-mode`` is driven by the mirror and in phase below both."""
+    known = {effect: catalogue()[effect] for effect in ("cubic-stiffness", "second-mode", "feedthrough")}
+    monkeypatch.setattr(diagnosing, "catalogue", lambda: known)
+    mode = {"frequency": [11.0], "quality": [40.0], "gain": [-0.012], "gain_rate": [0.0], "direct": 0.0}
+    *_, recording = prepared({"driven-modes": mode}, Position(1000.0, 1e-3))
+    diagnosis = diagnosing.diagnose([recording])
+    assert diagnosis.further_modes["x"]["frequency"] == pytest.approx([11.0], rel=1e-3)
+    assert diagnosis.device.axes["x"].terms["driven-modes"]["gain"] == pytest.approx([-0.012], rel=0.01)
+    errors = diagnosis.open_loop["sense_x"]
+    assert errors["improved"]["rmse"] < 0.1 * errors["nominal"]["rmse"]
 
 
 def test_a_diagnosis_states_further_modes_and_the_law_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
