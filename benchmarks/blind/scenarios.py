@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import pi, sqrt
 from typing import Any
 
@@ -114,7 +114,8 @@ class Scenario:
 
     def command(self, t: Array) -> Array:
         """The drive's command at any times [V]; a switching time belongs to what follows."""
-        return self._of_part(t, np.searchsorted([part.start for part in self.drive[1:]], t + 1e-12, side="right"))
+        part = np.searchsorted([part.start for part in self.drive[1:]], t + 1e-12, side="right")
+        return _of_part(self.drive, t, part)
 
     @cached_property
     def recorded_voltages(self) -> Array:
@@ -123,16 +124,25 @@ class Scenario:
 
     def voltages(self, start: float, stop: float, step: float) -> Array:
         """The command at the nodes of every step, (n, nodes) [V], by the waveform in which the step lies."""
-        first = start + step * np.arange(round((stop - start) / step))
-        part = np.searchsorted([part.start for part in self.drive[1:]], first + 0.5 * step, side="right")
-        nodes = first[:, None] + NODES * step
-        return self._of_part(nodes, np.broadcast_to(part[:, None], nodes.shape))
+        return _voltages(self.drive, start, stop, step)
 
-    def _of_part(self, t: Array, part: NDArray[np.intp]) -> Array:
-        volts = np.empty(t.shape)
-        for i, tones in enumerate(self.drive):
-            volts[part == i] = tones(t[part == i])
-        return volts
+
+@lru_cache(maxsize=4)
+def _voltages(drive: tuple[Tones, ...], start: float, stop: float, step: float) -> Array:
+    """See :meth:`Scenario.voltages`; kept, because scenarios with other initial states have the same drive."""
+    first = start + step * np.arange(round((stop - start) / step))
+    part = np.searchsorted([part.start for part in drive[1:]], first + 0.5 * step, side="right")
+    nodes = first[:, None] + NODES * step
+    volts = _of_part(drive, nodes, np.broadcast_to(part[:, None], nodes.shape))
+    volts.flags.writeable = False
+    return volts
+
+
+def _of_part(drive: tuple[Tones, ...], t: Array, part: NDArray[np.intp]) -> Array:
+    volts = np.empty(t.shape)
+    for i, tones in enumerate(drive):
+        volts[part == i] = tones(t[part == i])
+    return volts
 
 
 def ring(rng: Rng) -> Scenario:
