@@ -152,7 +152,6 @@ def report(name: str, case: Case) -> dict[str, Any]:
             "effect": f["effect"], "stage": f["stage"], "p": round(f["probability"], 4), "share": f.get("share"),
             "parameters": {p["name"]: p["value"] for p in f["parameters"]},
             "rivals": {r["effect"]: round(r["probability"], 4) for r in f["rivals"][:4]},
-            "formula": (f.get("curve") or {}).get("formula"),
         }
         for f in content["findings"]
     ]  # fmt: skip

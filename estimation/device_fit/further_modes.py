@@ -1,9 +1,10 @@
 """Further modes of the structure in the signal of a sensor of motion, which the drive excites beside the mirror's own.
 
-A sensor shows every mode in the band of the drive, an accelerometer those at high frequencies most, as it weighs a mode
-with the square of its frequency; modes beyond the band appear as a part of the drive itself. Their sum is linear. Two
-and more are fitted before the selection: no effect of the catalogue is several modes, and effects of the mirror's
-own mode would only be seen beside them. A single one is sought where the catalogue does not explain the misfit.
+An accelerometer weighs a mode with the square of its frequency, so it shows every mode in the band of the drive, and
+all modes below the band as a part of the drive itself. Their sum is linear and is fitted before the selection: no
+effect of the catalogue is several modes, and effects of the mirror's own mode would only be seen beside them. In the
+signals of other sensors the mirror's own mode is the largest, and what a nonlinear one leaves may resemble modes.
+There, modes are sought where neither laws nor free corrections explain the misfit.
 
 Source: Ewins, Modal Testing, Research Studies Press (2000), section 4.3 (modes and residual terms).
 """
@@ -22,13 +23,13 @@ from estimation.device_fit.open_loop import is_worse, open_loop
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.integrator.nodes import nodes_to_samples
-from scanner.stages import MotionSensor
+from scanner.stages import Acceleration, MotionSensor
 from scanner.terms.driven_modes import EFFECT, mode_response
 from scanner.terms.term import MIN_MODE_QUALITY
 
 SEVERAL_MODES = 2
-"""Number of further modes that are stated before laws are selected. A single one is left to ``second-mode`` at first,
-and a direct part of the drive to ``feedthrough``."""
+"""Least number of further modes that are stated before laws are selected. A single one is left to ``second-mode``, and
+a direct part of the drive to ``feedthrough``."""
 
 MAX_FURTHER_MODES = 8
 """Bound on the search. A band with more modes has a residual that the diagnosis then reports."""
@@ -107,13 +108,19 @@ def _transform(values: Array) -> Array:
     return np.asarray(np.fft.rfft(np.hanning(values.size) * (values - values.mean())))
 
 
-def with_driven_modes(runs: Sequence[Run], device: Device, at_least: int = SEVERAL_MODES) -> Device:
-    """The device with the further modes that its sensors of motion show, as ``[x.terms.driven-modes]``.
+def with_driven_modes(runs: Sequence[Run], device: Device, unexplained: bool = False) -> Device:
+    """The device with the further modes that its sensors show, as ``[x.terms.driven-modes]``.
 
-    It is the same one if there are fewer than ``at_least``, or if it would predict worse with them.
+    It is the same one if there are none, or if it would predict worse with them.
+
+    Args:
+        unexplained: whether laws have been selected and leave most of the misfit. Then a single mode is stated too, and
+            every sensor of motion is searched, not accelerometers alone.
     """
+    sensor, at_least = (MotionSensor, 1) if unexplained else (Acceleration, SEVERAL_MODES)
     for name, axis in device.axes.items():
-        if _may_show_modes(axis) and (table := find_modes(runs, axis, at_least)) is not None:
+        may_show = _has_linear_drive(axis) and isinstance(axis.readout, sensor) and EFFECT not in axis.terms
+        if may_show and (table := find_modes(runs, axis, at_least)) is not None:
             extended = device.with_terms({name: {EFFECT: table}})
             if not is_worse(open_loop(runs, device), open_loop(runs, extended)):
                 device = extended
@@ -134,9 +141,8 @@ def describe_modes(runs: Sequence[Run], nominal: Device, device: Device) -> dict
     return described
 
 
-def _may_show_modes(axis: Axis) -> bool:
-    linear = axis.drive is not None and axis.drive.kind == "linear" and axis.mechanics is not None
-    return linear and isinstance(axis.readout, MotionSensor) and EFFECT not in axis.terms
+def _has_linear_drive(axis: Axis) -> bool:
+    return axis.drive is not None and axis.drive.kind == "linear" and axis.mechanics is not None
 
 
 def find_modes(runs: Sequence[Run], axis: Axis, at_least: int = SEVERAL_MODES) -> dict[str, float | list[float]] | None:

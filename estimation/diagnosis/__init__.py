@@ -13,6 +13,6 @@ data, pictures and reports do not belong here. Modules in the order of the compu
 4. ``improvement``: the improved device; ``shares``: what each finding explains; ``corrected_parameters``: parameters
    beside a discrepancy; ``identifiability``: detectability of every effect; ``experiment_design``: further
    measurements; ``free_decay``: what one decay cannot tell apart; ``localisation``: channel, time and harmonics of a
-   misfit; ``discrepancy_law``: a fitted discrepancy as formula and curve.
+   misfit; ``discrepancy_law``: a fitted discrepancy as curve and table.
 5. ``finding``: an effect with its evidence and its rivals; ``diagnose``: verdict and findings.
 """

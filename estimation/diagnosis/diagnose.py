@@ -24,10 +24,6 @@ from scanner.terms import Term, catalogue
 
 SCHEMA = "lissajous-diagnosis/1"
 
-MIN_SHARE_OF_LAWS = 0.5
-"""Share of the misfit that laws with a name explain, below which a single further mode is sought: then most of the
-misfit has another cause, and ``second-mode``, which may be the same mode, has not been found."""
-
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -110,8 +106,8 @@ def diagnose(
     runs = [prepare_run(recording, nominal) for recording in recordings]
     extended = with_driven_modes(runs, nominal)
     diagnosis = _diagnose_runs(runs, extended, progress, excluded)
-    if extended is nominal and diagnosis.verdict == "mismatch" and _share_of_laws(diagnosis) < MIN_SHARE_OF_LAWS:
-        extended = with_driven_modes(runs, nominal, at_least=1)
+    if extended is nominal and _leaves_most(diagnosis):
+        extended = with_driven_modes(runs, nominal, unexplained=True)
         diagnosis = diagnosis if extended is nominal else _diagnose_runs(runs, extended, progress, excluded)
     if extended is nominal:
         return diagnosis
@@ -121,9 +117,10 @@ def diagnose(
     return replace(diagnosis, verdict="mismatch", open_loop=loops, further_modes=modes)
 
 
-def _share_of_laws(diagnosis: Diagnosis) -> float:
-    """Share of the misfit that findings with a name explain."""
-    return sum(finding.share or 0.0 for finding in diagnosis.findings if finding.effect != "unknown")
+def _leaves_most(diagnosis: Diagnosis) -> bool:
+    """Whether more of the misfit is left than all findings explain, laws and free corrections alike."""
+    explained = sum(finding.share or 0.0 for finding in diagnosis.findings)
+    return (diagnosis.remainder or {}).get("share", 0.0) > explained
 
 
 def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress, excluded: Collection[str]) -> Diagnosis:

@@ -1,4 +1,4 @@
-"""Law of a fitted discrepancy term: a curve with its band, a formula of its largest parts, and a table for a device."""
+"""Law of a fitted discrepancy term: a curve with its band, and a table for a device."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 
 from estimation.device_fit.fit import Fit
 from estimation.diagnosis.discrepancy import (
-    AMPLITUDE_MEMORY_SHARES,
-    DELAY_MEMORY_PERIODS,
     FORCE_DEGREE,
     FORCE_POWERS,
     GAIN_COSINES,
@@ -19,53 +17,6 @@ from estimation.diagnosis.discrepancy import (
 )
 from scanner.arrays import Array
 from scanner.terms import NaturalScales
-
-MIN_CHI2_PER_TERM = 12.0
-"""Rise of chi-square, if a part of the formula is removed, from which the part remains. Of fifty parts without any true
-contribution, one exceeds it in a recording out of forty."""
-
-MAX_PARTS = 4
-"""Parts of the formula, which has to be read at a glance."""
-
-LENGTH = "T: duration of the recording"
-STATE = "x = θ/A, y = θ'/(A ω)"
-VARIABLES = {
-    "free-mechanics": ("f/(k A)", f"{STATE}, H_s: x² + y² after a low-pass with time constant s T, {LENGTH}"),
-    "free-stiffness": ("(δk θ + δb θ')/(k A)", f"{STATE}, {LENGTH}"),
-    "free-capacitance": ("δC/(C0 exp(−u²))", "u = (θ − centre)/θ0"),
-    "free-drive": ("δV/s", f"u = V/s, v = V'/(s ω), s: the drive's rms, {LENGTH}"),
-    "free-readout": (
-        "δy/s",
-        f"u = y/s, w = y'/(s ω), {STATE}, r = y/√(x² + y²), P_h: play of half-width h, s: the signal's rms, {LENGTH}",
-    ),
-    "free-timing": ("delay/s", f"r² = x² + y², {STATE}, M_n: low-pass with a time constant of n periods, {LENGTH}"),
-    "free-optics": ("δθ/A", "x = θ/A"),
-}
-"""Left side of the formula of each discrepancy term, and the definition of its variables."""
-
-POLYNOMIALS = {
-    "free-mechanics": {
-        f"h{2 * i + j}": f"H_{share:g} {state}"
-        for i, state in enumerate("xy")
-        for j, share in enumerate(AMPLITUDE_MEMORY_SHARES)
-    },
-    "free-capacitance": {"a1": "u", "a3": "u³", "a4": "u⁴", "a5": "u⁵", "a6": "u⁶"},
-    "free-drive": {"v0": "u", "v1": "v", "v2": "u²", "v3": "u³", "v4": "u v", "v5": "v³"},
-    "free-readout": {
-        "y0": "u²", "y1": "u³", "y2": "w", "w0": "u y", "w1": "u x y", "w2": "u r", "w3": "u r³", "w4": "u r⁵",
-        **{f"m{i}": f"(P_{width}[u] − u)" for i, width in enumerate(PLAY_HALF_WIDTHS)},
-    },
-    "free-timing": {
-        "r2": "r²", "r4": "r⁴", **{f"m{i}": f"(M_{turns:g}[r²] − r²)" for i, turns in enumerate(DELAY_MEMORY_PERIODS)},
-    },
-}  # fmt: skip
-"""Symbol in the formula of every parameter whose part is not a cosine, by discrepancy term."""
-
-COSINE_FACTORS = {"k": "x ", "b": "y ", "g": "u ", "o": "", "d": ""}
-"""Variable that a cosine over time multiplies, by the first letter of the parameter's name."""
-
-POWER = ("", "", "²", "³", "⁴", "⁵")
-"""Exponents as a formula shows them, by their value."""
 
 
 class Section(NamedTuple):
@@ -92,7 +43,7 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
     It is drawn along the section on which the law is largest relative to its possible contributions.
 
     Returns:
-        the content of ``curve`` in diagnosis.json: labels, units, points and formula.
+        the content of ``curve`` in diagnosis.json: labels, units and points.
     """
     candidate = fit.model.candidates[-1]
     scales = fit.model.scales(candidate.axis)
@@ -122,7 +73,6 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
         "unit": section.unit,
         "columns": [section.x_label, section.label, "sd"],
         "points": points,
-        "formula": _formula(fit, indices),
     }
 
 
@@ -185,48 +135,6 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
                 for i, hat in enumerate(np.eye(MAPPING_KNOTS.size))
             }
             return [Section(hats, "angle error", "rad", s.amplitude * u, "angle (rad)")]
-
-
-def _symbol(effect: str, name: str) -> str:
-    """Symbol of a parameter in the formula."""
-    letter, number = name[0], name[1:]
-    if name in POLYNOMIALS.get(effect, {}):
-        return POLYNOMIALS[effect][name]
-    if effect == "free-mechanics" and letter == "f":
-        return " ".join(base + POWER[int(n)] for base, n in zip("xy", number, strict=True) if n != "0")
-    if letter == "c":
-        return f"hat(x − {MAPPING_KNOTS[int(number)]:.2g})".replace("− -", "+ ")
-    wave = "" if number == "0" else f"cos({number} π t/T)".replace("(1 ", "(")
-    return COSINE_FACTORS[letter] + wave
-
-
-def _formula(fit: Fit, indices: list[int]) -> str:
-    """Formula of the last term of a fit, a discrepancy term, reduced to its largest parts by backward elimination.
-
-    Parts are removed until at most ``MAX_PARTS`` remain, each of which raises chi-square by ``MIN_CHI2_PER_TERM`` if it
-    is removed.
-
-    Args:
-        indices: of the term's parameters in ``fit.x``.
-    """
-    candidate = fit.model.candidates[-1]
-    information = np.linalg.inv(fit.covariance[np.ix_(indices, indices)])
-    score = information @ fit.x[indices]
-    values, selected = fit.x[indices], list(range(len(indices)))
-    while selected:
-        inner = information[np.ix_(selected, selected)]
-        values = np.linalg.solve(inner, score[selected])
-        chi2_rise = values**2 / np.diag(np.linalg.inv(inner))
-        weakest = int(np.argmin(chi2_rise))
-        if chi2_rise[weakest] > MIN_CHI2_PER_TERM and len(selected) <= MAX_PARTS:
-            break
-        selected.pop(weakest)
-        values = np.delete(values, weakest)
-    scales, effect = fit.model.scales(candidate.axis), candidate.term.effect
-    free = [candidate.term.free_parameters[i] for i in selected]
-    parts = [f"{p.value(v, scales):.3g} {_symbol(effect, p.name)}".strip() for p, v in zip(free, values, strict=True)]
-    law, variables = VARIABLES[effect]
-    return f"{law} = {' + '.join(parts) or '0'}".replace("+ -", "− ") + f" with {variables}"
 
 
 STATIC_PARAMETERS = {

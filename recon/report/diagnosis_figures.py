@@ -63,7 +63,7 @@ def measured_curve_figure(curve: Any) -> Figure:
         axes.set(xlabel=curve["x"], ylabel=f"{curve['y']} ({curve['unit']})")
         axes.legend(frameon=False)
 
-    return one_panel(draw, f"measured curve of the unknown effect; approximated by {curve['formula']}")
+    return one_panel(draw, "measured curve of the unknown effect")
 
 
 def waveform_figure(shown: Waveform, name: str, unit: str) -> Figure:

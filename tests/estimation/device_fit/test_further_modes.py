@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation.device_fit.data import Run, prepare_run
-from estimation.device_fit.further_modes import _band, _Columns, _fit, _heights, find_modes
+from estimation.device_fit.further_modes import _band, _Columns, _fit, _heights, find_modes, with_driven_modes
 from estimation.diagnosis import diagnose as diagnosing
 from recon.report.conclusions import conclude_diagnosis
 from scanner.active_terms import stated_terms
@@ -94,6 +94,14 @@ def test_every_sensor_of_motion_shows_further_modes(readout: MotionSensor) -> No
     assert found is not None
     assert found["frequency"] == pytest.approx(MODES["frequency"], rel=0.01)
     assert found["gain"] == pytest.approx(MODES["gain"], rel=0.05)
+
+
+def test_only_acceleration_signals_are_searched_before_laws_are_selected() -> None:
+    runs, _, recording = prepared({"driven-modes": MODES}, Position(1000.0, 1e-3))
+    device = recording.device
+    assert device is not None
+    assert with_driven_modes(runs, device) is device
+    assert with_driven_modes(runs, device, unexplained=True) is not device
 
 
 def test_a_single_mode_that_no_law_explains_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
