@@ -1,15 +1,14 @@
 """Diagnosis of unmodelled dynamics: which effect the nominal device omits, its size, and the updated device.
 
-The package contains the selection of terms by evidence among fits of ``estimation.device_fit``; simulation of test
-data, pictures and reports do not belong here. Modules in the order of the computation:
+The package contains the selection of terms by evidence among fits of ``estimation.device_fit``, around which
+``estimation.candidate_terms`` compares them; simulation of test data, pictures and reports do not belong here. Modules
+in the order of the computation:
 
 1. ``undriven``: recordings that no model predicts; ``clipping``: readouts that are clipped.
-2. ``discrepancy``: flexible terms for effects without a law; ``anchor``: a fit that follows the motion;
-   ``from_stated_values``: fits where nominal values have absorbed a misfit.
-3. ``screening``: sensitivities to every candidate term; ``linear_model``: named laws beside a discrepancy, compared by
-   evidence; ``linearisation``: that model around a fit, and fits from it; ``law_selection``: laws selected, fitted and
-   selected again; ``necessity``: whether they are the answer; ``pruning``: terms and amplitudes that are not required;
-   ``significance``; ``selection``: named laws, else a discrepancy, else nothing.
+2. ``from_stated_values``: fits where nominal values have absorbed a misfit.
+3. ``law_selection``: laws selected, fitted and selected again; ``rival_laws``: laws to be fitted in their place;
+   ``necessity``: whether they are the answer; ``pruning``: terms and amplitudes that are not required; ``selection``:
+   named laws, else a discrepancy, else nothing.
 4. ``improvement``: the improved device; ``shares``: what each finding explains; ``corrected_parameters``: parameters
    beside a discrepancy; ``identifiability``: detectability of every effect; ``experiment_design``: further
    measurements; ``free_decay``: what one decay cannot tell apart; ``localisation``: channel, time and harmonics of a

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimation.candidate_terms.linear_model import MAX_SCALE_BESIDE, LinearModel
 from estimation.device_fit.fit import Fit
-from estimation.diagnosis.linear_model import MAX_SCALE_BESIDE, LinearModel
 from estimation.least_squares import Z_95, regress
 from scanner.arrays import Array
 
@@ -39,7 +39,7 @@ def correct_parameters(fit: Fit, corrections: LinearModel) -> CorrectedParameter
     """Mean and standard deviation of all parameters of a fit beside corrections, to first order.
 
     Args:
-        corrections: see :func:`estimation.diagnosis.linearisation.linear_model_of_corrections`.
+        corrections: see :func:`estimation.candidate_terms.linearisation.linear_model_of_corrections`.
     """
     scales = corrections.hypothesis((), max_scale=MAX_SCALE_BESIDE).scales
     precision = np.repeat(1.0 / scales, [term.columns.size for term in corrections.discrepancies])

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit
-from estimation.diagnosis.discrepancy import (
+from estimation.candidate_terms.discrepancy import (
     FORCE_DEGREE,
     FORCE_POWERS,
     GAIN_COSINES,
@@ -15,6 +14,7 @@ from estimation.diagnosis.discrepancy import (
     PLAY_HALF_WIDTHS,
     apply_play,
 )
+from estimation.device_fit.fit import Fit
 from scanner.arrays import Array
 from scanner.terms import NaturalScales
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimation.candidate_terms.screening import amplitude_indices
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import Fit, Likelihood, linearise_simulated
 from estimation.device_fit.initial import start_indices, stated_whitener
@@ -19,7 +20,6 @@ from estimation.diagnosis.identifiability import (
     confusion_probability,
     unexplained_norms,
 )
-from estimation.diagnosis.screening import amplitude_indices
 from scanner.arrays import Array
 
 RELATIVE_ANGLE_NOISE_SD = 1e-3

@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 
+from estimation.candidate_terms.discrepancy import is_discrepancy
+from estimation.candidate_terms.screening import ScoreTest
+from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD
 from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.profile_likelihood import profile_interval
 from estimation.diagnosis.clipping import rail_resolution
 from estimation.diagnosis.corrected_parameters import CorrectedParameters
-from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import correction_curve
 from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals
 from estimation.diagnosis.free_decay import decay_advice, decay_confounders
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, determined_parameters
 from estimation.diagnosis.localisation import describe_localisation
-from estimation.diagnosis.screening import ScoreTest
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from estimation.diagnosis.shares import share_of_finding
-from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
 
 METRIC = "reduced chi-square of the whitened residual on samples not used in the fit"
 

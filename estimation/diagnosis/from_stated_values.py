@@ -6,6 +6,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from estimation.candidate_terms.anchor import WINDOW_TOLERANCE, fit_growing, fit_window
+from estimation.candidate_terms.screening import ScoreTest, is_linear, score_candidate_starts
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD, MAX_HELD_OUT_CHI2, residual_is_noise
 from estimation.device_fit.fit import (
     Fit,
     Likelihood,
@@ -16,9 +19,6 @@ from estimation.device_fit.fit import (
 )
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import WINDOW_TOLERANCE, fit_growing, fit_window
-from estimation.diagnosis.screening import ScoreTest, is_linear, score_candidate_starts
-from estimation.diagnosis.significance import DETECTION_THRESHOLD, MAX_HELD_OUT_CHI2, residual_is_noise
 from scanner.arrays import Array
 from scanner.terms.term import AMPLITUDE_KINDS
 

@@ -12,10 +12,10 @@ from math import erfc, sqrt
 
 import numpy as np
 
+from estimation.candidate_terms.screening import all_candidates, amplitude_indices, score_candidate_starts
+from estimation.candidate_terms.significance import residual_is_noise
 from estimation.device_fit.fit import Fit, Likelihood, nominal_values_are_improbable, stated_values
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.screening import all_candidates, amplitude_indices, score_candidate_starts
-from estimation.diagnosis.significance import residual_is_noise
 from scanner.arrays import Array
 from scanner.terms import Term
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from estimation.candidate_terms.discrepancy import is_discrepancy
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD, held_out_gain, residual_is_noise
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import TIME_BLOCKS, Fit, fit_model, held_out_samples, misfit
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
-from estimation.diagnosis.discrepancy import is_discrepancy
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.significance import DETECTION_THRESHOLD, held_out_gain, residual_is_noise
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.stages import MotionSensor

@@ -13,11 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
-from estimation.device_fit.initial import refit_under_own_noise
-from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.discrepancy import is_discrepancy
-from estimation.diagnosis.linear_model import (
+from estimation.candidate_terms.discrepancy import is_discrepancy
+from estimation.candidate_terms.linear_model import (
     MAX_SCALE_BESIDE,
     MIN_EXCHANGE_GAIN,
     Effects,
@@ -25,10 +22,13 @@ from estimation.diagnosis.linear_model import (
     LinearModel,
     RivalFit,
 )
-from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
+from estimation.candidate_terms.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD, satisfies_sign_constraints
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
+from estimation.device_fit.initial import refit_under_own_noise
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.necessity import NO_LAWS, Need, need_of_laws
 from estimation.diagnosis.rival_laws import MAX_ALTERNATIVES, near_rivals, stated_confounders
-from estimation.diagnosis.significance import DETECTION_THRESHOLD, satisfies_sign_constraints
 from estimation.parallel import map_fits
 
 MAX_LINEARISATIONS = 8

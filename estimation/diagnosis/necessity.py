@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from estimation.diagnosis.linear_model import LinearModel
-from estimation.diagnosis.significance import DETECTION_THRESHOLD
+from estimation.candidate_terms.linear_model import LinearModel
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD
 
 MIN_EXPLAINED_RATIO = 0.1
 """Fall of the misfit by laws over that by free corrections beside them, from which laws may be the answer. Nominal

@@ -12,12 +12,12 @@ from math import comb, log
 
 import numpy as np
 
+from estimation.candidate_terms.screening import is_linear
+from estimation.candidate_terms.significance import evidence_gain, residual_is_noise
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.hum import STRONG_HUM, TONE, WEAK_HUM, select_mains_hum
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.screening import is_linear
-from estimation.diagnosis.significance import evidence_gain, residual_is_noise
 from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
 from scanner.arrays import Array
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from estimation.diagnosis.linear_model import Effects, Hypothesis, LinearModel
-from estimation.diagnosis.significance import DETECTION_THRESHOLD
+from estimation.candidate_terms.linear_model import Effects, Hypothesis, LinearModel
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD
 
 MAX_ALTERNATIVES = 6
 """Laws that are fitted in the place of each other, the best in the linear model: single laws around a discrepancy, as

@@ -5,6 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from estimation.candidate_terms.anchor import fit_anchor, fit_growing, max_residual_ratio, residual_ratio
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, is_discrepancy
+from estimation.candidate_terms.linear_model import RivalFit
+from estimation.candidate_terms.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
+from estimation.candidate_terms.screening import all_candidates, damped_start
+from estimation.candidate_terms.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import (
     Fit,
@@ -24,9 +30,7 @@ from estimation.device_fit.initial import (
 from estimation.device_fit.interference import with_interference_line
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import fit_anchor, fit_growing, max_residual_ratio, residual_ratio
 from estimation.diagnosis.clipping import clipped_readouts
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.diagnosis.from_stated_values import (
     fit_from_stated_values,
     fit_nonlinear_law,
@@ -34,8 +38,6 @@ from estimation.diagnosis.from_stated_values import (
     nonlinear_starts,
 )
 from estimation.diagnosis.law_selection import SelectedTerms, choose_laws
-from estimation.diagnosis.linear_model import RivalFit
-from estimation.diagnosis.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.diagnosis.necessity import least_explained, need_of_laws
 from estimation.diagnosis.pruning import (
     drop_redundant,
@@ -44,8 +46,6 @@ from estimation.diagnosis.pruning import (
     refit_without,
     select_hum,
 )
-from estimation.diagnosis.screening import all_candidates, damped_start
-from estimation.diagnosis.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
 from estimation.parallel import map_fits
 from scanner.device import Device
 from scanner.terms import Term

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from estimation.candidate_terms.linear_model import LinearModel
+from estimation.candidate_terms.linearisation import linear_model_of_corrections
+from estimation.candidate_terms.screening import ScoreTest
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD, residual_is_noise
 from estimation.device_fit.fit import Fit, Likelihood, held_out_samples, misfit
-from estimation.diagnosis.linear_model import LinearModel
-from estimation.diagnosis.linearisation import linear_model_of_corrections
 from estimation.diagnosis.localisation import chi2_reduction_by_channel
-from estimation.diagnosis.screening import ScoreTest
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.significance import DETECTION_THRESHOLD, residual_is_noise
 
 MAX_UNEXPLAINED_SHARE = 0.1
 """Largest residual, without the noise and as a share of a channel's standard deviation, of a fit that is called

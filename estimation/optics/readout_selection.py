@@ -22,8 +22,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD
 from estimation.diagnosis.finding import Finding, ParameterEstimate
-from estimation.diagnosis.significance import DETECTION_THRESHOLD
 from estimation.least_squares import Z_95, eliminate_backward
 from estimation.optics.readout_effects import (
     ReadoutEffect,

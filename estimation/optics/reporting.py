@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
-from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
 from estimation.least_squares import Z_95
 from estimation.optics.candidates import OpticsEffect, natural_scales
 from estimation.optics.fit import UNRESOLVED_SD_CELLS, validation_error

@@ -25,9 +25,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
-from estimation.diagnosis.significance import DETECTION_THRESHOLD
 from estimation.least_squares import GaussianPosterior, eliminate_backward, gaussian_posterior
 from estimation.optics.candidates import OpticsEffect, candidate_effects
 from estimation.optics.fit import fit_optics

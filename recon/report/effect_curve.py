@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
 from estimation.device_fit.fit import Fit
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.posterior import axis_trajectories, draw_parameters
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from scanner.active_terms import ActiveTerm, with_constants
 from scanner.arrays import Array
 from scanner.forward_model import AxisTrajectory, apply_channel_terms, effective_drive, sense_signal

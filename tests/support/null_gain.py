@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.diagnosis.linear_model import LinearModel
+from estimation.candidate_terms.linear_model import LinearModel
 
 DRAWS, SEED = 10_000, 1
 """Draws of noise, which determine the 99.9 % quantile to 0.4, and the seed of them."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import linregress
 
+from estimation.candidate_terms.screening import all_candidates
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.model import Model
-from estimation.diagnosis.screening import all_candidates
 from phantoms.experiment import Experiment, simulate_experiment
 from recon.evaluation import truth_from_simulation
 from recon.pipeline import reconstruct

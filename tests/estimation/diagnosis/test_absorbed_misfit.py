@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.blind.generator import Case
+from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD
 from estimation.device_fit.fit import nominal_values_are_improbable
-from estimation.diagnosis.significance import UNIQUE_NAME_THRESHOLD
 from scanner.terms import catalogue
 from tests.support.blind_recordings import search_blind_recording
 

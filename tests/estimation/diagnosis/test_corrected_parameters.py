@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimation.candidate_terms.linearisation import linear_model_of_corrections
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.initial import (
@@ -17,7 +18,6 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import parameter_estimates
-from estimation.diagnosis.linearisation import linear_model_of_corrections
 from scanner.recording import Recording
 from scanner.terms import catalogue
 from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals

@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
+from estimation.candidate_terms.linearisation import linear_model
+from estimation.candidate_terms.screening import all_candidates
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.drive_lines import is_steady, strongest_line
 from estimation.device_fit.fit import Likelihood, fit_model
@@ -25,9 +28,6 @@ from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.resampling import decimate, resample_drive
 from estimation.device_fit.slow_noise import gain_of_steeper_noise
 from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
-from estimation.diagnosis.linearisation import linear_model
-from estimation.diagnosis.screening import all_candidates
 from recon.cli import main
 from scanner.arrays import Array
 from scanner.device import Device

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
+from estimation.candidate_terms.linear_model import MAX_SCALE_BESIDE, MIN_SCALE, Hypothesis, LinearModel, LinearTerm
+from estimation.candidate_terms.screening import all_candidates
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Fit, Likelihood, fit_model
 from estimation.device_fit.initial import fit_progressively, flat_whiteners, window_schedule
@@ -16,10 +19,7 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import law_selection
 from estimation.diagnosis.diagnose import diagnose
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.law_selection import choose_laws
-from estimation.diagnosis.linear_model import MAX_SCALE_BESIDE, MIN_SCALE, Hypothesis, LinearModel, LinearTerm
-from estimation.diagnosis.screening import all_candidates
 from scanner.device import Axis, Device
 from scanner.recording import Recording
 from scanner.stages import Mechanics

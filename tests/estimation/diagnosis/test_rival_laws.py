@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from estimation.candidate_terms.linear_model import LinearModel, LinearTerm
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.law_selection import _addition_failed
-from estimation.diagnosis.linear_model import LinearModel, LinearTerm
 from estimation.diagnosis.rival_laws import stated_confounders
 from scanner.terms import catalogue
 

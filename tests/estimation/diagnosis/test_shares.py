@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from estimation.candidate_terms.screening import ScoreTest
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Likelihood, fit_model, linearise_at
 from estimation.device_fit.initial import flat_whiteners
@@ -18,7 +19,6 @@ from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse
 from estimation.diagnosis import shares
 from estimation.diagnosis.clipping import find_rail
 from estimation.diagnosis.identifiability import determined_parameters
-from estimation.diagnosis.screening import ScoreTest
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from estimation.diagnosis.shares import (
     describe_unexplained,
@@ -178,10 +178,10 @@ def test_nominal_values_that_absorbed_a_misfit_stay_as_stated() -> None:
 def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> None:
     """A pendulum let go at 45 degrees: whatever its law is called, the device that has it predicts its swing."""
     from benchmarks.measured import ROWS
+    from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
     from estimation.device_fit.fit import Fit
     from estimation.device_fit.initial import estimate_whiteners, fit_progressively, window_schedule
     from estimation.device_fit.parameters import Candidate
-    from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
     from estimation.diagnosis.improvement import improve
 
     (recording,), _, device = ROWS["pendulum-45"](measured_data)

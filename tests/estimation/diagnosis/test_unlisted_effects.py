@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.diagnose import Diagnosis, diagnose
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
 from tests.support.bench import RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES, bench_recording
 
 

@@ -28,7 +28,7 @@ from recon.runtime.compilation import announce_compilation
 
 announce_compilation()
 
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
 from scanner.integrator.runge_kutta import in_all_lanes
 from scanner.terms import catalogue
 

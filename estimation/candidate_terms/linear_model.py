@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.candidate_terms.screening import ScoreTest, is_amplitude
+from estimation.candidate_terms.significance import DETECTION_THRESHOLD
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.screening import ScoreTest, is_amplitude
-from estimation.diagnosis.significance import DETECTION_THRESHOLD
 from estimation.least_squares import regress, triangular_factor
 from scanner.arrays import Array
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.blind.generator import Case, generate_recording, write
+from estimation.candidate_terms.screening import amplitude_indices, set_amplitudes
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.screening import amplitude_indices, set_amplitudes
 from scanner.recording import Recording
 from scanner.terms import catalogue
 

@@ -8,14 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model, nominal_values_are_improbable, stated_values
-from estimation.device_fit.initial import window_schedule
-from estimation.device_fit.model import uncertain
-from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import fit_growing
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, is_discrepancy
-from estimation.diagnosis.linear_model import LinearModel, LinearTerm, columns_of
-from estimation.diagnosis.screening import (
+from estimation.candidate_terms.anchor import fit_growing
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, is_discrepancy
+from estimation.candidate_terms.linear_model import LinearModel, LinearTerm, columns_of
+from estimation.candidate_terms.screening import (
     ScoreTest,
     all_candidates,
     amplitude_indices,
@@ -24,6 +20,10 @@ from estimation.diagnosis.screening import (
     score_candidate_starts,
     set_amplitudes,
 )
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, nominal_values_are_improbable, stated_values
+from estimation.device_fit.initial import window_schedule
+from estimation.device_fit.model import uncertain
+from estimation.device_fit.parameters import Candidate
 from estimation.least_squares import regress
 from scanner.arrays import Array
 from scanner.integrator.abi import MAX_TERMS_PER_STAGE

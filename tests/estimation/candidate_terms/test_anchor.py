@@ -9,15 +9,15 @@ import pytest
 from numpy.polynomial.chebyshev import chebval
 from scipy.integrate import solve_ivp
 
+from estimation.candidate_terms.anchor import MAX_RESIDUAL_RATIO, fit_anchor, residual_ratio
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, FORCE_POWERS, N_FORCE_POWERS, cosine_series
+from estimation.candidate_terms.screening import ProfiledLinearModel, all_candidates, damped_start, linear_gain
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.device_fit.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.anchor import MAX_RESIDUAL_RATIO, fit_anchor, residual_ratio
-from estimation.diagnosis.discrepancy import DISCREPANCY_TERMS, FORCE_POWERS, N_FORCE_POWERS, cosine_series
 from estimation.diagnosis.law_selection import choose_laws
-from estimation.diagnosis.screening import ProfiledLinearModel, all_candidates, damped_start, linear_gain
 from scanner.device import Axis, Device
 from scanner.integrator.abi import Nominal
 from scanner.recording import Recording
