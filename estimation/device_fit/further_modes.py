@@ -117,10 +117,10 @@ def with_driven_modes(runs: Sequence[Run], device: Device, unexplained: bool = F
         unexplained: whether laws have been selected and leave most of the misfit. Then a single mode is stated too, and
             every sensor of motion is searched, not accelerometers alone.
     """
-    sensor, at_least = (MotionSensor, 1) if unexplained else (Acceleration, SEVERAL_MODES)
+    sensor = MotionSensor if unexplained else Acceleration
     for name, axis in device.axes.items():
         may_show = _has_linear_drive(axis) and isinstance(axis.readout, sensor) and EFFECT not in axis.terms
-        if may_show and (table := find_modes(runs, axis, at_least)) is not None:
+        if may_show and (table := find_modes(runs, axis, single=unexplained)) is not None:
             extended = device.with_terms({name: {EFFECT: table}})
             if not is_worse(open_loop(runs, device), open_loop(runs, extended)):
                 device = extended
@@ -145,31 +145,36 @@ def _has_linear_drive(axis: Axis) -> bool:
     return axis.drive is not None and axis.drive.kind == "linear" and axis.mechanics is not None
 
 
-def find_modes(runs: Sequence[Run], axis: Axis, at_least: int = SEVERAL_MODES) -> dict[str, float | list[float]] | None:
-    """Further modes of one axis as the table of their term, None where the recordings show fewer than ``at_least``.
+def find_modes(runs: Sequence[Run], axis: Axis, single: bool = False) -> dict[str, float | list[float]] | None:
+    """Further modes of one axis as the table of their term, None where the recordings show fewer than two.
 
     Modes are added to the mirror's own one where they take the most of the remaining power, and all are then fitted
     together, until none takes ``MIN_GAIN``.
+
+    Args:
+        single: whether one is enough. Then the residues are real, as of light damping: the phase that all modes have in
+            common is that of a delay, which the diagnosis seeks.
     """
     bands = [band for run in runs if (band := _band(run, axis)) is not None]
     if len(bands) < len(runs):
         return None
-    columns = _Columns(bands)
+    columns = _Columns(bands, residues=1 if single else 2)
     modes, residual = _fit(columns, np.array([[axis.resonance, axis.require_mechanics().quality]]))
     while len(modes) <= MAX_FURTHER_MODES:
         more, left = _fit(columns, np.vstack([modes, _next_mode(columns, modes, residual)]))
         if _power(left) > (1.0 - MIN_GAIN) * _power(residual) or not _is_further(more):
             break
         modes, residual = more, left
-    if len(modes) - 1 < at_least or _power(residual) > MAX_RESIDUAL_RATIO**2 * columns.power:
+    if len(modes) - 1 < (1 if single else SEVERAL_MODES) or _power(residual) > MAX_RESIDUAL_RATIO**2 * columns.power:
         return None
     heights, readout = _heights(columns, modes)[0], axis.readout
     assert isinstance(readout, MotionSensor)
+    residues = heights[columns.residues : -1].reshape(len(modes) - 1, columns.residues) / readout.gain
     return {
         "frequency": modes[1:, 0].tolist(),
         "quality": modes[1:, 1].tolist(),
-        "gain": (heights[2:-1:2] / readout.gain).tolist(),
-        "gain_rate": (heights[3:-1:2] / readout.gain).tolist(),
+        "gain": residues[:, 0].tolist(),
+        "gain_rate": (residues[:, 1] if columns.residues > 1 else np.zeros(len(residues))).tolist(),
         "direct": float(heights[-1]),
     }
 
@@ -203,10 +208,15 @@ def _band(run: Run, axis: Axis) -> _Band | None:
 
 
 class _Columns:
-    """Responses of modes in all bands, real and imaginary parts below each other."""
+    """Responses of modes in all bands, real and imaginary parts below each other.
 
-    def __init__(self, bands: Sequence[_Band]):
-        self.bands = tuple(bands)
+    Args:
+        bands: of all recordings.
+        residues: numbers a mode has: its gain, and that for the voltage's rate.
+    """
+
+    def __init__(self, bands: Sequence[_Band], residues: int = 2):
+        self.bands, self.residues = tuple(bands), residues
         data = np.concatenate([band.data for band in bands])
         self.data = _real(data)
         self.power = float(self.data @ self.data)
@@ -214,13 +224,13 @@ class _Columns:
         self._known: dict[tuple[float, float], Array] = {}
 
     def driven(self, frequency: float, quality: float) -> Array:
-        """Of one mode, shape (rows, 2)."""
-        return _real(np.concatenate([band.driven(frequency, quality) for band in self.bands]))
+        """Of one mode, shape (rows, residues)."""
+        return _real(np.concatenate([band.driven(frequency, quality)[:, : self.residues] for band in self.bands]))
 
     def table(self, modes: Array) -> Array:
-        """Of all modes, two a mode, then of the drive, then their decays in each recording, shape (rows, columns)."""
-        decays = [self._mode(*map(float, mode)) for mode in modes]
-        return np.hstack([*(each[:, :2] for each in decays), _real(self._drive), *(each[:, 2:] for each in decays)])
+        """Of all modes, then of the drive, then their decays in each recording, shape (rows, columns)."""
+        known, n = [self._mode(*map(float, mode)) for mode in modes], self.residues
+        return np.hstack([*(each[:, :n] for each in known), _real(self._drive), *(each[:, n:] for each in known)])
 
     def _mode(self, frequency: float, quality: float) -> Array:
         key = (frequency, quality)
@@ -245,7 +255,7 @@ def _heights(columns: _Columns, modes: Array) -> tuple[Array, Array]:
     size = np.linalg.norm(table, axis=0)
     size[size == 0.0] = 1.0  # a critically damped mode has no decay in quadrature
     heights = np.linalg.lstsq(table / size, columns.data, rcond=None)[0] / size
-    return heights[: 2 * len(modes) + 1], columns.data - table @ heights
+    return heights[: columns.residues * len(modes) + 1], columns.data - table @ heights
 
 
 def _power(residual: Array) -> float:

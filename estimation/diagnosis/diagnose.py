@@ -10,7 +10,7 @@ from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.further_modes import describe_modes, with_driven_modes
 from estimation.device_fit.hum import describe_strong_hum
-from estimation.device_fit.open_loop import open_loop
+from estimation.device_fit.open_loop import is_worse, open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, find_effect
 from estimation.diagnosis.improvement import improve
@@ -108,7 +108,10 @@ def diagnose(
     diagnosis = _diagnose_runs(runs, extended, progress, excluded)
     if extended is nominal and _leaves_most(diagnosis):
         extended = with_driven_modes(runs, nominal, unexplained=True)
-        diagnosis = diagnosis if extended is nominal else _diagnose_runs(runs, extended, progress, excluded)
+        beside_modes = _diagnose_runs(runs, extended, progress, excluded) if extended is not nominal else diagnosis
+        if not is_worse(open_loop(runs, beside_modes.device), open_loop(runs, diagnosis.device)):
+            return diagnosis
+        diagnosis = beside_modes
     if extended is nominal:
         return diagnosis
     nominal_loops = {name: loop.to_json() for name, loop in open_loop(runs, nominal).items()}
