@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from estimation.rail import upper_rail
 from recon.pipeline import estimate_motion
 from recon.quality.defects import unlocated_samples
+from recon.quality.range_timing import describe_range_timing
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.steps.estimated_motion import EstimatedMotion
 from recon.steps.phase_and_drift import correct_readout_phase
@@ -52,6 +53,7 @@ class PointCloud:
         unlocated: shots at which the mirror's angle is unknown.
         geometry: that the points were made with.
         estimator: of the motion.
+        limits: reasons why the points are not those of the scene, a line each.
         notes: what a reader has to know, a line each.
         seconds: computing time.
     """
@@ -65,6 +67,7 @@ class PointCloud:
     unlocated: int
     geometry: Geometry
     estimator: str
+    limits: list[str]
     notes: list[str]
     seconds: float = 0.0
 
@@ -81,6 +84,7 @@ class PointCloud:
             "sd_m": {name: np.sqrt(np.mean(np.square(sd[:, k]))) for k, name in enumerate("xyz")},
             "range_sd_m": self.geometry.range_sd or None,
             "geometry": self.geometry.kind,
+            "limits": self.limits,
             "notes": self.notes,
             "seconds": self.seconds,
         }
@@ -139,6 +143,7 @@ def make_point_cloud(recording: Recording, options: Options, quiet: bool = False
         unlocated=int(np.count_nonzero(returned & ~located)),
         geometry=geometry,
         estimator=estimated.motion.estimator,
+        limits=describe_range_timing(recording, estimated.beam, cut),
         notes=notes,
         seconds=time.perf_counter() - began,
     )

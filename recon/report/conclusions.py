@@ -11,7 +11,7 @@ from typing import Any
 from recon.imaging.blur import SHARP_FRACTION
 from recon.imaging.frame_axis import format_positions
 from recon.report.numbers import format_degrees, format_interval, format_value
-from scanner.wording import counted, percent
+from scanner.wording import counted, percent, sentence
 
 MIN_USABLE_FRACTION = 0.5
 """Fraction of the scan within the bound below which a picture is called blurred, and no estimator is recommended: most
@@ -279,14 +279,15 @@ def conclude_bidirectional(summary: Mapping[str, Any]) -> str:
 
 
 def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
-    """How many points there are, how far they reach and how uncertain they are."""
+    """What displaces the points, how many there are, how far they reach and how uncertain they are."""
     reach = max(abs(edge) for edge in summary["extent_m"]["z"])
     sd = max(summary["sd_m"].values())
     of_angles = "" if summary["range_sd_m"] else "; by the angles alone, without the range finder's noise"
     points, shots = counted(summary["points"], "point"), counted(summary["shots"], "shot")
+    limits = "".join(f"{sentence(limit)} " for limit in summary["limits"])
     return (
-        f"{points} from {shots}, up to {reach:.3g} m away, with a standard deviation of "
-        f"at most {format_value(1e3 * sd, 2)} mm (rms of an axis{of_angles}). Use {file}."
+        f"{limits}{points} from {shots}, up to {reach:.3g} m away, with a standard deviation of "
+        f"at most {format_value(1e3 * sd, 2)} mm (rms of an axis{of_angles}).{'' if limits else f' Use {file}.'}"
     )
 
 

@@ -33,6 +33,10 @@ from scanner.motion import AxisMotion, Motion
 PERIODS_PER_SLICE = 25
 """Periods of the slower axis whose samples are compared: they cover the field, and clocks hardly run apart in them."""
 
+MIN_SLICE_SAMPLES = 10_000
+"""Samples of a slice, if the scan has as many: a slow channel, such as the shots of a range finder at 100 kHz, visits a
+half of the 16 384 cells of phase by them, so that more than ``MIN_COMMON_CELLS`` are visited in both directions."""
+
 MAX_SLICES = 8
 """Slices, spread over the scan, that are compared: 0.02 s of computing time each at 1e5 samples."""
 
@@ -211,7 +215,7 @@ def _slices(beam: Motion, intensity: Channel) -> list[tuple[int, int]]:
     period = slow_period(beam) * intensity.sample_rate
     if not period * MIN_PERIODS <= intensity.size:
         return []
-    length = min(round(PERIODS_PER_SLICE * period), intensity.size)
+    length = min(max(round(PERIODS_PER_SLICE * period), MIN_SLICE_SAMPLES), intensity.size)
     count = min(max(intensity.size // max(length, 1), 1), MAX_SLICES)
     firsts = np.linspace(0, intensity.size - length, count).astype(int).tolist()
     return [(first, first + length) for first in firsts]

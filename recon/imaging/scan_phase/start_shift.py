@@ -1,7 +1,7 @@
-"""A start of the intensity, other than the stated one, that explains why the picture contradicts both axes.
+"""A start of the intensity or the ranges, other than the stated one, that explains why they contradict both axes.
 
 A phase is contradicted up to whole half-periods, so that one axis determines no start. Two axes with different periods
-test a start that is proposed: that of the phases themselves, or one at which the intensity ends with the sensors, as
+test a start that is proposed: that of the phases themselves, or one at which the channel ends with the sensors, as
 after a trigger that started it late.
 """
 
@@ -27,41 +27,44 @@ START_DECIMALS = 7
 """Decimals of a start [s] that is stated: phases in cells determine microseconds."""
 
 SENSORS = ("sense", "angle_", "drive_")
-"""Beginnings of the names of channels that are recorded beside the intensity."""
+"""Beginnings of the names of channels that are recorded beside the intensity or the ranges."""
 
 
-def describe_start_shift(recording: Recording, motion: Motion, found: Sequence[Contradiction]) -> list[str]:
-    """A line on the start of the intensity that explains the contradictions of both axes, if one does.
+def describe_start_shift(
+    recording: Recording, motion: Motion, found: Sequence[Contradiction], name: str = "intensity"
+) -> list[str]:
+    """A line on the start of a channel that explains the contradictions of both axes, if one does.
 
     Args:
-        recording: with the intensity as it was recorded.
+        recording: with the channel as it was recorded.
         motion: of the mirror.
-        found: contradictions of the axes.
+        found: contradictions of the axes by the channel.
+        name: of the channel, "intensity" or "range".
     """
     if {each.axis for each in found} != set(AXES):
         return []
-    intensity = recording["intensity"]
-    for shift, reason in _proposed_shifts(recording, intensity, motion, found):
+    moved = recording[name]
+    for shift, reason in _proposed_shifts(recording, moved, motion, found):
         if all(_explains(shift, each, motion) for each in found):
-            start = round(intensity.start + shift, START_DECIMALS)
+            start = round(moved.start + shift, START_DECIMALS)
             return [
-                f"intensity: a start of {start:.6g} s in place of {intensity.start:.6g} s explains the disagreement in "
-                f"both axes{reason}; if it is right, state it as start of the intensity"
+                f"{name}: a start of {start:.6g} s in place of {moved.start:.6g} s explains the disagreement in "
+                f"both axes{reason}; if it is right, state it as start of {name}"
             ]
     return []
 
 
 def _proposed_shifts(
-    recording: Recording, intensity: Channel, motion: Motion, found: Sequence[Contradiction]
+    recording: Recording, moved: Channel, motion: Motion, found: Sequence[Contradiction]
 ) -> Iterator[tuple[float, str]]:
     """Changes of the start [s], each with a reason beside the phases."""
     slowest = min(found, key=lambda each: _frequency(motion, each.axis))
     yield _phase(slowest) / (2.0 * pi * _frequency(motion, slowest.axis)), ""
     for name, channel in recording.channels.items():
-        same_clock = (channel.sample_rate, channel.start) == (intensity.sample_rate, intensity.start)
-        missing = channel.size - intensity.size
+        same_clock = (channel.sample_rate, channel.start) == (moved.sample_rate, moved.start)
+        missing = channel.size - moved.size
         if name.startswith(SENSORS) and same_clock and missing:
-            yield missing / intensity.sample_rate, f", and the intensity then ends with {name}"
+            yield missing / moved.sample_rate, f", and {moved.name} then ends with {name}"
 
 
 def _explains(shift: float, found: Contradiction, motion: Motion) -> bool:
