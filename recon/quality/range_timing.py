@@ -2,8 +2,8 @@
 
 A range that is stored late is located at an angle that the mirror has left. This is determined where the scene has
 relief and the phase is off by more than the registration reaches (15°); a smaller delay is removed with the phase error
-of the readout where the ranges, or an intensity on their clock, determine it. A plane wall square to the beam, and a scene
-equal to its mirror image, determine no delay.
+of the readout where the ranges, or an intensity on their clock, determine it. A plane wall square to the beam, and a
+scene equal to its mirror image, determine no delay.
 """
 
 from __future__ import annotations
