@@ -27,6 +27,7 @@ from estimation.identification.fits import (
 )
 from estimation.identification.lock_in_decay import fit_lock_in_decay
 from estimation.identification.reference_angle import ReferenceAngle, find_reference_angle, with_angle
+from estimation.identification.steady_segments import steady_segments
 from estimation.identification.sweep import SweptRecord
 from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
 from estimation.reference import drive_reference
@@ -36,17 +37,14 @@ from scanner.arrays import Array
 from scanner.clock import on_clock
 from scanner.device import DEFAULT_TOLERANCE, Axis, Device
 from scanner.errors import BadInput
-from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
 from scanner.stages import Amdm, MotionSensor, Readout
 
-SEGMENT_CYCLES = 200.0
-"""Cycles per segment of a driven recording: a sweep changes little within one, which counts as one frequency."""
-
-MAX_AMPLITUDE_CHANGE = 0.02
-"""Relative change of amplitude within a segment above which it is no steady motion and is left out."""
 TORQUE_SCALE = (("capacitance", "C0"), ("capacitance", "theta0"), ("drive", "torque_per_volt"), ("mechanics", "J"))
 """Stage and key of the constants that scale the torque, and with it J, k and b; J itself where no torque is known."""
+
+MECHANICS_KEYS = ("J", "b", "k")
+"""Constants that the torque scales together."""
 
 Decay = tuple[Array, float, float]
 """Angle of a free decay [rad], shape (n,), its rate [Hz], and the voltage on the combs [V]."""
@@ -86,6 +84,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         BadInput: no recording determines a parameter of any axis, or one cannot be used.
     """
     axes, values, used, notes, responses = dict(device.axes), {}, {}, [], {}
+    scaled: list[str] = []  # axes whose torque is uncertain
     if any("sense" in recording for recording in recordings):
         notes.append(
             "sense: the electrode is shared by both axes, so that capacitances and readout are not identified and keep "
@@ -100,6 +99,14 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         if result.values:
             axes[name], values[name], used[name] = result.device_axis(), result.marginal(), result.used
             responses[name] = result.responses
+            if any(result.by_torque.get(key) for key in MECHANICS_KEYS):
+                scaled.append(name)
+    if scaled:
+        notes.append(
+            f"{', '.join(scaled)}: the intervals of J, b and k contain the uncertainty of the torque, of the readout's "
+            "gain or of the nominal J, which scales all three together; this factor changes no motion, so that their "
+            "tolerances in device.toml do not contain it"
+        )
     if not values:
         what = "no recording shows a rest, a free decay, steady tones or a driven motion with a reference angle"
         names = ", ".join(sorted({name for recording in recordings for name in recording.channels}))
@@ -260,7 +267,7 @@ class _AxisIdentification:
                 "sweep through the resonance"
             )
         if several and self.gain_tolerance:
-            for key in ("J", "b", "k"):
+            for key in MECHANICS_KEYS:
                 self.by_torque[key] = float(np.hypot(self.by_torque[key], self.gain_tolerance * self.values[key].value))
         if self.decays and not several and not self.values["J"].sd:
             has_bias = any(volt for _, _, volt in self.decays)
@@ -326,24 +333,4 @@ def mechanics_from_decays(axis: Axis, decays: Sequence[Decay]) -> dict[str, Iden
     for key in ("k", "b"):
         ratio = found[f"{key}_over_J"]
         found[key] = IdentifiedValue(ratio.value * J.value, float(np.hypot(ratio.sd * J.value, ratio.value * J.sd)))
-    return found
-
-
-def steady_segments(angle: Array, voltage: Array, frequency: Array, rate: float) -> list[DrivenRecord]:
-    """Segments of one frequency of a driven record; those whose amplitude changes are left out.
-
-    Args:
-        angle: [rad], voltage: [V], frequency: of the motion [Hz], each of shape (n,). rate: [Hz].
-    """
-    length = block_length(float(np.mean(frequency)), rate, SEGMENT_CYCLES)
-    found = []
-    for first in range(0, max(angle.size - length // 2, 1), length):
-        cut = slice(first, min(first + length, angle.size))
-        f = float(np.mean(frequency[cut]))
-        block = block_length(f, rate, 10.0)
-        if angle[cut].size < 4 * block:
-            continue
-        size = np.abs(block_phasors(angle[cut], rate, 0.0, f, block)[1])
-        if np.ptp(size) < MAX_AMPLITUDE_CHANGE * size.mean():
-            found.append(DrivenRecord(angle[cut], voltage[cut], f, rate))
     return found

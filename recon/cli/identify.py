@@ -87,7 +87,13 @@ def _axes_summary(identification: Identification) -> dict[str, Any]:
         axis: {
             "used": list(identification.used[axis]),
             "values": {
-                name: {"value": each.value, "sd": each.sd, "ci95": list(each.ci95), "unit": UNITS[name]}
+                name: {
+                    "value": each.value,
+                    "sd": each.sd,
+                    "ci95": list(each.ci95),
+                    "unit": UNITS[name],
+                    "tolerance": identification.device.axis(axis).tolerance.get(name),
+                }
                 for name, each in values.items()
             },
         }

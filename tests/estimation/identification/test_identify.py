@@ -242,7 +242,8 @@ def test_the_command_writes_a_device_closer_to_the_truth(tmp_path, capsys):
     assert axis.readout.a_cir == pytest.approx(-3.7e11, rel=0.01)
     assert axis.readout.b_cir == pytest.approx(6.6, rel=0.01)
     assert values["noise_var"]["ci95"][0] < 0.0139**2 < values["noise_var"]["ci95"][1]
-    assert device.tolerance("x", "k") < 0.01
+    assert device.tolerance("x", "k") == values["k"]["tolerance"] < 0.01
+    assert values["k_over_J"]["tolerance"] is None
     assert "95 % interval" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 

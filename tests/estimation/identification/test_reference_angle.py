@@ -81,6 +81,8 @@ def test_a_fast_sweep_determines_the_mechanics(kind: str) -> None:
     values = found.values["x"]
     assert values["J"].value == pytest.approx(INERTIA, rel=5e-3)
     assert 0.019 < values["J"].sd / values["J"].value < 0.022  # the tolerance of the torque
+    assert found.device.axis("x").tolerance["J"] < 0.005  # at the nominal torque
+    assert sum("this factor changes no motion" in note for note in found.notes) == 1
 
 
 def test_intervals_of_a_sweep_have_the_size_of_the_errors() -> None:
