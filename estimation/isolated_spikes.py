@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.signals import robust_sd
 from scanner.arrays import Array, Index
@@ -21,7 +22,7 @@ def find_spikes(values: Array) -> Index:
     """Samples that are isolated spikes, increasing.
 
     Without a spike the neighbours on one side at least fit those around them. Those of a step or of the flyback of a
-    raster do not. Spikes that are one or two samples apart are not found.
+    raster do not. Spikes that are one or two samples apart are not found. A corner of a clipped signal is no spike.
 
     Args:
         values: shape (n,).
@@ -37,7 +38,8 @@ def find_spikes(values: Array) -> Index:
     fits = {
         step: np.abs(distance[found + step] + weight * distance[found]) <= limit for step, weight in NEIGHBOURS.items()
     }
-    return found[(fits[-2] & fits[-1]) | (fits[1] & fits[2])]
+    found = found[(fits[-2] & fits[-1]) | (fits[1] & fits[2])]
+    return found[~_is_next_to_rail(values, found)]
 
 
 def without_spikes(values: Array, spikes: Index) -> Array:
@@ -47,6 +49,19 @@ def without_spikes(values: Array, spikes: Index) -> Array:
     repaired = values.copy()
     repaired[spikes] = _cubic(values)[spikes]
     return repaired
+
+
+def _is_next_to_rail(values: Array, found: Index) -> NDArray[np.bool_]:
+    """Whether a sample at a rail is within reach, a mask of ``found``: the cubic leaves the range of the converter there.
+
+    A rail is the largest or the smallest value of all samples that are not ``found``, if successive ones stand at it.
+    """
+    others, on_rail = np.delete(values, found), np.zeros(values.size, np.bool_)
+    for extreme in (np.nanmin(others), np.nanmax(others)):
+        at_extreme = values == extreme
+        if (at_extreme[:-1] & at_extreme[1:]).any():
+            on_rail |= at_extreme
+    return np.array([on_rail[at - REACH : at + REACH + 1].any() for at in found], bool)
 
 
 def _cubic(values: Array) -> Array:

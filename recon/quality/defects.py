@@ -34,6 +34,11 @@ MAX_CLIPPED_SHARE = 0.01
 """Share of clipped samples of a position signal from which the picture is wrong. A sine that is clipped at both peaks
 for so long loses 1.2e-4 of its amplitude, 0.02 of 400 pixels."""
 
+MIN_RAIL_RUN_SAMPLES = 2
+"""Length of a run of equal samples at an extreme value from which it may be of a rail, if such runs hold more than
+``MAX_CLIPPED_SHARE`` of the samples: a signal of 25 samples a period that is clipped at 0.9 of its amplitude has runs
+of three and four. Else ``MIN_CLIPPED_RUN_SAMPLES`` are needed, as chance makes short runs [samples]."""
+
 MAX_LEVEL_RATIO = 4.0
 """Samples at the largest value of a converter over those at the value next to it up to which it is no rail. The peak of
 a sine that is not clipped has up to 2.4 times as many; one that is cut by a step of the converter has 4.4."""
@@ -235,7 +240,7 @@ def _find_gaps(channel: Channel) -> SampleRanges:
 
 
 def _find_clipped_runs(channel: Channel) -> SampleRanges:
-    """Runs of MIN_CLIPPED_RUN_SAMPLES or more equal samples at the smallest and the largest value of the channel.
+    """Runs of equal samples at the smallest and the largest value of the channel, where these are rails.
 
     The steps of a converter give such runs at the peaks of a sine too, which are left out.
     """
@@ -248,14 +253,21 @@ def _find_clipped_runs(channel: Channel) -> SampleRanges:
                 extremes[side] = extreme
                 clipped[side].clear()
             at_extreme = values == extremes[side]
-            if np.count_nonzero(at_extreme) >= MIN_CLIPPED_RUN_SAMPLES:
+            if np.count_nonzero(at_extreme) >= MIN_RAIL_RUN_SAMPLES:
                 clipped[side].extend(
-                    (first + a, first + b) for a, b in runs_of_true(at_extreme) if b - a >= MIN_CLIPPED_RUN_SAMPLES
+                    (first + a, first + b) for a, b in runs_of_true(at_extreme) if b - a >= MIN_RAIL_RUN_SAMPLES
                 )
     rails = [
         side for side in (0, 1) if clipped[side] and _is_rail(channel, extremes[side], (np.less, np.greater)[side])
     ]
-    return sorted(run for side in rails for run in clipped[side])
+    return sorted(run for side in rails for run in _rail_runs(clipped[side], channel.size))
+
+
+def _rail_runs(runs: SampleRanges, samples: int) -> SampleRanges:
+    """The runs at one extreme of a channel of ``samples`` that are too long, or too many, for chance."""
+    if sum(stop - first for first, stop in runs) > MAX_CLIPPED_SHARE * samples:
+        return runs
+    return [(first, stop) for first, stop in runs if stop - first >= MIN_CLIPPED_RUN_SAMPLES]
 
 
 def _is_rail(channel: Channel, extreme: float, is_beyond: Callable[[float, float], bool]) -> bool:

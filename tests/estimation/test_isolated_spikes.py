@@ -43,11 +43,35 @@ def test_spikes_are_found_and_replaced_to_the_noise() -> None:
         np.zeros(100),
         np.full(100, np.nan),
         SINE[:6],
+        np.clip(SINE + 1e-4 * NOISE, -0.9, 0.9),
+        np.clip(SINE[::20] + 1e-4 * NOISE[::20], -0.9, 0.9),
     ],
-    ids=["sine", "noise", "coarse", "few samples a period", "sawtooth", "step", "walk", "zero", "missing", "short"],
+    ids=[
+        "sine",
+        "noise",
+        "coarse",
+        "few samples a period",
+        "sawtooth",
+        "step",
+        "walk",
+        "zero",
+        "missing",
+        "short",
+        "clipped",
+        "clipped, few samples",
+    ],
 )
 def test_other_signals_have_no_spikes(values: np.ndarray) -> None:
     assert not find_spikes(values).size
+
+
+def test_spikes_of_a_clipped_signal_are_found() -> None:
+    """A spike is larger than the rail, so that the rail is not the largest value."""
+    clipped = np.clip(SINE + 1e-4 * NOISE, -0.9, 0.9)
+    spiked = clipped.copy()
+    at = 250 + 500 * np.arange(60)  # at zero crossings
+    spiked[at] = 3.0
+    np.testing.assert_array_equal(find_spikes(spiked), at)
 
 
 def test_the_sensor_is_as_accurate_as_it_states_in_spite_of_spikes() -> None:
