@@ -30,16 +30,39 @@ def find_spikes(values: Array) -> Index:
     if values.size <= 4 * REACH:
         return np.zeros(0, np.int64)
     distance = values - _cubic(values)
-    inner = distance[REACH:-REACH]
-    limit = MIN_SPIKE_SDS * robust_sd(inner) if np.isfinite(inner).any() else 0.0
+    found = _find_far(distance, np.isfinite(distance))
+    if not found.size:
+        return found
+    near_rail = _near_rail(values, found)
+    if not near_rail.any():
+        return found
+    found = _find_far(distance, np.isfinite(distance) & ~near_rail)  # clipped samples have no noise
+    return found[~near_rail[found]]
+
+
+def _find_far(distance: Array, typical: NDArray[np.bool_]) -> Index:
+    """Samples far from the cubic whose neighbours fit, in the noise of the ``typical`` samples; all of shape (n,)."""
+    limit = MIN_SPIKE_SDS * robust_sd(distance[typical]) if typical.any() else 0.0
     if not limit > 0.0:
         return np.zeros(0, np.int64)
     found = 2 * REACH + np.flatnonzero(np.abs(distance[2 * REACH : -2 * REACH]) > limit)
     fits = {
         step: np.abs(distance[found + step] + weight * distance[found]) <= limit for step, weight in NEIGHBOURS.items()
     }
-    found = found[(fits[-2] & fits[-1]) | (fits[1] & fits[2])]
-    return found[~_is_next_to_rail(values, found)]
+    return found[(fits[-2] & fits[-1]) | (fits[1] & fits[2])]
+
+
+def _near_rail(values: Array, found: Index) -> NDArray[np.bool_]:
+    """Samples within reach of one at a rail, shape (n,): the cubic through it leaves the range of the converter.
+
+    A rail is the largest or the smallest value of all samples that are not ``found``, if successive ones stand at it.
+    """
+    others, near = np.delete(values, found), np.zeros(values.size, np.bool_)
+    for extreme in (np.nanmin(others), np.nanmax(others)):
+        at_extreme = values == extreme
+        if (at_extreme[:-1] & at_extreme[1:]).any():
+            near |= np.convolve(at_extreme, np.ones(2 * REACH + 1), "same") > 0.5
+    return near
 
 
 def without_spikes(values: Array, spikes: Index) -> Array:
@@ -49,19 +72,6 @@ def without_spikes(values: Array, spikes: Index) -> Array:
     repaired = values.copy()
     repaired[spikes] = _cubic(values)[spikes]
     return repaired
-
-
-def _is_next_to_rail(values: Array, found: Index) -> NDArray[np.bool_]:
-    """Whether a sample at a rail is within reach, a mask of ``found``: the cubic leaves the range of the converter there.
-
-    A rail is the largest or the smallest value of all samples that are not ``found``, if successive ones stand at it.
-    """
-    others, on_rail = np.delete(values, found), np.zeros(values.size, np.bool_)
-    for extreme in (np.nanmin(others), np.nanmax(others)):
-        at_extreme = values == extreme
-        if (at_extreme[:-1] & at_extreme[1:]).any():
-            on_rail |= at_extreme
-    return np.array([on_rail[at - REACH : at + REACH + 1].any() for at in found], bool)
 
 
 def _cubic(values: Array) -> Array:

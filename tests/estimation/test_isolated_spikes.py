@@ -45,6 +45,7 @@ def test_spikes_are_found_and_replaced_to_the_noise() -> None:
         SINE[:6],
         np.clip(SINE + 1e-4 * NOISE, -0.9, 0.9),
         np.clip(SINE[::20] + 1e-4 * NOISE[::20], -0.9, 0.9),
+        np.clip(SINE[::4] + 1e-2 * NOISE[::4], -0.7, 0.7),
     ],
     ids=[
         "sine",
