@@ -169,7 +169,7 @@ class AxisMotion:
         return known if known.any() else np.ones_like(known)
 
     def __repr__(self) -> str:
-        sd = np.degrees(np.sqrt(np.mean(np.square(self.phase_sd))))
+        sd = np.degrees(np.sqrt(np.mean(np.square(self.phase_sd[self.known]))))
         return (
             f"{np.median(self.frequency):.6g} Hz, amplitude {np.median(self.amplitude):.4g} rad, "
             f"phase sd {sd:.3g}° rms, {self.time.size} times, sign {self.sign}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from estimation.held_samples import find_held_runs
 from estimation.initial import fit_initial_motion
 from estimation.isolated_spikes import find_spikes, without_spikes
 from estimation.lock_in_channels import lock_in_angle
+from estimation.missing_samples import MAX_FILLED_GAP_PERIODS, Filled, fill_missing
 from estimation.reference import (
     MIN_SAMPLES_PER_PERIOD,
     PhaseReference,
@@ -38,7 +40,7 @@ from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block
 from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 from scanner.stages import Position
-from scanner.wording import counted
+from scanner.wording import counted, percent
 
 MIN_NOISE_SAMPLES_PER_PERIOD = 20.0
 """Samples per period from which the sixth differences of a signal show its noise: those of the motion itself are then
@@ -107,33 +109,27 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
         reference = reference_of_any_waveform(recording, device, name, channel)
         return axis_motion_from_angle(angle, channel, reference, None, intensity_clock(recording, channel)), []
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
-    _check_position_signal(channel, device.axis(name))
-    angle = (channel.read() - zero) / scale
+    check_signal(channel, gaps_ok=True)
+    values = channel.read()
+    whole = _with_samples(channel, fill_missing(values, 0).values)
+    reference = reference_of_any_waveform(recording, device, name, whole)
+    longest = 1 if reference.kind == "blocks" else MAX_FILLED_GAP_PERIODS * channel.sample_rate / reference.frequency
+    repaired = fill_missing(values, int(longest))
+    angle = (repaired.values - zero) / scale
     spikes = find_spikes(angle)
     angle = without_spikes(angle, spikes)
-    reference = reference_of_any_waveform(recording, device, name, channel)
     if reference.kind in ("drive", "half-drive") and channel.sample_rate < MIN_SAMPLES_PER_PERIOD * reference.frequency:
         raise sampled_too_slowly(channel, "a motion", reference.frequency)
     held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
-    motion = axis_motion_from_angle(angle, channel, reference, noise_sd, intensity_clock(recording, channel), held)
-    notes = [*_describe_held(channel, held), *_describe_spikes(channel, spikes)]
+    clock, unknown = intensity_clock(recording, channel), sorted([*held, *repaired.left_out])
+    motion = axis_motion_from_angle(angle, channel, reference, noise_sd, clock, unknown)
+    notes = [*_describe_held(channel, held), *_describe_missing(channel, repaired), *_describe_spikes(channel, spikes)]
     return motion, [*notes, *_describe_noise(channel, abs(scale), noise_sd, motion.angle_noise_sd)]
 
 
-def _check_position_signal(channel: Channel, axis: Axis) -> None:
-    """Check that every sample is an angle.
-
-    Raises:
-        BadInput: as ``check_signal``; the hint names the estimator that leaves missing samples out where it has a model
-            of the motion.
-    """
-    try:
-        check_signal(channel)
-    except BadInput as error:
-        if axis.mechanics is None or not channel.name.startswith("sense") or np.isfinite(channel.read()).all():
-            raise
-        hint = f"{error.hint}, or use --estimator tracker, which leaves such samples out"
-        raise BadInput(error.what, file=error.file, channel=error.channel, hint=hint) from error
+def _with_samples(channel: Channel, values: Array) -> Channel:
+    """The channel with other samples, shape (n,), in its unit."""
+    return replace(channel, raw=values, first=0, stop=channel.size, gain=1.0, offset=0.0)
 
 
 def _describe_noise(channel: Channel, gain: float, stated: float | None, found: float) -> list[str]:
@@ -161,6 +157,19 @@ def _describe_spikes(channel: Channel, spikes: Index) -> list[str]:
         f"{channel.start + spikes[0] / channel.sample_rate:.6g} s, are replaced by the cubic through these: check the "
         "cable and the converter"
     ]
+
+
+def _describe_missing(channel: Channel, repaired: Filled) -> list[str]:
+    """Lines on missing samples: those that were interpolated, and those that are left out."""
+    notes, left_out = [], sum(stop - first for first, stop in repaired.left_out)
+    if repaired.filled:
+        number = f"{counted(repaired.filled, 'missing sample')} ({percent(repaired.filled / channel.size)})"
+        notes.append(f"{channel.name}: interpolated {number} in short gaps from the samples around")
+    if left_out:
+        number = f"{counted(left_out, 'missing sample')} ({percent(left_out / channel.size)})"
+        gaps = counted(len(repaired.left_out), "gap")
+        notes.append(f"{channel.name}: left out {number} in {gaps} too long to interpolate; no angle is known there")
+    return notes
 
 
 def _describe_held(channel: Channel, held: Sequence[tuple[int, int]]) -> list[str]:
@@ -239,11 +248,12 @@ def axis_motion_from_angle(
         noise_sd: white noise of the sensor, per sample [rad], as stated; measured where None, and where an oversampled
             motion shows ``MIN_NOISE_EXCESS`` times as much.
         clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
-        held: ranges of samples at which the sensor was stopped. The angle in the result is not known there (NaN). Phase
-            and amplitude are interpolated through them, and the phase has the standard deviation of an unknown one.
+        held: ranges of samples that are missing or at which the sensor was stopped. The angle in the result is not
+            known there (NaN). Phase and amplitude are interpolated through them, and the phase has the standard
+            deviation of an unknown one.
 
     Raises:
-        BadInput: the channel is shorter than two blocks, or was stopped in all but one.
+        BadInput: the channel is shorter than two blocks, or is missing or was stopped in all but one.
     """
     rate = channel.sample_rate
     block = slow_clock_block(reference.frequency, rate, BLOCK_CYCLES, channel.size)
@@ -259,10 +269,10 @@ def axis_motion_from_angle(
             hint="record for longer",
         )
     by_block = stopped[: time.size * block].reshape(-1, block)
-    known = ~by_block.any(axis=1)
+    known = ~(by_block.all(axis=1) if reference.kind == "blocks" else by_block.any(axis=1))
     if known.sum() < MIN_BLOCKS:
         raise BadInput(
-            "stands at one value in nearly all of the recording, as a sensor that was stopped",
+            "stands at one value, or lacks samples, in nearly all of the recording, as a sensor that was stopped",
             file=channel.file,
             channel=channel.name,
             hint="check the sensor and its cable, or cut the recording",

@@ -107,5 +107,7 @@ def test_a_sensor_that_stands_still_throughout_is_refused() -> None:
     sensed[4_000:] = sensed[4_000]
     held = recording.with_channel(make_channel("sense_x", sensed, unit="V", sample_rate=RATE_HZ))
     assert recording.device is not None
-    with pytest.raises(BadInput, match="sense_x: stands at one value in nearly all of the recording"):
+    with pytest.raises(
+        BadInput, match="sense_x: stands at one value, or lacks samples, in nearly all of the recording"
+    ):
         estimate_from_sensor(held, recording.device)

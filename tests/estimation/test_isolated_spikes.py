@@ -60,6 +60,7 @@ def test_spikes_are_found_and_replaced_to_the_noise() -> None:
         "short",
         "clipped",
         "clipped, few samples",
+        "clipped for half of the time, noise",
     ],
 )
 def test_other_signals_have_no_spikes(values: np.ndarray) -> None:

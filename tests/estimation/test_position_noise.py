@@ -5,7 +5,6 @@ import pytest
 
 from estimation.filters.baselines import estimate_from_sensor
 from scanner.device import Device
-from scanner.errors import BadInput
 from scanner.recording import Recording
 
 GAIN, STATED_SD = 20.0, 2e-3
@@ -22,15 +21,3 @@ def test_noise_above_the_stated_one_is_measured_and_noted(noise_sd: float, noted
     motion = estimate_from_sensor(Recording.from_arrays({"sense_x": (signal, "V", rate)}, device), device)
     assert motion.axes["x"].angle_noise_sd == pytest.approx(max(noise_sd, STATED_SD) / GAIN, rel=0.05)
     assert any("states noise_sd = 0.002" in note for note in motion.notes) == noted
-
-
-@pytest.mark.parametrize("has_model", [True, False])
-def test_missing_samples_are_refused_with_the_estimator_that_leaves_them_out(has_model: bool) -> None:
-    mechanics = "[x.mechanics]\nJ = 1e-12\nb = 1e-10\nk = 1.58e-4\n" if has_model else ""
-    readout = f'[x.readout]\nkind = "position"\ngain = {GAIN}\nnoise_sd = {STATED_SD}\n'
-    device = Device.from_toml(mechanics + readout)
-    signal = np.sin(2 * np.pi * 2e-3 * np.arange(50_000))
-    signal[1000] = np.nan
-    with pytest.raises(BadInput, match=r"sense_x: sample 1000 at .* is not finite; cut the recording") as refused:
-        estimate_from_sensor(Recording.from_arrays({"sense_x": (signal, "V", 1e6)}, device), device)
-    assert ("--estimator tracker" in str(refused.value)) == has_model

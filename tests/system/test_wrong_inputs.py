@@ -102,7 +102,7 @@ REFUSED_RECORDINGS: dict[str, tuple[str, Change | None, str]] = {
     "intensity complex": (DEVICE, values("intensity", lambda v: v + 0j), "not real numbers"),
     "no sense of y": (DEVICE, without("sense_y"), "y"),
     "sense constant": (DEVICE, values("sense_x", lambda v: 0 * v + 1), "sense_x: is constant, 1 V"),
-    "sense infinite": (DEVICE, values("sense_x", lambda v: np.append(v[:-1], np.inf)), "sense_x: sample 19999"),
+    "sense infinite": (DEVICE, values("sense_x", lambda v: v + np.inf), "sense_x: holds no sample that can be used"),
     "rate negative": (DEVICE, attribute("sense_x", "sample_rate", -1e6), "sense_x: sample_rate is -1e+06 Hz"),
     "rate zero": (DEVICE, attribute("intensity", "sample_rate", 0.0), "intensity: sample_rate is 0 Hz"),
     "rate missing": (DEVICE, attribute("sense_y", "sample_rate", None), "sense_y: sample_rate is missing"),

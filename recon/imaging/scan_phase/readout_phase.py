@@ -248,9 +248,9 @@ def _describe_late_signals(delay: float, estimator: str) -> str:
 
 
 def _sd_as_stated(axis: AxisMotion) -> float:
-    """Standard deviation of the phase, rms [deg], if the readout is as the device file states; axis: widened."""
+    """Standard deviation of a known phase, rms [deg], if the readout is as the device file states; axis: widened."""
     variance = np.maximum(axis.phase_sd**2 - _undescribed_variance(axis), 0.0)
-    return float(np.degrees(np.sqrt(np.mean(variance))))
+    return float(np.degrees(np.sqrt(np.mean(variance[axis.known]))))
 
 
 class CommonDelay(NamedTuple):
