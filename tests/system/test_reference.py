@@ -29,6 +29,7 @@ from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS
 from scanner.device import Device
 from scanner.edges import EDGE_CHANNELS
 from scanner.stages import READOUTS, Capacitance, Drive, Mechanics, Scan
+from tests.support import two_axis_scan
 from tests.support.simulated import imaging
 
 ROOT = Path(__file__).parent.parent.parent
@@ -117,12 +118,12 @@ def test_every_key_of_studies_and_excitations_is_in_the_reference() -> None:
 
 
 def keys(content: object) -> set[str]:
-    """Keys of nested tables, without those of ``info``, which depend on the estimator."""
+    """Keys of nested tables."""
     if isinstance(content, list):
         return set().union(*map(keys, content))
     if not isinstance(content, dict):
         return set()
-    nested = (keys(value) for key, value in content.items() if key not in ("info", "seconds_to_fill", "terms"))
+    nested = (keys(value) for key, value in content.items() if key not in ("seconds_to_fill", "terms"))
     return set(content).union(*nested)
 
 
@@ -141,6 +142,18 @@ def test_every_key_of_a_reconstruction_and_a_prediction_is_in_the_reference(
         assert missing(keys(summary) - {"sense"}, page("outputs")) == []
     with h5py.File(tmp_path / "out" / "motion.h5") as file:
         assert missing({*file.attrs, *file, *file["x"], *file["x"].attrs}, page("outputs")) == []
+
+
+@pytest.mark.parametrize("estimator", ["edges", "sine-ukf", "constant", "picture"])
+def test_every_detail_of_an_estimator_is_in_the_reference(estimator: str) -> None:
+    frequencies = two_axis_scan.FREQUENCIES_HZ.items()
+    drives = "".join(f'[{a}.drive]\nkind = "linear"\nfrequency = {f}\n' for a, f in frequencies)
+    device = Device.from_toml(two_axis_scan.READOUTS + two_axis_scan.FIELD + drives)
+    channels = two_axis_scan.sensors(1) | two_axis_scan.edges(*map(two_axis_scan.crossings, "xy"))
+    recording = lissajous.Recording.from_arrays(channels, device)
+    info = lissajous.reconstruct(recording, estimator=estimator, pixels=(80, 80)).motion.info
+    assert info
+    assert missing(keys(info) - {"sync_x", "sync_y"}, page("outputs")) == []
 
 
 def test_every_key_of_a_diagnosis_is_in_the_reference() -> None:
