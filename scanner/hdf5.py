@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from math import prod
 from pathlib import Path
@@ -186,19 +186,24 @@ def _check_samples(item: h5py.Dataset, path: str, where: str) -> None:
     check_claim(prod(item.shape or ()) * item.dtype.itemsize, stored, file=path, channel=where)
 
 
-def attributes(item: h5py.HLObject) -> dict[str, Any]:
+def attributes(item: h5py.HLObject, names: Collection[str] | None = None) -> dict[str, Any]:
     """Return attributes as Python values: text as str, arrays of one element as that element.
+
+    Args:
+        item: group or dataset.
+        names: of the attributes that are wanted, where they exist; all where None.
 
     Raises:
         BadInput: they are damaged, or state more than ``MAX_ATTRIBUTE_VALUES`` values.
     """
     with undamaged(item.file.filename, item.name):
-        for key in item.attrs:
+        wanted = [key for key in item.attrs if names is None or key in names]
+        for key in wanted:
             shape = item.attrs.get_id(key).shape or ()
             if prod(shape) > MAX_ATTRIBUTE_VALUES:
                 what = f"attribute {key} claims {prod(shape)} values"
                 raise BadInput(what, file=item.file.filename, channel=item.name, hint="copy the file again")
-        return {key: _plain(value) for key, value in item.attrs.items()}
+        return {key: _plain(item.attrs[key]) for key in wanted}
 
 
 def _plain(value: Any) -> Any:

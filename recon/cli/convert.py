@@ -13,6 +13,8 @@ OPTIONS = {
     "unit": ("unit", str),
     "rate": ("sample_rate", float),
     "start": ("start", float),
+    "scale": ("scale", float),
+    "offset": ("offset", float),
     "time": ("time", str),
     "event": ("event", str),
     "angle": ("angle", float),
@@ -31,6 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--{option}", action="append", default=[], metavar=f"[NAME=]{option.upper()}",
             help=f"{text} of all channels, or of one, where the file does not state it",
+        )  # fmt: skip
+    for option, text in (("scale", "unit of the channel per count or unit of the file"), ("offset", "value at zero")):
+        parser.add_argument(
+            f"--{option}", action="append", default=[], metavar=f"[NAME=]{option.upper()}",
+            help=f"{text}: channel = scale * variable + offset, of all channels, or of one",
         )  # fmt: skip
     parser.add_argument(
         "--time", action="append", default=[], metavar="[NAME=]COLUMN",
@@ -54,7 +61,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
     given = [f"--{name}" for name in ("channel", "format", *OPTIONS) if getattr(args, name)]
     if args.mapping is None:
-        return convert_file(args.file, plan_of(args), args.output)
+        return convert_file(args.file, plan_of(args), args.output, by_options=True)
     if given:
         raise BadInput(
             f"is given together with {given[0]}", channel="--mapping", hint="state everything in one of them"
@@ -109,4 +116,4 @@ def format_summary(summary: dict[str, Any]) -> str:
     lines += [
         f"  {name}: {counted(edges['number'], 'edge')}, {edges['event']}" for name, edges in summary["edges"].items()
     ]
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"  {note}" for note in summary["notes"])])

@@ -81,12 +81,14 @@ def suggestion(variables: Any, format: str | None = None) -> str:
     """A mapping (TOML) of all signals; values that the file does not state are commented out, to be filled in."""
     lines = [HEADING, *([f"format = {_quoted(format)}"] if format else [])]
     for name, variable in variables.items():
-        is_clock = name.lower() in TIME_NAMES and variable.sample_rate is None
+        is_clock = name.rpartition(".")[2].lower() in TIME_NAMES and variable.sample_rate is None
         if not variable.is_signal or variable.raw.shape[0] < 2 or (is_clock and len(variables) > 1):
             continue
         channel = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name) or "_"
         lines += ["", f"[channels.{channel}]", f"variable = {_quoted(name)}"]
         lines.append(f"unit = {_quoted(variable.unit)}" if variable.unit else '# unit = "V"')
+        if variable.raw.dtype.kind in "iu" and not variable.unit:
+            lines.append("# scale = 0.001  # V per count, of counts of a converter")
         rate = variable.sample_rate
         lines.append(f"sample_rate = {float(rate)!r}" if rate else "# sample_rate = 1e6  # Hz")
         lines += [f"start = {float(variable.start)!r}"] if variable.start is not None else []

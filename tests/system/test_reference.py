@@ -22,7 +22,7 @@ from estimation.diagnosis import diagnose, finding
 from estimation.estimators import estimators
 from recon import experiment_planning
 from recon.cli import COMMANDS, main
-from recon.io import convert
+from recon.io import convert, mapped_channel
 from recon.io.readers import readers
 from recon.study import plan, table
 from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS
@@ -92,7 +92,10 @@ def test_every_key_of_a_device_is_in_the_reference(tables: ModuleType) -> None:
 def test_every_channel_format_and_mapping_key_is_in_the_reference() -> None:
     assert missing((*CHANNEL_UNITS, *EDGE_CHANNELS, *AMPLITUDE_CHANNELS, "intensity"), page("recording")) == []
     assert (
-        missing((*readers(), *convert.TEXT_KEYS, *convert.CHANNEL_KEYS, *convert.EDGE_KEYS), page("instrument_files"))
+        missing(
+            (*readers(), *convert.TEXT_KEYS, *mapped_channel.CHANNEL_KEYS, *mapped_channel.EDGE_KEYS),
+            page("instrument_files"),
+        )
         == []
     )
 
@@ -192,7 +195,8 @@ def test_toml_blocks_on_pages_are_valid(where: str, text: str, tmp_path: Path) -
     elif kind == "mapping.toml":
         assert set(content) <= set(convert.MAPPING_KEYS)
         assert all(
-            set(channel) <= {*convert.CHANNEL_KEYS, *convert.EDGE_KEYS} for channel in content["channels"].values()
+            set(channel) <= {*mapped_channel.CHANNEL_KEYS, *mapped_channel.EDGE_KEYS}
+            for channel in content["channels"].values()
         )
         Device.from_table(content["device"])
     elif kind == "study.toml":

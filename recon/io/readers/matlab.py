@@ -19,6 +19,7 @@ from recon.io.readers.reader import Reader
 from scanner.channel import LazySamples
 from scanner.errors import BadInput
 from scanner.files import check_claim
+from scanner.hdf5 import MAX_GROUP_DEPTH
 
 Load = Callable[[str], NDArray[Any]]
 
@@ -29,7 +30,8 @@ DTYPES = {"double": "f8", "single": "f4", "logical": "?", "char": "U1"} | {
 
 
 def read_matlab(path: Path) -> Contents:
-    """Variables of a MATLAB file. An (n, 1) or (1, n) matrix, which is MATLAB's vector, becomes (n,).
+    """Variables of a MATLAB file. An (n, 1) or (1, n) matrix, which is MATLAB's vector, becomes (n,). The fields of a
+    structure have dotted names.
 
     Version 7.3 is read slice by slice, earlier versions one variable at a time; there none exceeds 2 GB.
 
@@ -42,7 +44,13 @@ def read_matlab(path: Path) -> Contents:
 
     table = _through_scipy(path, whosmat)
     load = lru_cache(maxsize=1)(partial(_load, path))  # channels are read one after the other
-    return Contents("MATLAB 4 to 7.2", {name: Variable(_lazy(path, load, name, *form)) for name, *form in table})
+    variables: dict[str, Variable] = {}
+    for name, shape, kind in table:
+        if kind == "struct" and prod(shape) == 1:
+            variables |= _fields(load, name, load(name))
+        else:
+            variables[name] = Variable(_lazy(path, load, name, shape, kind))
+    return Contents("MATLAB 4 to 7.2", variables)
 
 
 def _through_scipy(path: Path, read: Callable[..., Any], **options: Any) -> Any:
@@ -69,6 +77,29 @@ def _lazy(path: Path, load: Load, name: str, shape: tuple[int, ...], kind: str) 
         return load(name).reshape(shape)[first:stop]
 
     return LazySamples(shape, dtype, fetch)
+
+
+def _fields(load: Load, name: str, value: NDArray[Any], keys: tuple[str, ...] = ()) -> dict[str, Variable]:
+    """Fields of a structure, and of structures in it, with dotted names.
+
+    Args:
+        load: returns the variable.
+        name: of the variable.
+        value: the structure, or a field of it.
+        keys: the names of the fields that lead to ``value``.
+    """
+    if value.dtype.names and value.size == 1 and len(keys) < MAX_GROUP_DEPTH:
+        inner = (_fields(load, name, np.asarray(value.reshape(-1)[0][key]), (*keys, key)) for key in value.dtype.names)
+        return {field: variable for fields in inner for field, variable in fields.items()}
+    shape = vector(value.shape)
+
+    def fetch(first: int, stop: int) -> NDArray[Any]:
+        content = load(name)
+        for key in keys:
+            content = np.asarray(content.reshape(-1)[0][key])
+        return content.reshape(shape)[first:stop]
+
+    return {".".join((name, *keys)): Variable(LazySamples(shape, value.dtype, fetch))}
 
 
 def _load(path: Path, name: str) -> NDArray[Any]:

@@ -82,6 +82,7 @@ def test_a_mapping_converts_a_file_to_a_recording(bench: Path) -> None:
             },
         },
         "edges": {},
+        "notes": [],
     }  # fmt: skip
 
 
@@ -115,12 +116,12 @@ CONTENTS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
     [
         (
             ("sample_rate = 1000.0", ""),
-            "MAP: channels.sense_x: says no sample_rate of variable 'x', and the file states none; "
+            "MAP: channels.sense_x: no sample_rate is stated for variable 'x', and the file states none; "
             f"add sample_rate = ...; {CONTENTS}",
         ),
         (
             ('unit = "nm"', ""),
-            "MAP: channels.intensity: says no unit of variable 'z', and the file states none; "
+            "MAP: channels.intensity: no unit is stated for variable 'z', and the file states none; "
             f"add unit = ...; {CONTENTS}",
         ),
         (('variable = "z"', ""), f"MAP: channels.intensity: says no variable; add variable = ...; {CONTENTS}"),
@@ -273,7 +274,7 @@ def test_a_mapping_may_override_the_file_and_the_summary_reports_it(tmp_path: Pa
 def test_a_scaled_variable_needs_a_unit_in_the_mapping(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x-axis,1\nsecond,Volt\n0.0,1.5\n1e-3,2.5\n2e-3,3.5\n")
     plan = {"channels": {"angle_x": {"variable": "1", "scale": 0.1}}}
-    with pytest.raises(BadInput, match="says no unit of variable '1'"):
+    with pytest.raises(BadInput, match="no unit is stated for variable '1'"):
         convert(tmp_path / "a.csv", plan)
 
 
@@ -293,13 +294,13 @@ def test_arguments_replace_a_mapping(tmp_path: Path, capsys: pytest.CaptureFixtu
     out = tmp_path / "a.h5"
     given = ["convert", str(tmp_path / "a.csv"), "--channel", "sense_x=a", "--channel", "intensity=b", "-o", str(out)]
     assert main([*given, "--unit", "V", "--unit", "intensity=counts", "--rate", "5e6", "--start", "sense_x=0.5"]) == 0
-    assert "sense_x: a, V (mapping), 5000000 Hz (mapping), from 0.5 s (mapping), 3 samples" in capsys.readouterr().out
+    assert "sense_x: a, V (option), 5000000 Hz (option), from 0.5 s (option), 3 samples" in capsys.readouterr().out
     with Recording.open(out) as recording:
         assert recording["intensity"].unit == "counts"
         assert (recording["sense_x"].start, recording["intensity"].start) == (0.5, 0.0)
     out.unlink()
     for wrong, words in {
-        ("--unit", "V"): "says no sample_rate of variable 'a'",
+        ("--unit", "V"): "no sample_rate is stated for variable 'a'",
         ("--rate", "fast"): "--rate: 'fast' is no number",
         ("--unit", "drive_x=V"): "--unit: 'drive_x' is no channel named by --channel",
         ("--channel", "sense_x=b"): "--channel: 'sense_x=b' is not NAME=VARIABLE, or repeats a channel",

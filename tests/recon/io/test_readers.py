@@ -277,7 +277,7 @@ def test_the_suggested_mapping_is_complete_if_the_file_states_everything(tmp_pat
     with convert(path, parse_toml(description["suggestion"], "suggestion")) as recording:
         assert set(recording.channels) == {"CH2", "CH3"}
     bare = info(write_text(tmp_path / "b.csv", 't,"a]b"\n0,1\n1,2\n'))["suggestion"]
-    with pytest.raises(BadInput, match="says no sample_rate"):  # the file does not state it
+    with pytest.raises(BadInput, match="no sample_rate is stated"):  # the file does not state it
         convert(tmp_path / "b.csv", parse_toml(bare, "suggestion"))
 
 
