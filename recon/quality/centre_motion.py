@@ -1,4 +1,4 @@
-"""Whether the centre of a resonant motion moves in a position signal without a torque: hum or drift of the sensor."""
+"""Whether a position signal of a resonant motion holds more than this motion: crosstalk, hum or drift of the sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from estimation.signals import white_noise_sd
 from estimation.tracker.track import MIN_RELATIVE_FREQUENCY
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
-from scanner.device import Axis, Device
+from scanner.device import AXES, Axis, Device
 from scanner.motion import Motion
 from scanner.recording import Recording
 
@@ -21,13 +21,20 @@ MIN_CENTRES = 8
 """Fewest values of the centre from which its motion is stated."""
 
 
+MIN_BEATS = 10.0
+"""Beats of the frequencies of both axes in a block in which crosstalk is measured: the side lobes of a Hann window are
+then below 1e-3 and differ in sign from block to block, so that the own motion does not count as the other one's."""
+
+
 def describe_centre_motion(
     recording: Recording, device: Device, motion: Motion, grid: Grid, max_pixels: float
 ) -> list[str]:
-    """A line for each axis whose centre moves in the position signal by more than ``max_pixels``, but for the drive.
+    """A line for each axis whose position signal moves by more than ``max_pixels`` with the other axis, or otherwise
+    about a centre that moves, but for the drive.
 
     A mirror at resonance moves about its rest position, which only a slow torque displaces: what a recorded drive does
-    not cause is an error of the sensor, and the estimator ``sensor`` maps it. An axis without a recorded drive, or
+    not cause is an error of the sensor, and the estimator ``sensor`` maps it. What follows the other axis is crosstalk.
+    An axis without a recorded drive, or
     whose device states no mechanics, is not checked.
 
     Args:
@@ -38,11 +45,20 @@ def describe_centre_motion(
     """
     if motion.estimator != "sensor":
         return []
-    lines = []
+    lines, factors = [], {name: _crosstalk(motion, name) for name in AXES}
     for name, half_angle, pixels in (("x", grid.half_angle_x, grid.width), ("y", grid.half_angle_y, grid.height)):
-        time, centre, noise_sd = _undriven_centre(recording, device.axis(name), motion, name)
+        time, centre, noise_sd = _undriven_centre(recording, device.axis(name), motion, name, factors[name])
         if centre.size < MIN_CENTRES:
             continue
+        other = _other(name)
+        shear = abs(factors[name]) * float(motion.axes[other].amplitude.max()) * pixels / (2.0 * half_angle)
+        if shear > max_pixels:
+            lines.append(
+                f"{name}: the position signal follows {other} by the factor {factors[name]:+.2g}, ±{shear:.2g} pixels: "
+                "crosstalk, or a sensor that is rotated against the axes, which the estimator sensor takes for motion, "
+                f"so that the picture is sheared; subtract this factor times the angle of {other} from that of {name}, "
+                "or use --estimator tracker"
+            )
         centre = centre - centre.mean()
         variance = max(float(centre.var()) - noise_sd**2, 0.0)
         amplitude = sqrt(2.0 * variance) * pixels / (2.0 * half_angle)
@@ -58,9 +74,44 @@ def describe_centre_motion(
     return lines
 
 
-def _undriven_centre(recording: Recording, axis: Axis, motion: Motion, name: str) -> tuple[Array, Array, float]:
-    """Times [s] and centre of the motion less what the drive's slow part causes [rad], and the standard deviation of
-    the centre by white noise [rad]; empty where the drive's part is unknown."""
+def _other(name: str) -> str:
+    """The other axis."""
+    return AXES[1 - AXES.index(name)]
+
+
+def _angles(motion: Motion, name: str) -> Array:
+    """Angles of one axis, of the first ``MAX_READ_SAMPLES`` [rad]."""
+    angle = motion.axes[name].angle
+    return angle.read(0, min(angle.size, MAX_READ_SAMPLES))
+
+
+def _crosstalk(motion: Motion, name: str) -> float:
+    """Factor by which the measured angle of an axis follows the other one at the frequency of that; 0 where the
+    frequencies are too close to tell.
+
+    The factor is the in-phase part of the ratio of both phasors, in blocks within which the frequencies hardly drift.
+    """
+    frequencies = [float(np.median(motion.axes[each].frequency)) for each in (name, _other(name))]
+    rate, beat = motion.axes[name].angle.sample_rate, abs(frequencies[0] - frequencies[1])
+    values = np.stack([_angles(motion, name), _angles(motion, _other(name))])
+    size = values.shape[1]
+    if beat * size < MIN_BEATS * rate:
+        return 0.0
+    count = int(beat * size / (MIN_BEATS * rate))
+    length = size // count
+    turn = np.exp(-2j * np.pi * frequencies[1] / rate * np.arange(length)) * np.hanning(length)
+    blocks = values[:, : count * length].reshape(2, count, length)
+    own, other = (blocks - blocks.mean(axis=2, keepdims=True)) @ turn
+    known = np.isfinite(own) & np.isfinite(other)
+    power = float(np.sum(np.abs(other[known]) ** 2))
+    return float(np.sum((own * other.conj())[known].real)) / power if power > 0.0 else 0.0
+
+
+def _undriven_centre(
+    recording: Recording, axis: Axis, motion: Motion, name: str, factor: float
+) -> tuple[Array, Array, float]:
+    """Times [s] and centre of the motion less what the drive's slow part causes and ``factor`` times the other axis
+    [rad], and the standard deviation of the centre by white noise [rad]; empty where the drive's part is unknown."""
     drive, track = recording.channels.get(f"drive_{name}"), motion.axes[name]
     nothing = np.empty(0), np.empty(0), 0.0
     frequency = float(np.median(track.frequency))
@@ -68,7 +119,7 @@ def _undriven_centre(recording: Recording, axis: Axis, motion: Motion, name: str
         return nothing
     if frequency < MIN_RELATIVE_FREQUENCY * axis.resonance:  # the drive moves it slowly
         return nothing
-    rate, values = track.angle.sample_rate, track.angle.read(0, min(track.angle.size, MAX_READ_SAMPLES))
+    rate, values = track.angle.sample_rate, _angles(motion, name) - factor * _angles(motion, _other(name))
     time, centre = _centres(values, rate, track.angle.start, frequency)
     if axis.drive.kind == "linear":
         volts = _centres(drive.read(0, MAX_READ_SAMPLES), drive.sample_rate, drive.start, frequency)

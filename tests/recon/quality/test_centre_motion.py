@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
@@ -17,8 +19,13 @@ TIME_S = np.arange(20_000) / RATE_HZ
 DEVICE = Device.from_toml(new_device("electromagnetic", {"x": KnownAxis(2000.0), "y": KnownAxis(835.0)}))
 
 
-def scan(hum_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5) -> list[str]:
-    """Limits of a scan from rest, of amplitudes that fill the field; hum in the sensor and a slow drive are in x."""
+def scan(
+    hum_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5, crosstalk: tuple[float, float] = (0.0, 0.0)
+) -> list[str]:
+    """Limits of a scan from rest, of amplitudes that fill the field; hum in the sensor and a slow drive are in x.
+
+    The sensors of x and y hold ``crosstalk`` times the other angle.
+    """
     assert DEVICE.scan is not None
     rng, channels, angles = np.random.default_rng(5), {}, []
     for name, frequency, half_angle in (
@@ -40,6 +47,12 @@ def scan(hum_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5)
         noise = rng.normal(0.0, noise_rad, TIME_S.size)
         channels |= {f"drive_{name}": (volts, "V", RATE_HZ), f"angle_{name}": (angle + hum + noise, "rad", RATE_HZ)}
     x, y = angles
+    for name, other, factor, half_angle in (
+        ("x", y, crosstalk[0], DEVICE.scan.half_angle_y),
+        ("y", x, crosstalk[1], DEVICE.scan.half_angle_x),
+    ):
+        values, *about = channels[f"angle_{name}"]
+        channels[f"angle_{name}"] = (values + factor * half_angle * other, *about)
     light = 1.0 + 0.5 * np.sin(9.0 * x + 2.0) * np.cos(7.0 * y) + 0.3 * x
     recording = Recording.from_arrays({**channels, "intensity": (rng.poisson(500 * light) / 500, "V", RATE_HZ)}, DEVICE)
     return reconstruct(recording, Options(estimator="sensor", pixels=(80, 80), allow_outside=True), quiet=True).limits
@@ -52,6 +65,23 @@ def test_hum_in_a_position_signal_is_stated_with_its_size() -> None:
     assert line.startswith("x: the centre of the motion moves by ±3 pixels, most at 50")
 
 
+@pytest.mark.parametrize(("crosstalk", "name"), [((0.05, 0.0), "x"), ((0.0, -0.05), "y")])
+def test_crosstalk_of_the_other_axis_is_no_hum(crosstalk: tuple[float, float], name: str) -> None:
+    (line,) = (line for line in scan(crosstalk=crosstalk) if "centre" in line or "follows" in line)
+    other = "y" if name == "x" else "x"
+    stated = re.match(rf"{name}: the position signal follows {other} by the factor (\S+), ±(\S+) pixels", line)
+    assert stated is not None
+    assert float(stated[1]) == pytest.approx(sum(crosstalk), abs=1e-3)
+    assert float(stated[2]) == pytest.approx(2.0, abs=0.25)  # the amplitude still grows
+
+
+def test_crosstalk_and_hum_are_stated_both() -> None:
+    assert DEVICE.scan is not None
+    hum = 3.0 * 2.0 * DEVICE.scan.half_angle_x / 80
+    lines = [line for line in scan(hum_rad=hum, crosstalk=(0.05, 0.0)) if "centre" in line or "follows" in line]
+    assert [("follows" in line, "most at 50" in line) for line in lines] == [(True, False), (False, True)]
+
+
 @pytest.mark.parametrize("change", [{}, {"slow_drive": 0.3}, {"noise_rad": 5e-3}])
 def test_a_start_from_rest_a_slow_drive_and_noise_are_no_error_of_the_sensor(change: dict[str, float]) -> None:
-    assert not any("centre" in line for line in scan(**change))
+    assert not any("centre" in line or "follows" in line for line in scan(**change))
