@@ -278,6 +278,8 @@ def axis_motion_from_angle(
             hint="check the sensor and its cable, or cut the recording",
         )
     amplitude = np.interp(time, time[known], np.abs(phasors[known]))
+    if reference.kind == "blocks":  # the part at a frequency that is no line says nothing of the range
+        amplitude = np.full(time.size, 0.5 * float(np.ptp(angle[~stopped])))
     is_noise_known = noise_sd is not None or rate >= MIN_NOISE_SAMPLES_PER_PERIOD * reference.frequency
     if noise_sd is None or rate >= MIN_NOISE_SAMPLES_PER_PERIOD * reference.frequency:
         measured = white_noise_sd(angle[:NOISE_SAMPLES][~stopped[:NOISE_SAMPLES]])

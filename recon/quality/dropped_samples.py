@@ -178,8 +178,13 @@ def first_late_slice(phase_errors: Sequence[PhaseError], motion: Motion) -> int 
     The delay has to change there by as much as a slice may be late: a constant delay near that limit is within it in
     one slice and beyond it in another. It is compared in the axes that are determined before and after: dropped samples
     delay both, and the phase error of an axis that is determined only later may have been there from the start. The
-    last slice alone is not accepted, because the location needs a whole slice after it.
+    last slice alone is not accepted, because the location needs a whole slice after it. Slices after the end of the
+    motion, as of sensors that were stopped first, are not counted.
     """
+    end = min(float(axis.time[-1]) - axis.angle.start for axis in motion.axes.values())
+    phase_errors = [error for error in phase_errors if error.time <= end]
+    if not phase_errors:
+        return None
     late = ~slices_aligned(phase_errors, motion)
     first = int(np.argmax(late))
     if not (0 < first < len(phase_errors) - 1 and late[first:].all()):

@@ -44,6 +44,9 @@ def test_a_frequency_is_stated_only_if_the_signal_repeats(periods: float) -> Non
     if periods < 1.0:
         assert summary["y"]["frequency_hz"] is None
         assert len(notes) == 1
+        assert summary["y"]["amplitude_rad"] == pytest.approx(0.09, rel=0.05)  # half the range
+        assert summary["y"]["within_bound"] > 0.99
+        assert not any("determines no phase of y" in note for note in result.notes)
         assert "not determined</td>" in reconstruction_report(result, summary)
     else:
         assert summary["y"]["frequency_hz"] == pytest.approx(periods / SECONDS, rel=0.02)

@@ -176,8 +176,11 @@ def _undescribed_variance(axis: AxisMotion) -> Array:
     """Variance of the phase by a delay that the device file does not state [rad^2].
 
     That of a readout which has one: averaged with readouts as stated, half of them, the interval of ± 1.96 standard
-    deviations would hold 92 % of this prior.
+    deviations would hold 92 % of this prior. None of an axis without a frequency: it moves once through its range in
+    the recording, of which such a delay is a small part.
     """
+    if axis.reference == "blocks":
+        return np.zeros_like(axis.frequency)
     return np.square(2.0 * np.pi * axis.frequency * UNDESCRIBED_DELAY_SD_S)
 
 
@@ -197,7 +200,7 @@ def describe_readout_phase(
         f"the device file does not state; without such a delay it is {_sd_as_stated(motion.axes[name]):.2g}°. "
         "A scene with detail, more light or a longer scan narrows it"
         for name in AXES
-        if name not in found and name not in contradicted
+        if name not in found and name not in contradicted and motion.axes[name].reference != "blocks"
     ]
     notes += [
         f"the picture determines no phase of {name}; the delay that it shows in the other axis, whose signal passes "

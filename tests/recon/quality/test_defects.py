@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -301,7 +302,7 @@ def test_only_a_lasting_sudden_delay_counts_as_dropped_samples(whole: Reconstruc
 
     def slices_of(delays: Sequence[float], sd: float = 0.02) -> list[PhaseError]:
         return [
-            PhaseError(float(i), *(PhaseEstimate(delay * scale, sd * scale) for scale in radians_per_sample))
+            PhaseError(1e-3 * i, *(PhaseEstimate(delay * scale, sd * scale) for scale in radians_per_sample))
             for i, delay in enumerate(delays)
         ]
 
@@ -315,6 +316,8 @@ def test_only_a_lasting_sudden_delay_counts_as_dropped_samples(whole: Reconstruc
     assert first_late_slice(slices_of([0.4, 0.6, 0.6, 0.6]), whole.motion) is None  # a constant delay near the limit
     assert first_late_slice(slices_of([2.0, 2.0, 2.0]), whole.motion) is None  # a constant delay
     assert first_late_slice(slices_of([0.0, 0.0, 3.0]), whole.motion) is None  # followed by no complete slice
+    after_the_motion = [replace(each, time=1.0 + each.time) for each in slices_of([np.nan, np.nan], np.inf)]
+    assert first_late_slice([*slices_of([0.0, 0.0]), *after_the_motion], whole.motion) is None
 
 
 def test_a_constant_phase_error_of_an_axis_that_is_determined_only_later_is_no_loss(whole: Reconstruction) -> None:
@@ -322,9 +325,9 @@ def test_a_constant_phase_error_of_an_axis_that_is_determined_only_later_is_no_l
     aligned, unknown = PhaseEstimate(0.0, 1e-3), PhaseEstimate(math.nan, math.inf)
     late = PhaseEstimate(np.radians(3.0), 1e-4)
     axes = [(unknown, aligned)] * 2 + [(late, aligned)] * 4
-    slices = [PhaseError(float(i), x, y) for i, (x, y) in enumerate(axes)]
+    slices = [PhaseError(1e-3 * i, x, y) for i, (x, y) in enumerate(axes)]
     assert first_late_slice(slices, whole.motion) is None
-    lost = [PhaseError(float(i), aligned if i < 2 else late, unknown) for i in range(6)]
+    lost = [PhaseError(1e-3 * i, aligned if i < 2 else late, unknown) for i in range(6)]
     assert first_late_slice(lost, whole.motion) == 2
 
 
