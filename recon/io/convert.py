@@ -135,7 +135,7 @@ def convert(source: Path, mapping: Path | Plan) -> Recording:
 
 def _plan(mapping: Path | Plan) -> tuple[Plan, object]:
     """Content of the mapping and its source, for messages."""
-    return (mapping, "arguments") if isinstance(mapping, Mapping) else (read_toml(mapping), mapping)
+    return (mapping, "mapping") if isinstance(mapping, Mapping) else (read_toml(mapping), mapping)
 
 
 def _contents(source: Path, plan: Plan, plan_source: object) -> Contents:

@@ -262,7 +262,8 @@ def _clock(times: Variable, name: str, bad: Any) -> tuple[float, float]:
         raise bad(f"time = {name!r} is no column of numbers", "name the variable that holds the times [s]")
     rate, start, note = infer_clock(column)
     if rate is None or start is None:
-        raise bad(f"time = {name!r} is no clock: {note}", "cut the file there, or state sample_rate")
+        hint = "cut the file there, name the column of the times, or state the sample rate in their place"
+        raise bad(f"time = {name!r} is no clock: {note}", hint)
     seconds = TIME_UNITS.get((times.unit or "s").lower())
     if seconds is None:
         raise bad(f"time = {name!r} has the unit {times.unit!r}", "name a column of times")

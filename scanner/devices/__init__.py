@@ -40,6 +40,9 @@ def find(source: Device | str | Path) -> Device:
         raise BadInput(f"is a {type(source).__name__}, no device", channel="device", hint=hint)
     if str(source) in names():
         return load(str(source))
+    if "\n" in str(source):
+        hint = "Device.from_toml(text) makes a device of it"
+        raise BadInput("is the text of a device, neither a name nor the path of a file", channel="device", hint=hint)
     if not Path(source).exists():
         hint = f"there are {', '.join(names())}; `lissajous new-device` writes a file to edit"
         raise BadInput(f"no device is named {str(source)!r} and no file is", channel="device", hint=hint)

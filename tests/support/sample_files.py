@@ -89,6 +89,7 @@ def make_sample_files(folder: Path, measured: Path) -> dict[str, bytes]:
         "new.mat": written(_matlab_73),
         "plain.npz": written(np.savez, v=V, i=TWO),
         "packed.npz": written(np.savez_compressed, v=V, f=np.asfortranarray(TWO)),
+        "table.npy": written(np.save, TWO),
         "short.wav": written(wavfile.write, 48000, TWO),
         "float.wav": written(wavfile.write, 48000, V.astype("f4")),
         "three.wav": written(_wav_24),

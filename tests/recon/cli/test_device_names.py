@@ -7,6 +7,7 @@ import pytest
 from recon.cli import main
 from recon.steps.preparation import select_device
 from scanner import devices
+from scanner.errors import BadInput
 from tests.support.simulated import imaging
 
 
@@ -36,3 +37,9 @@ def test_simulate_drives_a_device_of_ones_own_so_that_it_fills_the_field(
     simulate = ["simulate", "--device", device, "-o", scan, "--duration", "0.005", "--rate", "2e5"]
     assert main([*simulate, "--drive-y", "800,3,0"]) == 0
     assert "driven at x 2000 Hz, 10 V, offset 0 V, y 800 Hz, 3 V, offset 0 V" in capsys.readouterr().out
+
+
+def test_the_text_of_a_device_is_no_name() -> None:
+    with pytest.raises(BadInput, match="device: is the text of a device, neither a name nor the path of a file") as bad:
+        devices.find('[x.readout]\nkind = "position"\n')
+    assert str(bad.value).count("readout") == 0

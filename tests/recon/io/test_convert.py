@@ -155,7 +155,7 @@ CONTENTS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
         (
             ('"matlab"', '"labview"'),
             "SOURCE: format: format 'labview' is unknown; "
-            "known formats: csv, hdf5, lvm, matlab, npz, scope, tdms, wav",
+            "known formats: csv, hdf5, lvm, matlab, npy, npz, scope, tdms, wav",
         ),
         (('"matlab"', "7"), "MAP: format: is 7 and must be text; put it in quotes"),
         (("sense_x]", '"a/b"]'), "MAP: channels.a/b: is no name for a channel; name it without /"),

@@ -58,6 +58,18 @@ def test_fields_of_matlab_structures_are_variables(tmp_path: Path) -> None:
     assert not variables["data.daq.text"].is_signal
 
 
+def test_one_numpy_array_is_read_by_columns_or_fields(tmp_path: Path) -> None:
+    np.save(tmp_path / "table.npy", np.stack([COUNTS, COUNTS + 1], axis=1))
+    np.save(tmp_path / "line.npy", COUNTS)
+    np.save(tmp_path / "named.npy", np.array([(1, 2.0), (3, 4.0)], dtype=[("x", "i4"), ("y", "f8")]))
+    found = {name: read(tmp_path / f"{name}.npy").variables for name in ("table", "line", "named")}
+    assert [list(variables) for variables in found.values()] == [["column 1", "column 2"], ["line"], ["x", "y"]]
+    np.testing.assert_array_equal(found["table"]["column 2"].raw[5:9], COUNTS[5:9] + 1)
+    np.save(tmp_path / "objects.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(BadInput, match=r"objects\.npy: is not a whole NumPy array: .*save it again"):
+        read(tmp_path / "objects.npy")
+
+
 @pytest.mark.parametrize(
     ("variable", "options", "warned"),
     [
