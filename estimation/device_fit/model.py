@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from threading import Lock
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +16,8 @@ from estimation.device_fit.parameters import (
     ParameterSpec,
     nominal_parameters,
 )
-from estimation.parallel import map_parallel
-from scanner.active_terms import ActiveTerm, stated_terms, with_constants
+from estimation.device_fit.trajectory_cache import MotionRequest, TrajectoryCache
+from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.forward_model import (
@@ -28,10 +26,8 @@ from scanner.forward_model import (
     reference_signal,
     sense_signal,
     simulate_axis,
-    simulate_batch,
     simulate_coupled,
 )
-from scanner.integrator.abi import LANES
 from scanner.stages import Amdm
 from scanner.terms import NaturalScales
 
@@ -41,25 +37,6 @@ both."""
 
 AXIS_CACHE_SIZE = 64
 """Axes with fitted nominal values that a model caches: about as many as one Jacobian has columns."""
-
-
-_Key = tuple[object, ...]
-
-
-class _Motion(NamedTuple):
-    """Everything but the drive that determines a motion; input of ``simulate_batch``."""
-
-    axis: Axis
-    active_terms: tuple[ActiveTerm, ...]
-    start: tuple[float, float]
-
-    def key(self, r: int, inputs: DriveInput) -> _Key:
-        """Key that is equal for equal motions; the readout does not affect the motion."""
-        axis, active_terms, start = self
-        return (
-            r, axis.name, axis.mechanics, axis.capacitance, axis.drive, start, len(inputs.voltage),
-            *[(active.term.effect, active.values, active.hidden_state) for active in active_terms],
-        )  # fmt: skip
 
 
 _EMPTY_BASIS: tuple[list[int], Array] = [], np.zeros((0, 0))
@@ -109,15 +86,13 @@ class Model:
                     self._pre_saturation_basis[r, output.name] = indices, _on_grid(waveforms, output, run)
                     indices, waveforms = _EMPTY_BASIS
                 self.basis[r, output.name] = indices, waveforms
-        self._trajectory_cache: dict[_Key, AxisTrajectory] = {}
-        self._prefetched: dict[_Key, AxisTrajectory] = {}
-        self._axis_cache: dict[_Key, Axis] = {}
+        self._trajectories = TrajectoryCache(8 * len(self.runs))
+        self._axis_cache: dict[tuple[object, ...], Axis] = {}
         self._nominal = {
             axis: [(self._indices[("nominal", axis, name, -1)], name, value, tolerance)
                    for name, value, tolerance in nominal_parameters(device, axis)]
             for axis in self.axes
         }  # fmt: skip
-        self._lock = Lock()
 
     def _parameter_specs(self) -> list[ParameterSpec]:
         specs = [
@@ -265,7 +240,7 @@ class Model:
         def simulate(name: str, inputs: DriveInput, start: tuple[float, float], other: Array | None) -> AxisTrajectory:
             if other is not None:
                 return simulate_axis(axes[name], added[name], inputs, start, other)
-            return self._cached_trajectory(axes[name], added[name], inputs, start, r)
+            return self._trajectories.trajectory(MotionRequest(r, axes[name], added[name], start, inputs))
 
         inputs = {name: _truncate(drive, stop) for name, drive in run.inputs.items()}
         coupled = any(drive.term.coupled for terms in added.values() for drive in terms)
@@ -285,50 +260,16 @@ class Model:
             parallel: integrate the batches on several processors, if the recordings are long enough. Not within a
                 function that runs in parallel itself.
         """
-        groups: dict[tuple[int, str, tuple[object, ...]], dict[_Key, _Motion]] = {}
-        for x in xs:
-            for name in self.axes:
-                axis = self.nominal(name, x)
-                for r, run in enumerate(self.runs):
-                    if name in run.inputs:
-                        motion = _Motion(axis, _motion_terms(self.active_terms(name, r, x)), self.start(name, r, x))
-                        inputs = _truncate(run.inputs[name], stop)
-                        key = motion.key(r, inputs)
-                        if key not in self._trajectory_cache:
-                            on_drive = (active for active in motion.active_terms if active.term.voltage is not None)
-                            drive = tuple(active.values for active in on_drive)
-                            groups.setdefault((r, name, drive), {})[key] = motion
-
-        def simulate_part(part: tuple[DriveInput, list[tuple[_Key, _Motion]]]) -> None:
-            trajectories = simulate_batch([motion for _, motion in part[1]], part[0])
-            with self._lock:
-                self._prefetched |= {
-                    key: trajectory for (key, _), trajectory in zip(part[1], trajectories, strict=True)
-                }
-
-        batches = []
-        for (r, name, _), group in groups.items():
-            inputs, requests = _truncate(self.runs[r].inputs[name], stop), list(group.items())
-            parts = -(-len(requests) // LANES)
-            if parallel and len(requests) > LANES // 2:
-                parts = max(parts, 2)  # for a second processor
-            batches += [(inputs, requests[i::parts]) for i in range(parts)]
-        map_parallel(simulate_part, batches, self.steps if parallel else 0)
-
-    def _cached_trajectory(self, axis: Axis, added: tuple[ActiveTerm, ...], inputs: DriveInput,
-                    start: tuple[float, float], r: int) -> AxisTrajectory:  # fmt: skip
-        """Trajectory from the cache or a new integration; a changed readout needs no new one."""
-        motion = _Motion(axis, _motion_terms(added), start)
-        key = motion.key(r, inputs)
-        with self._lock:
-            trajectory = self._prefetched.pop(key, None) or self._trajectory_cache.pop(key, None)
-        if trajectory is None:
-            (trajectory,) = simulate_batch([motion], inputs)
-        with self._lock:  # reinserted at the end: the least recently used one is dropped first
-            self._trajectory_cache[key] = trajectory
-            if len(self._trajectory_cache) > 8 * len(self.runs):
-                self._trajectory_cache.pop(next(iter(self._trajectory_cache)))
-        return replace(trajectory, axis=with_constants(axis, added), active_terms=added)
+        requests = (
+            MotionRequest(
+                r, axis, self.active_terms(name, r, x), self.start(name, r, x), _truncate(run.inputs[name], stop)
+            )
+            for x in xs
+            for name, axis in ((name, self.nominal(name, x)) for name in self.axes)
+            for r, run in enumerate(self.runs)
+            if name in run.inputs
+        )
+        self._trajectories.prefetch(requests, self.steps if parallel else 0)
 
     def _offset(self, output: Output, signal: Array, r: int, x: Array) -> Array:
         """A simulated channel with the gain of a reference channel and the additive waveforms of x."""
@@ -354,11 +295,6 @@ def _on_grid(waveforms: Array, output: Output, run: Run) -> Array:
     return np.array([np.interp(positions, samples, waveform) for waveform in waveforms]).reshape(
         len(waveforms), grid.size
     )
-
-
-def _motion_terms(added: Iterable[ActiveTerm]) -> tuple[ActiveTerm, ...]:
-    """The terms that change the motion."""
-    return tuple(active for active in added if active.term.stage in ("drive", "mechanics", "capacitance"))
 
 
 def _truncate(inputs: DriveInput, stop: float) -> DriveInput:

@@ -135,10 +135,10 @@ def test_outputs_prepared_in_advance_equal_outputs_computed_on_demand() -> None:
     ahead, model = (Model([run], DEVICE, [candidate]) for _ in range(2))
     points = np.random.default_rng(0).normal(0.0, 0.3, (11, len(model.parameters)))
     ahead.prefetch_trajectories(list(points), 0.5)
-    assert len(ahead._prefetched) == len(points)
+    assert len(ahead._trajectories._prefetched) == len(points)
     for x in points:
         np.testing.assert_array_equal(ahead.outputs(x, 0.5)[0][0], model.outputs(x, 0.5)[0][0])
-    assert not ahead._prefetched
+    assert not ahead._trajectories._prefetched
 
 
 def test_halving_the_integration_step_changes_outputs_by_less_than_a_tenth_of_the_noise() -> None:
