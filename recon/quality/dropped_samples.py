@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from recon.imaging.gridding import map_samples, pixel_index
 from recon.imaging.picture import Grid
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
+from recon.imaging.scan_phase.bidirectional_phase import measure_motion_phase_errors, slow_period
+from recon.imaging.scan_phase.phase_error import PhaseError
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples
 from scanner.device import AXES

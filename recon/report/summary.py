@@ -11,13 +11,12 @@ import numpy as np
 from recon.evaluation import AxisEvaluation
 from recon.imaging import blur
 from recon.imaging.coverage import fill_against_time
-from recon.imaging.frame_axis import position_axis
 from recon.imaging.picture import fill_factor
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase import UNDESCRIBED_DELAY_SD_S, common_delay
+from recon.report.z_summary import position_summary, stack_summary
 from recon.steps.reconstruction import Reconstruction
-from recon.steps.z_rests import cut_to_intensity, read_blocks
 from recon.steps.z_slices import ZSlices
 from scanner.arrays import Array
 from scanner.device import AXES
@@ -308,33 +307,6 @@ def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str
         "limits": result.limits,
         "notes": result.notes,
         "info": dict(result.motion.info),
-    }
-
-
-def stack_summary(slices: ZSlices | None) -> dict[str, Any] | None:
-    """Positions and samples of the slices of a stack; None without one."""
-    if slices is None:
-        return None
-    axis = position_axis(slices.positions)
-    return {
-        "z_m": list(axis.values),
-        "step_m": axis.step,
-        "even": axis.even,
-        "samples": list(slices.samples),
-    }
-
-
-def position_summary(result: Reconstruction) -> dict[str, float] | None:
-    """Mean and range of z during the intensity; None where it was not recorded or is nowhere known."""
-    if result.position_z is None:
-        return None
-    try:
-        blocks = read_blocks(cut_to_intensity(result.position_z, result.intensity))
-    except BadInput:
-        return None
-    return {
-        "mean_m": float(np.nanmean(blocks.mean)),
-        "range_m": 0.0 if blocks.constant else float(blocks.most - blocks.least),
     }
 
 

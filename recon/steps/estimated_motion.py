@@ -10,8 +10,8 @@ from recon.imaging.intensity_drift import IntensityDrift
 from recon.imaging.picture import Grid
 from recon.imaging.sample_motion.correction import relative_to_sample
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError
 from recon.imaging.scan_phase.phase_agreement import Contradiction
+from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.steps.preparation import PreparedRecording
 from scanner.arrays import Array

@@ -15,9 +15,10 @@ from recon.imaging.intensity_correction import (
     exceeds_uncertainty,
     measure_intensity_drift,
 )
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_motion_phase_errors
+from recon.imaging.scan_phase.bidirectional_phase import measure_motion_phase_errors
 from recon.imaging.scan_phase.contradicted_phase import include_contradictions
 from recon.imaging.scan_phase.phase_agreement import Contradiction, find_contradictions
+from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors

@@ -15,7 +15,7 @@ from recon.imaging.picture import Picture
 from recon.imaging.picture_kinds.picture_estimate import PictureKind
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.quality.defects import Defect
 from recon.steps.preparation import DeviceSource

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase import measured_phase_error, posterior_times
 from recon.imaging.scan_phase.readout_phase_model import (
     OFFSET_SDS_RAD,

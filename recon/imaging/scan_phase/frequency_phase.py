@@ -24,7 +24,8 @@ from estimation.signals import phase_reference
 from estimation.tracker.phase_measurements import UNKNOWN_PHASE_SD
 from recon.imaging.picture import Grid
 from recon.imaging.scan_phase.amplitude_change import measure_amplitude_changes
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, measure_motion_phase_errors, slow_period
+from recon.imaging.scan_phase.bidirectional_phase import measure_motion_phase_errors, slow_period
+from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.phase_search import (
     MIN_FOUND_FRACTION,
     PERIODS_PER_SEARCH,

@@ -23,13 +23,9 @@ from estimation.term_compensation import estimate_with_terms
 from estimation.tracker import PhaseMeasurement, track
 from estimation.tracker.drive_only import track_drive_only
 from recon.imaging.picture import Grid
-from recon.imaging.scan_phase.bidirectional_phase import (
-    PERIODS_PER_SLICE,
-    PhaseError,
-    measure_motion_phase_errors,
-    slow_period,
-)
+from recon.imaging.scan_phase.bidirectional_phase import PERIODS_PER_SLICE, measure_motion_phase_errors, slow_period
 from recon.imaging.scan_phase.frequency_phase import phases_from_picture
+from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.response_phase import check_response
 from scanner.arrays import Array
 from scanner.channel import Channel

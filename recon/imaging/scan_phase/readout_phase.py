@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstimate
+from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
 from recon.imaging.scan_phase.readout_phase_model import (
     DRIFT_SDS_RAD,
     ReadoutPhase,

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError
+from recon.imaging.scan_phase.phase_error import PhaseError
 from scanner.arrays import Array
 from scanner.motion import Motion
 

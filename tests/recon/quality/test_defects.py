@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from recon.cli import main
 from recon.evaluation import truth_from_simulation
 from recon.imaging.gridding import map_samples
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstimate
+from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
 from recon.pipeline import reconstruct
 from recon.quality.clock_jumps import detect_clock_jumps
 from recon.quality.defects import Defect, describe_defects, find_defects

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstimate
+from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
 from recon.report.conclusions import describe_slices
 from recon.report.summary import excess_variance, picture_phase_error
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from estimation.tracker import track
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseErrorParts, PhaseEstimate
 from recon.imaging.scan_phase.carried_readout_phase import CHANGE_SD_RAD, apply_readout_phase, update_readout_phase
+from recon.imaging.scan_phase.phase_error import PhaseError, PhaseErrorParts, PhaseEstimate
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from scanner.motion import Motion
 from tests.support.simulated import imaging

@@ -12,7 +12,7 @@ from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.targets import make_target
 from recon.evaluation import truth_from_simulation
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseErrorParts, PhaseEstimate
+from recon.imaging.scan_phase.phase_error import PhaseError, PhaseErrorParts, PhaseEstimate
 from recon.imaging.scan_phase.readout_phase import remove_readout_phase
 from recon.imaging.scan_phase.readout_phase_model import (
     OFFSET_SDS_RAD,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.imaging.scan_phase.bidirectional_phase import PhaseError, PhaseEstimate
+from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.pipeline import reconstruct
 from recon.report.picture_conclusion import conclude_reconstruction
