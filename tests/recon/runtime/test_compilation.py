@@ -40,7 +40,7 @@ assert len(compiled) > 10
 
 def _messages_of_two_runs(script: Path, code: str, **environment: str) -> list[str]:
     script.write_text(code, encoding="utf-8")
-    whole = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent)} | environment
+    whole = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])} | environment
     options: dict[str, Any] = {"env": whole, "capture_output": True, "text": True, "check": True}
     return [subprocess.run([sys.executable, str(script)], **options).stderr for _ in range(2)]
 
