@@ -27,7 +27,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from recon.io.mapped_channel import Request, describe_counts, find_variable, is_scaled, map_channel, map_edges
+from recon.io.mapped_channel import (
+    Request,
+    describe_counts,
+    describe_times,
+    find_variable,
+    is_scaled,
+    map_channel,
+    map_edges,
+)
 from recon.io.readers import read
 from recon.io.readers.contents import Contents
 from scanner.device import Device
@@ -98,7 +106,8 @@ def convert_file(source: Path, mapping: Path | Plan, output: Path, by_options: b
     contents = _contents(source, plan, plan_source)
     with _recording(contents, source, plan, plan_source) as recording:
         requests = [Request(name, plan["channels"][name], contents, source, plan_source) for name in recording.channels]
-        notes = [note for note in map(describe_counts, requests) if note]
+        found = [describe(request) for describe in (describe_counts, describe_times) for request in requests]
+        notes = list(dict.fromkeys(note for note in found if note))
         recording.write(output)
         return {
             "recording": str(output),

@@ -158,9 +158,20 @@ def describe_counts(request: Request) -> str | None:
         if (values != np.round(values)).any() or np.unique(values).size < MIN_DISTINCT_COUNTS:
             return None
     return (
-        f"{request.name}: whole numbers from {values.min():.6g} to {values.max():.6g} are taken as {unit}; if they are "
-        f"counts of a converter, state {unit} per count: "
+        f"{request.name}: whole numbers from {values.min():.6g} to {values.max():.6g} are taken as {unit}; if they "
+        f"have another unit, state it; if they are counts of a converter, state {unit} per count: "
         f"{f'--scale {request.name}=...' if request.stated_in is None else 'scale = ...'}"
+    )
+
+
+def describe_times(request: Request) -> str | None:
+    """A line on times whose unit the file does not state; None where it does, or where a rate is stated."""
+    name = request.spec.get("time")
+    if name is None or _find(request, name).unit is not None:
+        return None
+    return (
+        f"{name}: no unit is stated for these times, and they are taken as seconds; if they have another unit, state "
+        f"the sample rate in their place"
     )
 
 

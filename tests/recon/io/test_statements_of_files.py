@@ -90,6 +90,16 @@ def test_whole_numbers_taken_as_volts_are_named(
             assert recording["sense_x"].read() == pytest.approx((COUNTS - 2048.0) / 1000.0)
 
 
+def test_times_without_a_unit_are_named_once(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    np.savez(tmp_path / "a.npz", x=COUNTS / 1000.0, y=COUNTS / 1000.0, time_us=np.arange(COUNTS.size))
+    channels = ["--channel", "sense_x=x", "--channel", "sense_y=y", "--unit", "V"]
+    given = ["convert", str(tmp_path / "a.npz"), *channels, "-o", str(tmp_path / "a.h5")]
+    assert main([*given, "--time", "time_us"]) == 0
+    assert capsys.readouterr().out.count("time_us: no unit is stated for these times, and they are taken as sec") == 1
+    assert main([*given, "--rate", "1e6"]) == 0
+    assert "taken as seconds" not in capsys.readouterr().out
+
+
 def test_messages_name_the_options_that_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     _, _, error = converted(tmp_path, capsys, "--channel", "sense_x=x")
     assert "counts.npz: sense_x: no unit is stated for variable 'x', and the file states none" in error
