@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -55,11 +56,12 @@ def fill_missing(values: Array, longest: int) -> Filled:
     filled, left_out = 0, list[tuple[int, int]]()
     edges = np.flatnonzero(np.diff(np.concatenate([[True], known, [True]])))
     for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        around = _samples_around(usable, first, stop, MAX_SPAN_GAPS * max(longest, DEGREE))
-        if around is None or stop - first > longest:
+        reach = MAX_SPAN_GAPS * max(longest, DEGREE)
+        around = None if stop - first > longest else _samples_around(usable, first, stop, reach)
+        if around is None:
             left_out.append((first, stop))
             continue
-        out[first:stop] = _polynomial(around, values[around], at[first:stop])
+        out[first:stop] = _weights(tuple((around - first).tolist()), stop - first) @ values[around]
         filled += stop - first
     return Filled(out, filled, left_out)
 
@@ -73,9 +75,22 @@ def _samples_around(usable: Index, first: int, stop: int, reach: int) -> Index |
     return around
 
 
-def _polynomial(at: Index, values: Array, wanted: Index) -> Array:
-    """The polynomial through values at some samples, by least squares, at the ``wanted`` ones."""
+@lru_cache(maxsize=1024)
+def _weights(around: tuple[int, ...], gap: int) -> Array:
+    """Weights of known samples in the polynomial through them, by least squares, at each missing sample of a gap.
+
+    Most gaps of a recording are alike, so that the weights are kept.
+
+    Args:
+        around: numbers of the known samples, counted from the first missing one.
+        gap: number of missing samples.
+
+    Returns:
+        shape (gap, known samples).
+    """
+    at = np.array(around, float)
     middle, half = 0.5 * (at[0] + at[-1]), 0.5 * (at[-1] - at[0])
-    basis = np.polynomial.legendre.legvander((at - middle) / half, DEGREE)
-    coefficients = np.linalg.lstsq(basis, values, rcond=None)[0]
-    return np.polynomial.legendre.legval((wanted - middle) / half, coefficients)
+    known, wanted = (
+        np.polynomial.legendre.legvander((each - middle) / half, DEGREE) for each in (at, np.arange(gap, dtype=float))
+    )
+    return np.asarray(wanted @ np.linalg.pinv(known), np.float64)
