@@ -87,6 +87,7 @@ def smooth_motion(
     vibrations: Sequence[Vibration] = (),
     start: SmoothedMotion | None = None,
     jumps: bool = True,
+    excluded: Sequence[float] = (),
 ) -> SmoothedMotion:
     """Return the smoothed position under the most likely walk, vibrations and jumps.
 
@@ -96,13 +97,14 @@ def smooth_motion(
         vibrations: around which the equations are.
         start: a motion near the most likely one.
         jumps: whether jumps are searched.
+        excluded: frequencies of vibrations that are not searched [cycles per block].
     """
     blocks = len(position)
     around = position[:, None] + vibration_shift(vibrations, blocks).reshape(blocks, PARTS, 2)
     data = Data.around(equations, by_shape(around))
     variance = _step_variance(blocks, start.jumps if start else [])
     rest = observe(data, []).log_likelihood((0, 0), np.zeros(blocks))
-    walk, found, best = find_vibrations(equations, around, variance, start.walk if start else None)
+    walk, found, best = find_vibrations(equations, around, variance, start.walk if start else None, excluded)
     observed = observe(data, found)
     steps: list[int] = []
     if jumps:

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ from recon.imaging.sample_motion.coarse_search import search_motion
 from recon.imaging.sample_motion.jumps import MotionKnots, place_jumps
 from recon.imaging.sample_motion.motion_smoother import SmoothedMotion, part_shift, smooth_motion
 from recon.imaging.sample_motion.residual import residual_variance
-from recon.imaging.sample_motion.vibrations import Vibration
+from recon.imaging.sample_motion.vibrations import Vibration, vibration_shift
 from scanner.arrays import Array
 from scanner.channel import Channel
 
@@ -116,7 +117,7 @@ def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int
         final, final_width = _follow(samples, start, part, shape)
     gain = min(first.gain, final.gain)
     if gain >= MIN_LOG_LIKELIHOOD_GAIN:
-        gain = min(gain, _prediction_gain(samples, part, shape, (final.shift, final_width), (at_rest, width)))
+        gain = min(gain, _prediction_gain(samples, part, shape, final_width, final.shift, at_rest))
     moving = gain >= MIN_LOG_LIKELIHOOD_GAIN
     if moving:
         knots, shift, vibrations = place_jumps(samples, final, part, shape, final_width), final.shift, final.vibrations
@@ -141,38 +142,80 @@ def choose_width(samples: ScanSamples, shift: Array, part: int, shape: tuple[int
 
 
 def _prediction_gain(
-    samples: ScanSamples, part: int, shape: tuple[int, int], moved: tuple[Array, float], rest: tuple[Array, float]
+    samples: ScanSamples, part: int, shape: tuple[int, int], width: float, moved: Array, without: Array
 ) -> float:
     """Gain of the log likelihood of the samples under the pictures of the other blocks, at least 0.
 
     Args:
         samples, part, shape: as for :func:`choose_width`.
-        moved, rest: displacement of each part, shape (blocks * PARTS, 2) [px], and kernel [px].
+        width: of the kernel [px].
+        moved, without: displacement of each part, shape (blocks * PARTS, 2) [px].
     """
-    after, before = (sample_log_likelihoods(samples, shift, part, shape, width) for shift, width in (moved, rest))
+    after, before = (sample_log_likelihoods(samples, shift, part, shape, width) for shift in (moved, without))
     return max(float(np.nansum(after - before, dtype=np.float64)), 0.0)
 
 
 def _follow(
-    samples: ScanSamples, smoothed: SmoothedMotion, part: int, shape: tuple[int, int]
+    samples: ScanSamples, start: SmoothedMotion, part: int, shape: tuple[int, int]
 ) -> tuple[SmoothedMotion, float]:
-    """The motion after rounds of Gauss-Newton from a coarse one, and the kernel [px] of the last ones."""
-    width, _ = choose_width(samples, smoothed.shift, part, shape)
+    """The motion after rounds of Gauss-Newton from a coarse one, and the kernel [px] of the last ones.
+
+    Vibrations that do not predict the samples better than the motion without them are excluded; then the rounds are
+    repeated.
+    """
+    width, _ = choose_width(samples, start.shift, part, shape)
+    excluded: list[float] = []
+    while True:
+        smoothed = _converge(samples, start, part, shape, width, excluded)
+        failed = [each for each in smoothed.vibrations if not _predicts(samples, smoothed, each, part, shape, width)]
+        if not failed:
+            return smoothed, width
+        excluded += [each.frequency for each in failed]
+        start = smoothed
+
+
+def _predicts(
+    samples: ScanSamples,
+    motion: SmoothedMotion,
+    vibration: Vibration,
+    part: int,
+    shape: tuple[int, int],
+    width: float,
+) -> bool:
+    """Whether a motion predicts the samples better than the one without one of its vibrations."""
+    without = motion.shift - vibration_shift([vibration], len(motion.position))
+    return _prediction_gain(samples, part, shape, width, motion.shift, without) >= MIN_LOG_LIKELIHOOD_GAIN
+
+
+def _converge(
+    samples: ScanSamples,
+    smoothed: SmoothedMotion,
+    part: int,
+    shape: tuple[int, int],
+    width: float,
+    excluded: Sequence[float],
+) -> SmoothedMotion:
+    """The motion after rounds of Gauss-Newton, without vibrations near excluded frequencies [cycles per block]."""
     for _ in range(MAX_ROUNDS):
         before = smoothed
-        smoothed = _round(samples, before, part, shape, width)
+        smoothed = _round(samples, before, part, shape, width, excluded)
         variance = np.einsum("bpii->bpi", smoothed.covariance()).mean()
         if np.mean((smoothed.shift - before.shift) ** 2) < CONVERGED_SD**2 * variance:
             break
-    return smoothed, width
+    return smoothed
 
 
 def _round(
-    samples: ScanSamples, around: SmoothedMotion, part: int, shape: tuple[int, int], width: float
+    samples: ScanSamples,
+    around: SmoothedMotion,
+    part: int,
+    shape: tuple[int, int],
+    width: float,
+    excluded: Sequence[float],
 ) -> SmoothedMotion:
     """A step of Gauss-Newton, without the mean, which no sample determines."""
     found = block_equations(samples, around.shift, part, shape, width)
-    smoothed = smooth_motion(found, around.position, around.vibrations, around)
+    smoothed = smooth_motion(found, around.position, around.vibrations, around, excluded=excluded)
     return smoothed._replace(position=smoothed.position - smoothed.position.mean(axis=0))
 
 

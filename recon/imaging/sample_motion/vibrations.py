@@ -90,7 +90,11 @@ def observe(data: Data, vibrations: Sequence[Vibration]) -> Observations:
 
 
 def find_vibrations(
-    equations: BlockEquations, around: Array, variance: Array, start: tuple[int, int] | None
+    equations: BlockEquations,
+    around: Array,
+    variance: Array,
+    start: tuple[int, int] | None,
+    excluded: Sequence[float] = (),
 ) -> tuple[tuple[int, int], list[Vibration], float]:
     """Return walk, vibrations and log likelihood, the vibrations being found one after the other.
 
@@ -99,14 +103,15 @@ def find_vibrations(
         around: displacement of each part in the equations, shape (blocks, PARTS, 2) [px].
         variance: of the jump before each block, shape (blocks,) [px²].
         start: numbers of a walk near the most likely one.
+        excluded: frequencies that are not searched [cycles per block].
     """
     data, blocks = Data.around(equations, by_shape(around)), len(around)
     found: list[Vibration] = []
     rejected: list[float] = []
     walk, best = climb(observe(data, found), variance, start)
     while len(found) + len(rejected) < MAX_VIBRATIONS:
-        excluded = [*rejected, *(each.frequency for each in found)]
-        candidate = _strongest(data, observe(data, found), walk, variance, excluded)
+        unused = [*excluded, *rejected, *(each.frequency for each in found)]
+        candidate = _strongest(data, observe(data, found), walk, variance, unused)
         if candidate is None:
             break
         trial = refine_vibrations(data, [*found, candidate], walk, variance)
