@@ -160,31 +160,27 @@ def _follow(
 ) -> tuple[SmoothedMotion, float]:
     """The motion after rounds of Gauss-Newton from a coarse one, and the kernel [px] of the last ones.
 
-    Vibrations that do not predict the samples better than the motion without them are excluded; then the rounds are
-    repeated.
+    Vibrations that do not predict the samples better than the motion without them are excluded. Then the rounds are
+    repeated, unless nothing is left that does.
     """
     width, _ = choose_width(samples, start.shift, part, shape)
     excluded: list[float] = []
+
+    def predicts(moved: Array, without: Array) -> bool:
+        return _prediction_gain(samples, part, shape, width, moved, without) >= MIN_LOG_LIKELIHOOD_GAIN
+
     while True:
         smoothed = _converge(samples, start, part, shape, width, excluded)
-        failed = [each for each in smoothed.vibrations if not _predicts(samples, smoothed, each, part, shape, width)]
+        blocks, shift = len(smoothed.position), smoothed.shift
+        own = [vibration_shift([each], blocks) for each in smoothed.vibrations]
+        failed = [each for each, its in zip(smoothed.vibrations, own, strict=True) if not predicts(shift, shift - its)]
         if not failed:
+            return smoothed, width
+        walk = part_shift(smoothed.position, [])
+        if len(failed) == len(own) and not predicts(walk, np.zeros_like(walk)):
             return smoothed, width
         excluded += [each.frequency for each in failed]
         start = smoothed
-
-
-def _predicts(
-    samples: ScanSamples,
-    motion: SmoothedMotion,
-    vibration: Vibration,
-    part: int,
-    shape: tuple[int, int],
-    width: float,
-) -> bool:
-    """Whether a motion predicts the samples better than the one without one of its vibrations."""
-    without = motion.shift - vibration_shift([vibration], len(motion.position))
-    return _prediction_gain(samples, part, shape, width, motion.shift, without) >= MIN_LOG_LIKELIHOOD_GAIN
 
 
 def _converge(
