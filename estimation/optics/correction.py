@@ -6,7 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.optics.detector_inverse import REACH, detector_corners, inverse_filter, undo_low_pass
+from estimation.optics.detector_inverse import (
+    MEASURED_SAMPLES,
+    REACH,
+    detector_corners,
+    inverse_filter,
+    measure_regularisation,
+    undo_low_pass,
+)
 from scanner.arrays import Array
 from scanner.channel import LazySamples
 from scanner.device import Device
@@ -31,7 +38,8 @@ def correct_intensity(recording: Recording, device: Device, undo_lag: bool = Fal
     channel = recording["intensity"]
     step = 1 / channel.sample_rate
     corners = detector_corners(device) if undo_lag else []
-    filters = [inverse_filter(corner, step) for corner in corners]
+    measured = channel.read(0, min(MEASURED_SAMPLES, channel.size) if corners else 0)
+    filters = [inverse_filter(corner, step, measure_regularisation(measured, corner, step)) for corner in corners]
     before, after = len(filters) * (REACH + 1), len(filters) * REACH
 
     def corrected(first: int, stop: int) -> Array:
