@@ -13,6 +13,7 @@ from estimation.device_fit.hum import describe_strong_hum
 from estimation.device_fit.open_loop import is_worse, open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, find_effect
+from estimation.diagnosis.held_drive import with_held_drive
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
 from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
@@ -104,6 +105,15 @@ def diagnose(
     """
     nominal = nominal_device(recordings, device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
+    diagnosis = _diagnose_with_modes(runs, nominal, progress, excluded)
+    findings = tuple(with_held_drive(finding, recordings) for finding in diagnosis.findings)
+    return replace(diagnosis, findings=findings)
+
+
+def _diagnose_with_modes(
+    runs: Sequence[Run], nominal: Device, progress: Progress, excluded: Collection[str]
+) -> Diagnosis:
+    """The diagnosis of prepared recordings, with further modes where they show them."""
     extended = with_driven_modes(runs, nominal)
     diagnosis = _diagnose_runs(runs, extended, progress, excluded)
     if extended is nominal and _leaves_most(diagnosis):
