@@ -55,8 +55,9 @@ def describe_centre_motion(
         if shear > max_pixels:
             lines.append(
                 f"{name}: the position signal follows {other} by the factor {factors[name]:+.2g}, ±{shear:.2g} pixels: "
-                "crosstalk, or a sensor that is rotated against the axes, which the estimator sensor takes for motion, "
-                f"so that the picture is sheared; subtract this factor times the angle of {other} from that of {name}, "
+                f"crosstalk, a sensor that is rotated against the axes, or a mirror that itself follows {other}. If it "
+                "is not the mirror, the estimator sensor takes it for motion and the picture is sheared: "
+                f"subtract this factor times the angle of {other} from that of {name}, "
                 "or use --estimator tracker"
             )
         centre = centre - centre.mean()
