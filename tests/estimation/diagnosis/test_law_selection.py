@@ -142,11 +142,15 @@ def test_a_law_with_inexact_sensitivities_is_compared_where_the_discrepancy_has_
     assert (0,) in compared
 
 
+@pytest.mark.parametrize("takes_bulk", [True, False])
 @pytest.mark.parametrize(("discrepancy", "exchanged"), [(0.0, False), (0.05, True)])
 def test_beside_a_fit_that_leaves_only_noise_corrections_improve_no_rival(
-    discrepancy: float, exchanged: bool, monkeypatch: pytest.MonkeyPatch
+    discrepancy: float, exchanged: bool, takes_bulk: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rival is worse than the present law without corrections, and better with them."""
+    """The rival is worse than the present law without corrections, and better with them.
+
+    Confounders that terms state are compared too where the laws leave more than noise and take the bulk of the misfit.
+    """
     linear = linear_model({"cubic-damping": 1.0}, discrepancy)
     beside = linear.hypothesis((1,), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
     alone = linear.without_discrepancy((1,)).neg2_log_evidence
@@ -160,11 +164,15 @@ def test_beside_a_fit_that_leaves_only_noise_corrections_improve_no_rival(
     monkeypatch.setattr(law_selection, "fit_terms", lambda *arguments: rival)
     monkeypatch.setattr(law_selection, "satisfies_sign_constraints", lambda fit: True)
     monkeypatch.setattr(law_selection, "linear_model", around_rival)
+    monkeypatch.setattr(law_selection._Centre, "takes_bulk", lambda self, nominal: takes_bulk)
+    asked = list[bool]()
+    monkeypatch.setattr(law_selection, "stated_confounders", lambda *arguments: asked.append(True) or {})
     terms = [term.candidate for term in linear.discrepancies]
     likelihood = SimpleNamespace(steps=0)
     centre = law_selection._Centre(likelihood, present, linear, (1,))  # type: ignore[arg-type]
-    best, _ = law_selection._exchange_near_rival(centre, terms, {})
+    best, _ = law_selection._exchange_near_rival(centre, terms, {}, SimpleNamespace())  # type: ignore[arg-type]
     assert (best is rival) is exchanged
+    assert bool(asked) is (takes_bulk and not centre.leaves_noise)
 
 
 @pytest.mark.slow
