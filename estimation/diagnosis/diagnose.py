@@ -13,7 +13,7 @@ from estimation.device_fit.hum import describe_strong_hum
 from estimation.device_fit.open_loop import is_worse, open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, find_effect
-from estimation.diagnosis.held_drive import with_held_drive
+from estimation.diagnosis.held_drive import with_held_drives
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
 from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
@@ -106,8 +106,7 @@ def diagnose(
     nominal = nominal_device(recordings, device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
     diagnosis = _diagnose_with_modes(runs, nominal, progress, excluded)
-    findings = tuple(with_held_drive(finding, recordings) for finding in diagnosis.findings)
-    return replace(diagnosis, findings=findings)
+    return replace(diagnosis, findings=with_held_drives(diagnosis.findings, recordings))
 
 
 def _diagnose_with_modes(

@@ -10,29 +10,35 @@ from estimation.diagnosis.finding import Finding
 from scanner.recording import Recording
 
 DELAYS = ("channel-delay", "drive-lag", "readout-lag")
-"""Effects that a delay of the drive may be named as; for a linear axis all of them commute."""
+"""Effects that a delay of the drive may be named as; for a linear axis all of them commute, and two may share it."""
 
-MAX_DEVIATION = 0.05
-"""Deviation of a delay from half a sample, relative to it, up to which it is that of a held drive: a low-pass and the
-attenuation by holding differ from a pure delay by less from ten samples a period on."""
-
-
-def with_held_drive(finding: Finding, recordings: Sequence[Recording]) -> Finding:
-    """The finding with the advice that a delay of half a sample of the drive calls for."""
-    delay, name = _delay(finding), f"drive_{finding.axis}"
-    halves = {0.5 / recording[name].sample_rate for recording in recordings if name in recording}
-    if delay is None or len(halves) != 1 or abs(delay - (half := halves.pop())) > MAX_DEVIATION * half:
-        return finding
-    text = (
-        f"a converter that holds {name} from one sample to the next delays it by half a sample ({1e6 * half:.3g} µs), "
-        "as found: record its output, or state a start of the channel that is half a sample later"
-    )
-    return replace(finding, advice="; ".join(filter(None, (text, finding.advice))))
+MAX_DEVIATION = 0.1
+"""Deviation of a delay from half a sample, relative to it, up to which it is that of a held drive: with 12 to 100
+samples a period, low-pass filters in its place were 4 % short."""
 
 
-def _delay(finding: Finding) -> float | None:
-    """Delay of a finding [s], of a low-pass that at low frequencies; None for other effects."""
+def with_held_drives(findings: Sequence[Finding], recordings: Sequence[Recording]) -> tuple[Finding, ...]:
+    """The findings, the first delay of an axis with the advice that half a sample of its drive calls for."""
+    found = list(findings)
+    for axis in dict.fromkeys(finding.axis for finding in findings):
+        delays = {i: delay for i, each in enumerate(found) if each.axis == axis and (delay := _delay(each))}
+        name = f"drive_{axis}"
+        halves = {0.5 / recording[name].sample_rate for recording in recordings if name in recording}
+        if len(halves) != 1 or abs(sum(delays.values()) - (half := halves.pop())) > MAX_DEVIATION * half:
+            continue
+        first = found[min(delays)]
+        text = (
+            f"a converter that holds {name} from one sample to the next delays it by half a sample "
+            f"({1e6 * half:.3g} µs), as found: record its output, or state a start of the channel that is half a "
+            "sample later"
+        )
+        found[min(delays)] = replace(first, advice="; ".join(filter(None, (text, first.advice))))
+    return tuple(found)
+
+
+def _delay(finding: Finding) -> float:
+    """Delay of a finding [s], of a low-pass that at low frequencies; 0 for other effects."""
     if finding.effect not in DELAYS:
-        return None
+        return 0.0
     (parameter,) = finding.parameters
     return parameter.value if parameter.unit == "s" else 1.0 / (2.0 * pi * parameter.value)
