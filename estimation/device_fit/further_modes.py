@@ -27,7 +27,7 @@ from scanner.stages import Acceleration, MotionSensor
 from scanner.terms.driven_modes import EFFECT, mode_response
 from scanner.terms.term import MIN_MODE_QUALITY
 
-SEVERAL_MODES = 2
+MIN_FURTHER_MODES = 2
 """Least number of further modes that are stated before laws are selected. A single one is left to ``second-mode``, and
 a direct part of the drive to ``feedthrough``."""
 
@@ -165,7 +165,8 @@ def find_modes(runs: Sequence[Run], axis: Axis, single: bool = False) -> dict[st
         if _power(left) > (1.0 - MIN_GAIN) * _power(residual) or not _is_further(more):
             break
         modes, residual = more, left
-    if len(modes) - 1 < (1 if single else SEVERAL_MODES) or _power(residual) > MAX_RESIDUAL_RATIO**2 * columns.power:
+    fewest, most_left = 1 if single else MIN_FURTHER_MODES, MAX_RESIDUAL_RATIO**2 * columns.power
+    if len(modes) - 1 < fewest or _power(residual) > most_left:
         return None
     heights, readout = _heights(columns, modes)[0], axis.readout
     assert isinstance(readout, MotionSensor)

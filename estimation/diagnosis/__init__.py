@@ -11,7 +11,7 @@ in the order of the computation:
    named laws, else a discrepancy, else nothing.
 4. ``improvement``: the improved device; ``shares``: what each finding explains; ``corrected_parameters``: parameters
    beside a discrepancy; ``identifiability``: detectability of every effect; ``experiment_design``: further
-   measurements; ``free_decay``: what one decay cannot tell apart; ``held_drive``: a delay by half a sample;
+   measurements; ``free_decay``: what a single decay cannot distinguish; ``held_drive``: a delay by half a sample;
    ``localisation``: channel, time and harmonics of a misfit; ``discrepancy_law``: a fitted discrepancy as curve and
    table.
 5. ``finding``: an effect with its evidence and its rivals; ``diagnose``: verdict and findings.

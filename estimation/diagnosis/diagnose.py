@@ -117,10 +117,10 @@ def _diagnose_with_modes(
     diagnosis = _diagnose_runs(runs, extended, progress, excluded)
     if extended is nominal and _leaves_most(diagnosis):
         extended = with_driven_modes(runs, nominal, unexplained=True)
-        beside_modes = _diagnose_runs(runs, extended, progress, excluded) if extended is not nominal else diagnosis
-        if not is_worse(open_loop(runs, beside_modes.device), open_loop(runs, diagnosis.device)):
-            return diagnosis
-        diagnosis = beside_modes
+        if extended is not nominal:
+            without_modes, diagnosis = diagnosis, _diagnose_runs(runs, extended, progress, excluded)
+            if not is_worse(open_loop(runs, diagnosis.device), open_loop(runs, without_modes.device)):
+                return without_modes
     if extended is nominal:
         return diagnosis
     nominal_loops = {name: loop.to_json() for name, loop in open_loop(runs, nominal).items()}

@@ -12,9 +12,9 @@ from scanner.recording import Recording
 DELAYS = ("channel-delay", "drive-lag", "readout-lag")
 """Effects that a delay of the drive may be named as; for a linear axis all of them commute, and two may share it."""
 
-MAX_DEVIATION = 0.1
-"""Deviation of a delay from half a sample, relative to it, up to which it is that of a held drive: with 12 to 100
-samples a period, low-pass filters in its place were 4 % short."""
+MAX_RELATIVE_DEVIATION = 0.1
+"""Deviation of a delay from half a sample, relative to it, up to which it is that of a held drive: at 12 to 100
+samples a period the delay of fitted low-pass filters was 4 % below half a sample."""
 
 
 def with_held_drives(findings: Sequence[Finding], recordings: Sequence[Recording]) -> tuple[Finding, ...]:
@@ -24,7 +24,7 @@ def with_held_drives(findings: Sequence[Finding], recordings: Sequence[Recording
         delays = {i: delay for i, each in enumerate(found) if each.axis == axis and (delay := _delay(each))}
         name = f"drive_{axis}"
         halves = {0.5 / recording[name].sample_rate for recording in recordings if name in recording}
-        if len(halves) != 1 or abs(sum(delays.values()) - (half := halves.pop())) > MAX_DEVIATION * half:
+        if len(halves) != 1 or abs(sum(delays.values()) - (half := halves.pop())) > MAX_RELATIVE_DEVIATION * half:
             continue
         first = found[min(delays)]
         text = (

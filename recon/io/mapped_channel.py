@@ -37,11 +37,11 @@ COUNT_UNITS = ("count", "counts", "cts", "digit", "digits", "lsb", "adu")
 """Names of the unit of raw values of a converter, in lower case."""
 
 MIN_DISTINCT_COUNTS = 17
-"""Distinct whole numbers from which values of type float are taken for counts: more than those of a converter of four
+"""Distinct integers from which floating-point values are classified as counts: more than those of a converter of four
 bits. A square wave of whole volts has two."""
 
 COUNT_SAMPLES = 1 << 16
-"""Samples from the beginning in which whole numbers are looked for."""
+"""Samples at the beginning that are tested for integer values."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def is_scaled(spec: Mapping[str, Any]) -> bool:
 
 
 def describe_counts(request: Request) -> str | None:
-    """A line on whole numbers that are taken for values in the channel's unit, as for volts; None for other values."""
+    """Return a note if integer samples are interpreted in the channel's unit, for example as volts; None otherwise."""
     spec = request.spec
     unit = CHANNEL_UNITS.get(request.name)
     if unit is None or is_scaled(spec) or isinstance(spec["variable"], list):
@@ -158,20 +158,20 @@ def describe_counts(request: Request) -> str | None:
         if (values != np.round(values)).any() or np.unique(values).size < MIN_DISTINCT_COUNTS:
             return None
     return (
-        f"{request.name}: whole numbers from {values.min():.6g} to {values.max():.6g} are taken as {unit}; if they "
-        f"have another unit, state it; if they are counts of a converter, state {unit} per count: "
+        f"{request.name}: integer values from {values.min():.6g} to {values.max():.6g} are interpreted as {unit}; "
+        f"if they have another unit, state it; if they are counts of a converter, state {unit} per count: "
         f"{f'--scale {request.name}=...' if request.stated_in is None else 'scale = ...'}"
     )
 
 
 def describe_times(request: Request) -> str | None:
-    """A line on times whose unit the file does not state; None where it does, or where a rate is stated."""
+    """Return a note if times without a stated unit are interpreted as seconds; None otherwise."""
     name = request.spec.get("time")
     if name is None or _find(request, name).unit is not None:
         return None
     return (
-        f"{name}: no unit is stated for these times, and they are taken as seconds; if they have another unit, state "
-        f"the sample rate in their place"
+        f"{name}: no unit is stated for these times, and they are interpreted as seconds; if they have another unit, "
+        "state the sample rate in their place"
     )
 
 

@@ -88,7 +88,7 @@ def _angles(motion: Motion, name: str) -> Array:
 
 def _crosstalk(motion: Motion, name: str) -> float:
     """Factor by which the measured angle of an axis follows the other one at the frequency of that; 0 where the
-    frequencies are too close to tell.
+    frequencies are too close to separate.
 
     The factor is the in-phase part of the ratio of both phasors, in blocks within which the frequencies hardly drift.
     """

@@ -19,7 +19,7 @@ def describe_range_timing(recording: Recording, beam: Motion, ranges: Channel) -
     """Lines on ranges that contradict the motion; none where they agree or determine nothing.
 
     Args:
-        recording: as it was recorded.
+        recording: with unmodified channels.
         beam: motion whose angles are on the clock of ``ranges``.
         ranges: distance along the beam, shape (n,) [m]; nan where nothing returned.
     """

@@ -1,7 +1,7 @@
 """Gradient of a noisy picture as it is expected from its measured value.
 
 The information of a sample on a displacement is proportional to the square of the gradient ∇f. A measured gradient g
-has noise, whose square would be taken for information: in a scene of a few beads most of it is that of the background.
+has noise, whose square would count as information: in a scene of a few beads most of it is that of the background.
 The score of a displacement, in contrast, has the slope g · ∇f, which is that of the scene alone in the mean. Estimates
 with too much information take too small steps, so that they stop early, and state too small standard deviations.
 

@@ -172,12 +172,12 @@ def _follow(
     while True:
         smoothed = _converge(samples, start, part, shape, width, excluded)
         blocks, shift = len(smoothed.position), smoothed.shift
-        own = [vibration_shift([each], blocks) for each in smoothed.vibrations]
-        failed = [each for each, its in zip(smoothed.vibrations, own, strict=True) if not predicts(shift, shift - its)]
+        vibrations = [(each, vibration_shift([each], blocks)) for each in smoothed.vibrations]
+        failed = [each for each, vibrating in vibrations if not predicts(shift, shift - vibrating)]
         if not failed:
             return smoothed, width
         walk = part_shift(smoothed.position, [])
-        if len(failed) == len(own) and not predicts(walk, np.zeros_like(walk)):
+        if len(failed) == len(vibrations) and not predicts(walk, np.zeros_like(walk)):
             return smoothed, width
         excluded += [each.frequency for each in failed]
         start = smoothed

@@ -36,7 +36,7 @@ def describe_start_shift(
     """A line on the start of a channel that explains the contradictions of both axes, if one does.
 
     Args:
-        recording: with the channel as it was recorded.
+        recording: with the unmodified channel.
         motion: of the mirror.
         found: contradictions of the axes by the channel.
         name: of the channel, "intensity" or "range".

@@ -84,7 +84,7 @@ def test_whole_numbers_taken_as_volts_are_named(
 ) -> None:
     code, out, _ = converted(tmp_path, capsys, "--channel", f"sense_x={variable}", "--unit", "V", *options)
     assert code == 0
-    assert ("sense_x: whole numbers from 548 to 3548 are taken as V" in out) == warned
+    assert ("sense_x: integer values from 548 to 3548 are interpreted as V" in out) == warned
     if options:
         with Recording.open(tmp_path / "out.h5") as recording:
             assert recording["sense_x"].read() == pytest.approx((COUNTS - 2048.0) / 1000.0)
@@ -95,9 +95,12 @@ def test_times_without_a_unit_are_named_once(tmp_path: Path, capsys: pytest.Capt
     channels = ["--channel", "sense_x=x", "--channel", "sense_y=y", "--unit", "V"]
     given = ["convert", str(tmp_path / "a.npz"), *channels, "-o", str(tmp_path / "a.h5")]
     assert main([*given, "--time", "time_us"]) == 0
-    assert capsys.readouterr().out.count("time_us: no unit is stated for these times, and they are taken as sec") == 1
+    assert (
+        capsys.readouterr().out.count("time_us: no unit is stated for these times, and they are interpreted as sec")
+        == 1
+    )
     assert main([*given, "--rate", "1e6"]) == 0
-    assert "taken as seconds" not in capsys.readouterr().out
+    assert "interpreted as seconds" not in capsys.readouterr().out
 
 
 def test_messages_name_the_options_that_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
