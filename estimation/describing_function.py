@@ -87,7 +87,7 @@ def describing_function(
     result = DescribingFunction(
         float(torque[1].imag / amplitude), float(-torque[1].real / (amplitude * rate)), harmonics
     )
-    coupled = [active for active in terms if active.term.coupled]
+    coupled = [active for active in terms if active.term.couples_motions]
     for other, other_motion in motion.axes.items():
         other_rate = 2 * np.pi * float(np.median(other_motion.frequency))
         if other == name or not coupled or abs(other_rate / rate - 1.0) <= DEGENERATE_FREQUENCY_RATIO:

@@ -182,14 +182,17 @@ def with_outputs(
 
 
 def _invert(law: Callable[[Array], Array], values: Array) -> Array | None:
-    """The signal that ``law`` maps to ``values``, sample by sample by Newton's method; None where samples are lost."""
+    """The signal that ``law`` maps to ``values``, sample by sample by Newton's method.
+
+    None where samples are lost, or where the law is NaN because it depends on the motion.
+    """
     signal, step = values, SLOPE_STEP * float(np.nanstd(values))
     for _ in range(NEWTON_ITERATIONS):
         mapped = law(signal)
         slope = (law(signal + step) - mapped) / step
         signal = signal + (values - mapped) / np.where(np.abs(slope) > MIN_SLOPE, slope, 1.0)
-    lost = (np.abs(law(signal) - values) > MAX_INVERSION_ERROR * step) | (slope < MIN_SLOPE)
-    return None if lost[np.isfinite(values)].any() else signal
+    kept = (np.abs(law(signal) - values) <= MAX_INVERSION_ERROR * step) & (slope >= MIN_SLOPE)
+    return signal if kept[np.isfinite(values)].all() else None
 
 
 def measured_channels(recording: Recording, bare: Device) -> list[tuple[str, str, list[str]]]:

@@ -44,7 +44,7 @@ from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
-from scanner.forward_model import reference_signal, sense_signal
+from scanner.forward_model import AxisTrajectory, beside_each_other, reference_signal, sense_signal
 from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
 
@@ -185,13 +185,14 @@ def _signals(
     for key, kind, axes in measured_channels(recording, bare):
         channel = recording[key]
         angles = _angles_at_samples(channel, motion)
-        nominal, complete = [], []
-        for name in axes:
+        motions: tuple[dict[str, AxisTrajectory], dict[str, AxisTrajectory]] = {}, {}
+        for name in angles:
             drive = drive_input(recording.channels.get(f"drive_{name}"), recording, channel)
             axis = bare.sensed_axis(name)
             with_terms = add_term_motion(angles, channel.sample_rate, motion, functions, name)
-            nominal.append(trajectory(axis, (), drive, angles[name]))
-            complete.append(trajectory(axis, tuple(terms[name]), drive, with_terms))
+            motions[0][name] = trajectory(axis, (), drive, angles[name])
+            motions[1][name] = trajectory(axis, tuple(terms[name]), drive, with_terms)
+        nominal, complete = ([beside_each_other(each)[name] for name in axes] for each in motions)
         if kind == "angle":
             without, full = reference_signal(nominal[0]), reference_signal(complete[0])
         else:

@@ -121,7 +121,7 @@ def simulate_motion(
         BadInput: the motion grows without limit.
     """
     terms = {name: stated_terms(axis) for name, axis in axes.items()}
-    coupled = any(each.term.coupled for added in terms.values() for each in added)
+    coupled = any(each.term.couples_motions for added in terms.values() for each in added)
     state = {name: (each.angle, each.rate) for name, each in start.items()}
     for t0, t1 in pairwise(edges):
         drifts = {name: drift_terms(drift, t0, t1) for name, drift in plan.drift.items()}

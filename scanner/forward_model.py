@@ -65,6 +65,7 @@ class AxisTrajectory:
         drive: as recorded, before the drive terms.
         angle, rate: shape (n + 1,) [rad, rad/s].
         voltage: on the actuator, after the drive terms, shape (n + 1,) [V].
+        other: the motion of the other axis; None where it is unknown.
     """
 
     axis: Axis
@@ -73,6 +74,7 @@ class AxisTrajectory:
     angle: Array
     rate: Array
     voltage: Array
+    other: AxisTrajectory | None = None
 
     def derivative(self, order: int) -> Array:
         """Return the angle [rad], its rate [rad/s] or its acceleration [rad/s2] (``order`` 0, 1, 2), shape (n + 1,)."""
@@ -84,7 +86,12 @@ class AxisTrajectory:
         """Return the trajectory from step ``first`` on."""
         drive = replace(self.drive, voltage=self.drive.voltage[first:], t0=self.drive.t0 + first * self.drive.step)
         return replace(
-            self, drive=drive, angle=self.angle[first:], rate=self.rate[first:], voltage=self.voltage[first:]
+            self,
+            drive=drive,
+            angle=self.angle[first:],
+            rate=self.rate[first:],
+            voltage=self.voltage[first:],
+            other=None if self.other is None else self.other.from_step(first),
         )
 
     def joined_with(self, later: AxisTrajectory) -> AxisTrajectory:
@@ -95,6 +102,7 @@ class AxisTrajectory:
             angle=np.concatenate([self.angle[:-1], later.angle]),
             rate=np.concatenate([self.rate[:-1], later.rate]),
             voltage=np.concatenate([self.voltage[:-1], later.voltage]),
+            other=None if self.other is None or later.other is None else self.other.joined_with(later.other),
         )
 
 
@@ -182,7 +190,7 @@ def simulate_coupled(
     Args:
         drives: by axis name.
         starts: angle [rad] and rate [rad/s] at the first sample, by axis name.
-        coupled: whether a term depends on the angle of the other axis.
+        coupled: whether the torque of a term depends on the angle of the other axis.
         simulate: simulates one axis.
     """
     motions = {name: simulate(name, drives[name], starts[name], None) for name in drives}
@@ -191,7 +199,15 @@ def simulate_coupled(
         for name in drives:
             (other,) = (motion for other_name, motion in previous.items() if other_name != name)
             motions[name] = simulate(name, drives[name], starts[name], _angle_at_nodes(other))
-    return motions
+    return beside_each_other(motions)
+
+
+def beside_each_other(motions: Mapping[str, AxisTrajectory]) -> dict[str, AxisTrajectory]:
+    """Return the motions, by axis name, each with that of the other axis as ``other``."""
+    return {
+        name: replace(motion, other=next((each for other, each in motions.items() if other != name), None))
+        for name, motion in motions.items()
+    }
 
 
 def _angle_at_nodes(motion: AxisTrajectory) -> Array:
@@ -228,6 +244,11 @@ def sense_signal(readout: Readout, motions: Sequence[AxisTrajectory], background
         background: as in :func:`apply_channel_terms`.
     """
     readout = effective_readout(readout, motions)
+    return apply_channel_terms("sense", _before_channel_terms(readout, motions), motions, readout, background)
+
+
+def _before_channel_terms(readout: Readout, motions: Sequence[AxisTrajectory]) -> Array:
+    """The signal of a readout before the terms that act on its channel, shape (n + 1,) [V]."""
     match readout:
         case Amdm():
             signal = sum(map(_capacitance, motions[1:]), start=_capacitance(motions[0]))
@@ -248,7 +269,7 @@ def sense_signal(readout: Readout, motions: Sequence[AxisTrajectory], background
                 for motion in motions
             ]
             signal = sum(currents[1:], start=currents[0])
-    return apply_channel_terms("sense", signal, motions, readout, background)
+    return signal
 
 
 def effective_readout(readout: Readout, motions: Sequence[AxisTrajectory]) -> Readout:
@@ -292,10 +313,22 @@ def apply_channel_terms(
         for active, motion in pairs:
             if active.term.after_noise is after_noise:
                 variant = active.channel.partition(":")[2]
-                signal = active.term.apply(signal, active.values, _signal_context(motion, readout, variant))
+                context = _signal_context(motion, readout, variant)
+                if active.term.coupled:
+                    context = replace(context, other=_same_channel(channel, motion.other, motion.angle.size))
+                signal = active.term.apply(signal, active.values, context)
         if not after_noise:
             signal = signal + background
     return signal
+
+
+def _same_channel(channel: str, motion: AxisTrajectory | None, size: int) -> Array:
+    """The channel of the same kind of another axis, without its terms, shape (size,); NaN where it is unknown."""
+    if motion is None or (channel == "sense" and motion.axis.readout is None):
+        return np.full(size, np.nan)
+    if channel == "sense":
+        return _before_channel_terms(effective_readout(motion.axis.require_readout(), [motion]), [motion])
+    return motion.derivative(REFERENCE_ORDERS[channel])
 
 
 def _capacitance(motion: AxisTrajectory) -> Array:

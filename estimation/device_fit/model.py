@@ -243,7 +243,7 @@ class Model:
             return self._trajectories.trajectory(MotionRequest(r, axes[name], added[name], start, inputs))
 
         inputs = {name: _truncate(drive, stop) for name, drive in run.inputs.items()}
-        coupled = any(drive.term.coupled for terms in added.values() for drive in terms)
+        coupled = any(drive.term.couples_motions for terms in added.values() for drive in terms)
         starts = {name: self.start(name, r, x) for name in run.inputs}
         return simulate_coupled(inputs, starts, coupled, simulate)
 

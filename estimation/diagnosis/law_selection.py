@@ -98,10 +98,13 @@ class _Centre:
         """Whether corrections beside the laws of the fit gain no more than a law has to."""
         return self.alone.neg2_log_evidence - self.beside.neg2_log_evidence <= DETECTION_THRESHOLD
 
+    def without_laws(self, nominal: Fit) -> Fit:
+        """The fit of the nominal device under the likelihood of the centre."""
+        return fit_model(self.likelihood, nominal.model, nominal.x)
+
     def takes_bulk(self, nominal: Fit) -> bool:
         """Whether the laws of the fit take the bulk of the misfit of the nominal device."""
-        before = fit_model(self.likelihood, nominal.model, nominal.x)
-        explained = misfit(before) - misfit(self.fit)
+        explained = misfit(self.without_laws(nominal)) - misfit(self.fit)
         return need_of_laws(self.linear, self.laws, explained, alone=np.inf).takes_bulk
 
     def is_followed_by(self, other: Fit) -> bool:
@@ -123,7 +126,7 @@ def choose_laws(
     end, compared = _iterate_selection(anchor, nominal, candidates, progress)
     if end is None:
         return None
-    before = fit_model(end.likelihood, nominal.model, nominal.x)
+    before = end.without_laws(nominal)
     alone = end.linear.hypothesis(()).neg2_log_evidence
     if any(map(is_discrepancy, anchor.model.candidates)):
         around = fit_model(end.likelihood, anchor.model, anchor.x)
@@ -158,7 +161,10 @@ def _iterate_selection(
         progress("beside a discrepancy: " + " or ".join(map(linear.describe, proposed)))
         options = {linear.effects(laws): laws for laws in proposed if laws}
         if not options:
-            break
+            if not present or needed == present or not _is_needed(centre, centre.without_laws(nominal)):
+                break
+            needed, start = present, centre.fit
+            continue
         if list(options) == [present]:
             exchanged, near = _exchange_near_rival(centre, candidates, fitted, nominal)
             compared.append(near)

@@ -20,7 +20,10 @@ TERM = Term(
     equation="J θ'' + b θ' + k θ + κ θ_other = τ",
     parameters=(Parameter("kappa", "N m/rad", lambda s: 0.01 * s.k),),
     source="Urey, Wine & Osborn, Proc. SPIE 4178, 176 (2000)",
-    confounders={"second-mode": "a mode has its own frequency, not that of the other axis: record the other axis"},
+    confounders={
+        "second-mode": "a mode has its own frequency, not that of the other axis: record the other axis",
+        "sensor-crosstalk": "crosstalk of the sensor has no resonance: drive the other axis at this one's resonance",
+    },
     applies=lambda axis, scales: scales.two_axes,
     torque=torque,
     coupled=True,

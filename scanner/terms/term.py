@@ -143,6 +143,8 @@ class SignalContext:
         raw_voltage: drive at the samples as recorded, shape (n,) [V].
         theta, rate: motion of the mirror, shape (n,) [rad, rad/s].
         variant: the text after the colon in the name of the term's channel, as in ``"sense:signal"``.
+        other: the channel of the same kind of the other axis, without that axis's terms, shape (n,); only for a
+            ``coupled`` term, NaN where the other axis is unknown.
     """
 
     time: Array
@@ -153,6 +155,7 @@ class SignalContext:
     theta: Array
     rate: Array
     variant: str = ""
+    other: Array = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,7 @@ class Term:
             themselves; no fit searches them.
         after_noise: whether ``output`` acts on the sum of signal and noise, as the converter does.
         per_axis: on an electrode that all combs share, whether each axis may have the effect separately.
-        coupled: whether ``torque`` depends on the angle of the other axis.
+        coupled: whether ``torque`` or ``output`` depends on the motion of the other axis.
     """
 
     effect: str
@@ -208,6 +211,11 @@ class Term:
     def variants(self) -> tuple[str, ...]:
         """The kinds of channel among which ``variant`` of a device file selects, in its order."""
         return (*self.channels, *self.stated_channels)
+
+    @property
+    def couples_motions(self) -> bool:
+        """Whether the motion itself depends on that of the other axis."""
+        return self.coupled and self.torque is not None
 
     @property
     def acts_on_channel(self) -> bool:
