@@ -12,7 +12,7 @@ from estimation.device_fit.further_modes import describe_modes, with_driven_mode
 from estimation.device_fit.hum import describe_strong_hum
 from estimation.device_fit.open_loop import is_worse, open_loop
 from estimation.diagnosis.corrected_parameters import correct_parameters
-from estimation.diagnosis.finding import METRIC, Finding, find_effect
+from estimation.diagnosis.finding import METRIC, Finding, beside_imperfections, find_effect
 from estimation.diagnosis.held_drive import with_held_drives
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
@@ -170,7 +170,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
     findings = map_fits(
         lambda step: find_effect(result, step, correction, corrected), result.steps, result.likelihood.steps
     )
-    findings.sort(key=lambda finding: -(finding.share or 0.0))
+    findings = beside_imperfections(findings, [bool(step.candidate.term.free_parameters) for step in result.steps])
     tension = None if findings else _prior_tension_finding(result.final)
     if tension is not None:
         findings.append(tension)

@@ -25,8 +25,8 @@ MAX_NOISE_RATIO = 10.0
 """Noise over the stated one up to which a residual that is visible in a plot may be noise. Flicker noise, hum or a data
 sheet account for some times the stated noise; the residual of a broad drive may resemble noise at any size."""
 
-MIN_REMAINDER_SHARE = 1e-3
-"""Share of the misfit below which no remainder is stated: held-out samples scatter by as much."""
+MIN_SHARE = 1e-3
+"""Smallest share of the misfit that is determined, and stated as a remainder: held-out samples scatter by as much."""
 
 
 def explained_share(without: float, complete: float, nominal: float, noise: float) -> float:
@@ -128,7 +128,7 @@ def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dic
         explained = max(misfit(result.nominal) - misfit(result.final), 0.0)
         left = correction.predicted_gain if correction else 0.0
         share = left / max(explained + left, 1e-300)
-    if share < MIN_REMAINDER_SHARE:
+    if share < MIN_SHARE:
         return None
     return {"share": share, "stage": correction.candidate.term.stage if correction else "readout", "channel": name}
 

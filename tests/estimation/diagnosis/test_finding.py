@@ -8,7 +8,7 @@ import pytest
 
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import finding
-from estimation.diagnosis.finding import _advice, find_probabilities, parameter_estimates
+from estimation.diagnosis.finding import _advice, beside_imperfections, find_probabilities, parameter_estimates
 from scanner.terms import catalogue
 
 
@@ -43,6 +43,32 @@ def test_what_is_certain_without_a_fit_stays_certain_beside_a_remainder() -> Non
     clipped = step("saturation")
     clipped.candidate.term.free_parameters = ()
     assert find_probabilities(clipped, 9900.0) == {"saturation": 1.0}
+
+
+def found(effect: str, share: float, *rivals: finding.Rival) -> finding.Finding:
+    """A finding that is certain but for its rivals."""
+    left = 1.0 - sum(rival.probability for rival in rivals)
+    return finding.Finding("x", "mechanics", effect, "", (), "", left, rivals, {}, "sense", "", share)
+
+
+def test_a_further_law_of_a_small_share_may_be_an_imperfection() -> None:
+    findings = [
+        found("sensor-cubic", 0.024, finding.Rival("profile-shape", 0.2), finding.Rival("unknown", 0.1)),
+        found("cubic-stiffness", 0.8),
+    ]
+    largest, small = beside_imperfections(findings, [True, True])
+    assert (largest.probability, largest.rivals) == (1.0, ())
+    assert small.probability == pytest.approx(0.9 * 0.7, rel=1e-2)
+    rivals = {rival.effect: rival.probability for rival in small.rivals}
+    assert rivals == {"unknown": pytest.approx(0.19, rel=2e-2), "profile-shape": pytest.approx(0.18, rel=1e-2)}
+    assert small.probability + sum(rivals.values()) == pytest.approx(1.0)
+
+
+def test_a_further_law_without_a_share_is_improbable_and_what_samples_show_is_certain() -> None:
+    findings = [found("cubic-stiffness", 0.9), found("gain-drift", 0.0), found("saturation", 0.0)]
+    _, drift, clipped = beside_imperfections(findings, [True, True, False])
+    assert drift.probability == pytest.approx(1.0 - drift.rivals[0].probability) == pytest.approx(0.25, rel=1e-2)
+    assert clipped.probability == 1.0
 
 
 def test_a_rival_on_both_axes_gets_its_advice_once() -> None:
