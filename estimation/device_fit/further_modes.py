@@ -44,7 +44,7 @@ DRIVEN_POWER = 0.01
 """Power of the drive relative to its median in the driven band above which a frequency belongs to that band."""
 
 MIN_BAND_OCTAVES = 1.0
-"""Width of the drive's band that further modes need to be told from a single one."""
+"""Width of the drive's band that further modes need to be distinguished from a single one."""
 
 OWN_WIDTHS = 2.0
 """Distance of a further mode from the mirror's own one in half-power widths of that. A nonlinear mode seems split."""

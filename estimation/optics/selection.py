@@ -89,7 +89,7 @@ class OpticsDiagnosis:
     def to_json(self) -> list[dict[str, object]]:
         """Which effects this recording could show, for diagnosis.json."""
         return [
-            {"effect": v.effect, "axis": v.axis, "sigma": v.sigma, "told": v.sigma >= DISCRIMINATION_SIGMA}
+            {"effect": v.effect, "axis": v.axis, "sigma": v.sigma, "detectable": v.sigma >= DISCRIMINATION_SIGMA}
             for v in self.detectability
         ]
 

@@ -6,7 +6,7 @@ motion has none. The curve is estimated from the latter: the samples are compare
 and everything that the harmonics of an axis explain is projected out of both the difference and the curve. So its
 estimate hardly depends on the track's amplitude. The channel is then straightened, and the track computed again.
 
-The curve is a linear spline of the signal whose slope is zero in the middle: a gain cannot be told apart from the gain
+The curve is a linear spline of the signal whose slope is zero in the middle: a gain cannot be distinguished from that
 of the readout. It is used if curves from one half of the blocks explain the other half.
 """
 

@@ -25,7 +25,7 @@ BLOCK_S = 0.5
 """Time over which frequency, amplitudes and phases of hum are taken to be constant [s]."""
 
 MIN_CYCLES = 2.0
-"""Cycles of the mains from which its harmonics are told from a slow motion: they differ by two frequency bins."""
+"""Cycles of the mains from which its harmonics are distinguished from a slow motion: two frequency bins apart."""
 
 SAMPLES_PER_CYCLE = 8
 """Samples per cycle of the highest harmonic from which hum is fitted; further ones are averaged."""

@@ -232,7 +232,7 @@ def _judgement(difference: float) -> str:
 
 def _optics_section(table: Mapping[str, Any]) -> Section:
     rows = [
-        [f"{e['effect']}, axis {e['axis']}", f"{e['sigma']:.1f}", "detectable" if e["told"] else "not detectable here"]
+        [f"{e['effect']}, axis {e['axis']}", f"{e['sigma']:.1f}", ("" if e["detectable"] else "not ") + "detectable"]
         for e in table["effects"]
     ]
     text = (

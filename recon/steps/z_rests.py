@@ -39,7 +39,7 @@ SINE_SWING = 2.0**0.5
 from the block, and those of the noise do not count."""
 
 MIN_NOISE_SAMPLES = 32
-"""Samples of z from which noise is told from movement by successive differences: their ratio is then 2 ± 0.35."""
+"""Samples of z from which successive differences distinguish noise from movement: their ratio is then 2 ± 0.35."""
 
 BAND_WIDTHS = 2.0 ** -np.arange(24.0, 0.5, -0.5)
 """Widths of the band that are tried, in travels of z: from a step of a converter of 24 bits to half the travel."""

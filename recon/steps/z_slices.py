@@ -20,7 +20,7 @@ MAX_TRAVEL_M = 0.1
 """Travel of z above which a note asks for its unit: stages of microscopes travel some centimetres at most [m]."""
 
 MIN_BLOCKS_OF_SLICE = 16
-"""Blocks of z from which a variation within a slice is told from noise, and parts of a slice that are compared: for
+"""Blocks of z from which a variation within a slice is distinguished from noise, and parts that are compared: for
 white noise the variance of their differences is then 2 ± 0.5 times that of their means."""
 
 

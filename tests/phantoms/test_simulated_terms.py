@@ -98,8 +98,8 @@ def test_simulation_agrees_with_the_forward_model(effect: str) -> None:
         effect == "cross-axis-coupling",
         lambda name, inputs, start, other: simulate_axis(axes[name], stated_terms(axes[name]), inputs, start, other),
     )
-    told, shown = sense_signal(device.readout, list(paths.values()))[:-1:4], recorded(device)["sense"]
-    assert np.abs(told - shown)[50:].max() < 2e-4 * np.ptp(shown)
+    direct, shown = sense_signal(device.readout, list(paths.values()))[:-1:4], recorded(device)["sense"]
+    assert np.abs(direct - shown)[50:].max() < 2e-4 * np.ptp(shown)
 
 
 def test_term_of_one_axis_does_not_change_the_comb_of_the_other() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from scanner.arrays import Array
 
 MIN_COMMON_SLICES = 3
-"""Slices from which a shift that all have in common is told from the noise of each, whose variance is estimated too."""
+"""Slices from which a common shift is distinguished from the noise of each, whose variance is estimated too."""
 
 
 def common_shift_factor(coarse: tuple[Array, Array], fine: tuple[Array, Array]) -> Array:

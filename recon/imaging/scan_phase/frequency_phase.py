@@ -111,7 +111,7 @@ def phases_from_picture(
     axes = {name: axis.negated() if flips.get(name, False) else axis for name, axis in axes.items()}
     if not any(measured.values()):
         raise _search_failure(references, found, slices, intensity)
-    info = {"picture": {"rounds": rounds, "slices": len(errors), "told": measured}}
+    info = {"picture": {"rounds": rounds, "slices": len(errors), "determined": measured}}
     return replace(motion, axes=axes, info={**motion.info, **info}), [
         *_notes(measured, len(errors)),
         *_describe_unused_mechanics(recording, device),

@@ -117,7 +117,7 @@ def refine_motion(
         smoothed_with = ways if chosen is improved else smoothed_with
         before, motion, rounds = motion, chosen, rounds + 1
     measured = {name: int(np.isfinite(phases[name].sd).sum()) for name in refined}
-    info = {"rounds": rounds, "slices": len(errors), "told": measured, "smoothed_with": smoothed_with}
+    info = {"rounds": rounds, "slices": len(errors), "determined": measured, "smoothed_with": smoothed_with}
     notes = [_note(name, measured[name], len(errors), smoothed_with[name] != motion.estimator) for name in refined]
     return replace(motion, info={**motion.info, "picture": info}), [*response_notes, *notes]
 

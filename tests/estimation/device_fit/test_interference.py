@@ -1,4 +1,4 @@
-"""A tone in the residual is told from the lines of the drive and from a resonance of the amplifier."""
+"""A tone in the residual is distinguished from the lines of the drive and from a resonance of the amplifier."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def scan(
 def test_a_scan_without_effects_is_consistent() -> None:
     diagnosis = diagnose_with_optics([scan()])
     assert diagnosis.verdict == "consistent"
-    detectable = {(effect["effect"], effect["axis"]): effect["told"] for effect in diagnosis.optics[0]["effects"]}
+    detectable = {(effect["effect"], effect["axis"]): effect["detectable"] for effect in diagnosis.optics[0]["effects"]}
     assert detectable["intensity-delay", "x"]
     assert not detectable["field-distortion", "x"]
 
@@ -178,7 +178,7 @@ def test_effects_on_a_sample_without_features_are_reported_as_not_detectable() -
         [Recording.from_arrays({**channels, "intensity": (blank, "V", SAMPLE_RATE_HZ, 0.0)}, DEVICE)]
     )
     assert diagnosis.verdict == "consistent"
-    assert not any(effect["told"] for effect in diagnosis.optics[0]["effects"] if effect["effect"] != "bleaching")
+    assert not any(effect["detectable"] for effect in diagnosis.optics[0]["effects"] if effect["effect"] != "bleaching")
 
 
 def test_the_improved_device_restores_the_picture() -> None:
@@ -191,7 +191,7 @@ def test_the_improved_device_restores_the_picture() -> None:
         == {"intensity-delay", "bleaching"}
         == set(device.axis("x").terms)
     )
-    assert "not detectable here" in diagnosis_report(diagnosis, ["scan"])[1]
+    assert "not detectable" in diagnosis_report(diagnosis, ["scan"])[1]
     assert intensity_delay(device, 1 / SAMPLE_RATE_HZ) == pytest.approx(2e-6, rel=0.1)
 
     grid = Grid(80, 80, HALF_ANGLE_RAD, HALF_ANGLE_RAD)

@@ -155,7 +155,7 @@ def test_a_featureless_sample_is_reported_to_determine_no_phase() -> None:
     recording, _ = scan()
     grey = np.random.default_rng(0).poisson(500.0, recording["intensity"].size).astype(float)
     result = reconstruct(without(recording, "sense", intensity=grey), Options(pixels=(200, 200)), quiet=True)
-    assert result.motion.info["picture"]["told"] == {"x": 0, "y": 0}
+    assert result.motion.info["picture"]["determined"] == {"x": 0, "y": 0}
     assert sum("shows nothing of the phase" in note for note in result.notes) == 2
     for axis in result.motion.axes.values():
         assert np.rad2deg(axis.phase_sd.min()) > 3.0
@@ -172,7 +172,7 @@ def test_bars_determine_only_the_phase_across_them() -> None:
         field, field.device, track_drive_only(field, field.device), field["intensity"], GRID, {}
     )
     assert rmse(motion, truth)["x"] < 0.15
-    assert motion.info["picture"]["told"]["y"] == 0  # type: ignore[index]
+    assert motion.info["picture"]["determined"]["y"] == 0  # type: ignore[index]
     assert any("nothing of the phase of y" in note for note in notes)
 
 
