@@ -194,9 +194,10 @@ def test_readout_gain_drifts_from_the_start_of_the_recording() -> None:
     inputs = DriveInput(np.zeros((1000, 3)), STEP, t0=0.5)
     path = simulate_axis(LINEAR, [], inputs, (0.1, 0.0))
     plain = sense_signal(LINEAR.readout, [path])
-    drifting = ActiveTerm(catalogue()["gain-drift"], (0.1, 1.0))
-    drifted = sense_signal(LINEAR.readout, [replace(path, active_terms=(drifting,))])
-    np.testing.assert_allclose(drifted, plain * (1 + 0.1 * inputs.time))
+    for duration, gain in ((1.0, 1 + 0.1 * inputs.time), (0.25, 1.1)):
+        drifting = ActiveTerm(catalogue()["gain-drift"], (0.1, duration))
+        drifted = sense_signal(LINEAR.readout, [replace(path, active_terms=(drifting,))])
+        np.testing.assert_allclose(drifted, plain * gain)
 
 
 def test_every_term_has_no_effect_at_zero_and_a_description() -> None:
