@@ -107,10 +107,18 @@ def _effect(term: Term) -> str:
     lines = [
         f"### {term.effect}",
         f'<p class="equation"><i>{set_equation(term.equation)}</i></p>',
-        f"Parameters: {units}. Source: {term.source}.",
+        f"Parameters: {units}{_variants(term)}. Source: {term.source}.",
         *(f"- Confounder [{other}](#{other}): {apart}." for other, apart in term.confounders.items()),
     ]
     return "\n\n".join(lines[:3]) + "\n\n" + "\n".join(lines[3:])
+
+
+def _variants(term: Term) -> str:
+    """Which channel ``variant`` selects, for a term that may act on several."""
+    if len(term.variants) < 2:
+        return ""
+    channels = ", ".join(f"{i} `{channel}`" for i, channel in enumerate(term.variants))
+    return f"; `variant` selects the channel, 0 unless stated: {channels}"
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:

@@ -34,8 +34,7 @@ def describe_centre_motion(
 
     A mirror at resonance moves about its rest position, which only a slow torque displaces: what a recorded drive does
     not cause is an error of the sensor, and the estimator ``sensor`` maps it. What follows the other axis is crosstalk.
-    An axis without a recorded drive, or
-    whose device states no mechanics, is not checked.
+    An axis without a recorded drive, or whose device states no mechanics, is not checked.
 
     Args:
         recording, device: of the scan.
@@ -56,9 +55,9 @@ def describe_centre_motion(
             lines.append(
                 f"{name}: the position signal follows {other} by the factor {factors[name]:+.2g}, ±{shear:.2g} pixels: "
                 f"crosstalk, a sensor that is rotated against the axes, or a mirror that itself follows {other}. If it "
-                "is not the mirror, the estimator sensor takes it for motion and the picture is sheared: "
-                f"subtract this factor times the angle of {other} from that of {name}, "
-                "or use --estimator tracker"
+                "is not the mirror, the estimator sensor maps it as motion and the picture is sheared: "
+                f"state it under [{name}.terms.sensor-crosstalk] in the device, as diagnose measures it, or use "
+                "--estimator tracker"
             )
         centre = centre - centre.mean()
         variance = max(float(centre.var()) - noise_sd**2, 0.0)
@@ -69,7 +68,7 @@ def describe_centre_motion(
         frequency = float(np.argmax(spectrum) / (centre.size * np.mean(np.diff(time))))
         lines.append(
             f"{name}: the centre of the motion moves by ±{amplitude:.2g} pixels, most at {frequency:.3g} Hz, which its "
-            "drive does not cause: hum or drift of the sensor, which the estimator sensor takes for motion, so that "
+            "drive does not cause: hum or drift of the sensor, which the estimator sensor maps as motion, so that "
             "the picture is distorted; remove the hum, or use --estimator tracker"
         )
     return lines

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,9 @@ DEVICE = Device.from_toml(new_device("electromagnetic", {"x": KnownAxis(2000.0),
 
 
 def scan(
-    hum_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5, crosstalk: tuple[float, float] = (0.0, 0.0)
-) -> list[str]:
+    hum_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5,
+    crosstalk: tuple[float, float] = (0.0, 0.0), device: Device = DEVICE,
+) -> list[str]:  # fmt: skip
     """Limits of a scan from rest, of amplitudes that fill the field; hum in the sensor and a slow drive are in x.
 
     The sensors of x and y hold ``crosstalk`` times the other angle.
@@ -54,7 +56,7 @@ def scan(
         values, *about = channels[f"angle_{name}"]
         channels[f"angle_{name}"] = (values + factor * half_angle * other, *about)
     light = 1.0 + 0.5 * np.sin(9.0 * x + 2.0) * np.cos(7.0 * y) + 0.3 * x
-    recording = Recording.from_arrays({**channels, "intensity": (rng.poisson(500 * light) / 500, "V", RATE_HZ)}, DEVICE)
+    recording = Recording.from_arrays({**channels, "intensity": (rng.poisson(500 * light) / 500, "V", RATE_HZ)}, device)
     return reconstruct(recording, Options(estimator="sensor", pixels=(80, 80), allow_outside=True), quiet=True).limits
 
 
@@ -73,6 +75,12 @@ def test_crosstalk_of_the_other_axis_is_no_hum(crosstalk: tuple[float, float], n
     assert stated is not None
     assert float(stated[1]) == pytest.approx(sum(crosstalk), abs=1e-3)
     assert float(stated[2]) == pytest.approx(2.0, abs=0.25)  # the amplitude still grows
+
+
+def test_crosstalk_that_the_device_states_is_subtracted() -> None:
+    terms = {"sensor-crosstalk": {"c": 0.05, "variant": 1}}
+    stated = replace(DEVICE, axes=dict(DEVICE.axes) | {"x": replace(DEVICE.axis("x"), terms=terms)})
+    assert not any("follows" in line for line in scan(crosstalk=(0.05, 0.0), device=stated))
 
 
 def test_crosstalk_and_hum_are_stated_both() -> None:
