@@ -71,3 +71,14 @@ def test_crosstalk_of_the_sensor_and_coupling_of_the_mirror_are_named(effect: st
     (parameter,) = finding.parameters
     low, high = parameter.ci95
     assert low < size[parameter.name] < high
+
+
+def test_a_sensor_that_is_rotated_against_the_axes_has_crosstalk_in_both() -> None:
+    size = {"x": 0.035, "y": -0.035}
+    rotated = {name: replace(TEMPLATE.axis(name), terms={"sensor-crosstalk": {"c": c}}) for name, c in size.items()}
+    recording, _ = simulate(replace(TEMPLATE, axes=rotated), PLAN, seed=9, nominal=TEMPLATE)
+    others = [name for name in catalogue() if name not in COMPARED]
+    findings = diagnose([without_angles(recording)], excluded=others).findings
+    assert {(finding.effect, finding.axis) for finding in findings} == {("sensor-crosstalk", name) for name in "xy"}
+    for finding in findings:
+        assert finding.parameters[0].value == pytest.approx(size[finding.axis], rel=0.01)
