@@ -105,7 +105,7 @@ def _finding_section(finding: Finding, index: int, search: SelectionResult | Non
     for rival in finding.rivals:
         distance = "" if rival.distance is None else f"; differs from it by {rival.distance:.1f} σ at most"
         probability = f"probability {format_probability(rival.probability)}" if rival.probability > 1e-4 else ""
-        rows.append([f"alternative: {rival.effect}", (probability or "fits as well, with more parameters") + distance])
+        rows.append([f"alternative: {rival.effect}", (probability or "not excluded by this recording") + distance])
     figures = [measured_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []
     if search is not None:
         figures += _effect_figures(finding, search)

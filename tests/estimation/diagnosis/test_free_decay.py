@@ -39,7 +39,9 @@ def listed(*recordings: Recording, effect: str = "cubic-damping", device: Device
 def test_one_decay_of_a_sensor_of_motion_does_not_exclude_changes_in_time() -> None:
     assert listed(decay(0.2)) == ("gain-drift", "damping-drift")
     assert listed(decay(0.2), effect="damping-drift") == ("gain-drift", "cubic-damping")
-    assert listed(decay(0.2), effect="cubic-stiffness") == ()
+    assert listed(decay(0.2), effect="cubic-stiffness") == ("resonance-drift",)
+    assert listed(decay(0.2), effect="resonance-drift") == ("cubic-stiffness",)
+    assert listed(decay(0.2), effect="sensor-cubic") == ()
 
 
 def test_an_angle_channel_excludes_a_gain_that_drifts() -> None:
