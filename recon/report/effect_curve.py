@@ -133,18 +133,16 @@ def _state_curve(
     fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], run_index: int, bins: int
 ) -> EffectCurve | None:
     """The change by an effect over the variable that explains most of its variance."""
-    trajectories = axis_trajectories(fit, fit.x, run_index)
-    trajectory = trajectories[candidate.axis]
+    trajectory = axis_trajectories(fit, fit.x, run_index)[candidate.axis]
     other_terms = tuple(active for active in trajectory.active_terms if active.term is not candidate.term)
     nominal = fit.model.nominal(candidate.axis, fit.x)
     without = replace(trajectory, axis=with_constants(nominal, other_terms), active_terms=other_terms)
     size = trajectory.angle.size
-    other_angle = next((t.angle for name, t in trajectories.items() if name != candidate.axis), np.zeros(size))
     samples = np.linspace(0, size - 1, min(CURVE_SAMPLES, size)).astype(np.intp)
 
     def change(x: Array) -> Array:
         active = ActiveTerm(candidate.term, values(x), candidate.channel)
-        return _change(without, active, other_angle, samples)
+        return _change(without, active, samples)
 
     fitted = change(fit.x)
     if not fitted.any():
@@ -165,6 +163,8 @@ def _representations(without: AxisTrajectory, candidate: Candidate, samples: NDA
     ones, quantity = np.ones(samples.size), _changed_quantity(candidate)
     variables = {"angle (mrad)": 1e3 * angle, "rate (rad/s)": rate, "time (ms)": 1e3 * time}
     variables["voltage (V)"] = without.voltage[samples]
+    if candidate.term.coupled and without.other is not None:
+        variables["angle of the other axis (mrad)"] = 1e3 * without.other.angle[samples]
     modulations = {}
     if candidate.term.torque is not None:
         mechanics = without.axis.require_mechanics()
@@ -205,13 +205,12 @@ def _changed_quantity(candidate: Candidate) -> str:
     return "change of the sense signal (V)"
 
 
-def _change(
-    without: AxisTrajectory, active: ActiveTerm, other_angle: Array, samples: NDArray[np.intp]
-) -> NDArray[np.float64]:
+def _change(without: AxisTrajectory, active: ActiveTerm, samples: NDArray[np.intp]) -> NDArray[np.float64]:
     """What one effect changes at its stage along a fixed motion, shape of ``samples``."""
     term, nominal = active.term, nominal_values(without.axis)
     if term.torque is not None:
         values, time = np.asarray(active.values, float), without.drive.time
+        other_angle = np.zeros(time.size) if without.other is None else without.other.angle
         torque = [
             term.torque(time[i], without.angle[i], without.rate[i], other_angle[i], without.voltage[i], 0.0, 0.0,
                         values, nominal)[0]

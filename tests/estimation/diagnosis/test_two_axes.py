@@ -11,6 +11,7 @@ from estimation.diagnosis.diagnose import diagnose
 from estimation.estimate import estimate
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Sine
+from recon.report.effect_curve import effect_curve
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.recording import Recording
@@ -66,11 +67,16 @@ def test_crosstalk_of_the_sensor_and_coupling_of_the_mirror_are_named(effect: st
     """The gain of the sensor is stated to 30 %. Around the fit of a coupling, nominal values seem to explain it."""
     recording, _ = recorded(effect, **size)
     others = [name for name in catalogue() if name not in COMPARED]
-    (finding,) = diagnose([without_angles(recording)], excluded=others).findings
+    found = diagnose([without_angles(recording)], excluded=others)
+    (finding,) = found.findings
     assert (finding.effect, finding.axis) == (effect, "x")
     (parameter,) = finding.parameters
     low, high = parameter.ci95
     assert low < size[parameter.name] < high
+    assert found.search is not None
+    curve = effect_curve(found.search.final, found.search.final.model.candidates[0])
+    assert curve is not None
+    assert curve.x_label == "angle of the other axis (mrad)"
 
 
 def test_a_sensor_that_is_rotated_against_the_axes_has_crosstalk_in_both() -> None:
