@@ -19,7 +19,7 @@ from scanner.active_terms import ActiveTerm, with_constants
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Axis, Device
-from scanner.forward_model import AxisTrajectory, DriveInput, apply_channel_terms, effective_drive
+from scanner.forward_model import AxisTrajectory, DriveInput, apply_channel_terms, beside_each_other, effective_drive
 from scanner.integrator.nodes import nodes_to_samples, to_nodes
 from scanner.recording import Recording
 from scanner.stages import Amdm
@@ -154,15 +154,16 @@ def with_outputs(
         filtered = any(term.term.corners and term.channel == kind for name in axes for term in terms[name])
         if filtered or not any(laws.values()):  # a low-pass and a nonlinear law cannot be exchanged
             continue
-        trajectories = [
-            trajectory(
+        unknown = {
+            name: trajectory(
                 bare.sensed_axis(name),
-                tuple(laws[name]),
+                tuple(laws.get(name, ())),
                 drive_input(recording.channels.get(f"drive_{name}"), recording, channel),
                 np.full(channel.size, np.nan),
             )
-            for name in axes
-        ]
+            for name in bare.axes
+        }
+        trajectories = [beside_each_other(unknown)[name] for name in axes]
         readout = bare.sensed_axis(axes[0]).readout
 
         def law(signal: Array, kind=kind, trajectories=trajectories, readout=readout) -> Array:  # type: ignore[no-untyped-def]

@@ -65,7 +65,7 @@ class AxisTrajectory:
         drive: as recorded, before the drive terms.
         angle, rate: shape (n + 1,) [rad, rad/s].
         voltage: on the actuator, after the drive terms, shape (n + 1,) [V].
-        other: the motion of the other axis; None where it is unknown.
+        other: the motion of the other axis; None where it does not move, or was not recorded.
     """
 
     axis: Axis
@@ -323,9 +323,9 @@ def apply_channel_terms(
 
 
 def _same_channel(channel: str, motion: AxisTrajectory | None, size: int) -> Array:
-    """The channel of the same kind of another axis, without its terms, shape (size,); NaN where it is unknown."""
+    """The channel of the same kind of another axis, without its terms, shape (size,); 0 where it does not move."""
     if motion is None or (channel == "sense" and motion.axis.readout is None):
-        return np.full(size, np.nan)
+        return np.zeros(size)
     if channel == "sense":
         return _before_channel_terms(effective_readout(motion.axis.require_readout(), [motion]), [motion])
     return motion.derivative(REFERENCE_ORDERS[channel])

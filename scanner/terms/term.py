@@ -144,7 +144,7 @@ class SignalContext:
         theta, rate: motion of the mirror, shape (n,) [rad, rad/s].
         variant: the text after the colon in the name of the term's channel, as in ``"sense:signal"``.
         other: the channel of the same kind of the other axis, without that axis's terms, shape (n,); only for a
-            ``coupled`` term, NaN where the other axis is unknown.
+            ``coupled`` term.
     """
 
     time: Array

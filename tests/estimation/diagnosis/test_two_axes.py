@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimation.device_fit.predict import predict
 from estimation.diagnosis.diagnose import diagnose
 from estimation.estimate import estimate
 from phantoms.forward import Plan, simulate
@@ -56,6 +57,13 @@ def test_estimators_subtract_a_stated_crosstalk() -> None:
         track = estimate(without_angles(recording), device, "sensor").axes["x"].angle
         errors.append(np.sqrt(np.nanmean((track.read(0, track.size) - angle) ** 2)))
     assert errors[1] < 0.1 * errors[0]
+
+
+def test_an_axis_that_was_not_recorded_is_at_rest() -> None:
+    recording, _ = recorded("sensor-crosstalk", c=CROSSTALK)
+    alone = replace(recording, channels={name: recording[name] for name in ("drive_x", "sense_x")})
+    nominal, with_crosstalk = (predict(alone, device) for device in (TEMPLATE, stated("sensor-crosstalk", c=CROSSTALK)))
+    np.testing.assert_array_equal(with_crosstalk["sense_x"].values, nominal["sense_x"].values)
 
 
 @pytest.mark.parametrize(
