@@ -19,6 +19,7 @@ from estimation.reference import (
     PhaseReference,
     absolute_reference,
     block_reference,
+    has_slow_oscillation,
     sampled_too_slowly,
     tone_frequency,
 )
@@ -203,11 +204,16 @@ def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[C
 
 
 def reference_from_drive_or_signal(recording: Recording, device: Device, name: str, channel: Channel) -> PhaseReference:
-    """The phase reference of one axis from its drive, or from a position signal where no drive is known."""
+    """The phase reference of one axis from its drive, or from a position signal where no drive is known.
+
+    Without a drive it is the strongest line near the resonance, or of the whole spectrum where the main oscillation is
+    far below the resonance: a sawtooth has harmonics at the resonance too.
+    """
     if f"drive_{name}" in recording and device.axis(name).drive is not None:
         return phase_reference(recording, device, name, channel)
-    axis = device.axis(name)
-    band = (0.8 * axis.resonance, 1.25 * axis.resonance) if axis.mechanics else (0.0, np.inf)
+    axis, band = device.axis(name), (0.0, np.inf)
+    if axis.mechanics and not has_slow_oscillation(channel, 0.8 * axis.resonance):
+        band = (0.8 * axis.resonance, 1.25 * axis.resonance)
     return absolute_reference(tone_frequency(channel, *band), channel.start, channel.end)
 
 

@@ -66,6 +66,16 @@ def test_a_resonant_drive_sampled_too_slowly_is_refused() -> None:
         phase_reference(sampled, stage(), "x")
 
 
+def test_a_sawtooth_without_a_drive_is_no_motion_at_the_resonance() -> None:
+    """One of its harmonics lies near the resonance."""
+    sawtooth = 5.0 * (2.0 * (SLOW_HZ * TIME % 1.0) - 1.0)
+    sense = {f"sense_{axis}": recording(TIME, sawtooth)[f"sense_{axis}"].read() for axis in "xy"}
+    undriven = Recording.from_arrays({name: (values, "V", RATE) for name, values in sense.items()}, device=stage())
+    motion = estimate_from_sensor(undriven, stage()).axes["x"]
+    assert motion.frequency == pytest.approx(SLOW_HZ, rel=1e-3)
+    np.testing.assert_allclose(motion.amplitude, 5.0 * 2.0 / np.pi, rtol=0.02)  # of the fundamental
+
+
 def test_a_step_of_the_drive_is_no_oscillation() -> None:
     step = recording(np.where(TIME > 2.0, 10.0, 0.0), 0.0 * TIME)
     assert not has_slow_oscillation(step["drive_x"], RESONANCE_HZ)
