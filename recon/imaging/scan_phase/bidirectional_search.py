@@ -52,7 +52,9 @@ class RegistrationSamples(NamedTuple):
 def search_phase_errors(samples: RegistrationSamples) -> Array:
     """Return the phase errors (x, y) [rad] for which the pictures of opposite directions correlate best, shape (2,).
 
-    NaN where they correlate no better than noise, or an axis does not move.
+    NaN where they correlate no better than noise, where an axis does not move, and where the two directions have no
+    cells in common at some of the phase errors: the right one may be among these, as in a scan of two nearly equal
+    frequencies, whose figure hardly changes within a slice.
 
     Over arcsin(θ/A) instead of θ, forward and backward pictures are shifted against each other by 2 d everywhere. All
     errors within ``SEARCH_REACH_RAD`` are therefore evaluated at once, by the normalised correlation of the pairs of
@@ -89,14 +91,16 @@ def search_phase_errors(samples: RegistrationSamples) -> Array:
         sums = np.fft.irfft2((a[:, 0].conj() * b[:, 1]).sum(0), (2 * n, 2 * n))
         return np.asarray(gaussian_filter(sums, MATCH_SMOOTHING_CELLS, mode="wrap")[window])
 
-    pairs = np.maximum(correlate(one, one), 0.5)
+    pairs, smoothed_cells = correlate(one, one), 4.0 * math.pi * MATCH_SMOOTHING_CELLS**2
+    if pairs.min() * smoothed_cells < MIN_CORRELATION_SD**2:  # not even a correlation of 1 exceeds noise there
+        return np.full(2, np.nan)
     mean_a, mean_b, square_a, square_b, product = (
         correlate(*sums) / pairs for sums in ((first, one), (one, first), (second, one), (one, second), (first, first))
     )
     variance = np.maximum((square_a - mean_a**2) * (square_b - mean_b**2), np.finfo(float).tiny)
     match = (product - mean_a * mean_b) / np.sqrt(variance)
     best_y, best_x = np.unravel_index(np.argmax(match), match.shape)
-    noise_sd = 1.0 / np.sqrt(pairs[best_y, best_x] * 4.0 * math.pi * MATCH_SMOOTHING_CELLS**2)
+    noise_sd = 1.0 / np.sqrt(pairs[best_y, best_x] * smoothed_cells)
     if match[best_y, best_x] < MIN_CORRELATION_SD * noise_sd:
         return np.full(2, np.nan)
     return np.array([lag[allowed][best_x], lag[allowed][best_y]]) / 2

@@ -195,10 +195,11 @@ def describe_readout_phase(
         contradicted: axes whose motion the picture contradicts, which is stated elsewhere.
     """
     notes = [
-        f"the picture determines no phase of {name}: no feature across it, a pattern that repeats, or too few photons. "
+        f"the picture determines no phase of {name}: no feature across it, a pattern that repeats, too few photons, "
+        "or a figure whose two directions have too few places in common. "
         f"The standard deviation of the phase allows for {UNDESCRIBED_DELAY_SD_S * 1e6:.2g} µs of readout delay that "
         f"the device file does not state; without such a delay it is {_sd_as_stated(motion.axes[name]):.2g}°. "
-        "A scene with detail, more light or a longer scan narrows it"
+        "A scene with detail, more light, a longer scan or other frequencies narrow it"
         for name in AXES
         if name not in found and name not in contradicted and motion.axes[name].reference != "blocks"
     ]
