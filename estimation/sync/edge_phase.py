@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.sync.numbering import NumberedEdges, number_edges
+from estimation.sync.numbering import SIGNIFICANT_SD, NumberedEdges, number_edges
 from estimation.sync.smoother import SmoothedPhase, smooth_phase
 from scanner.arrays import Array
 from scanner.edges import Edges
@@ -18,9 +18,6 @@ NOMINAL_PHASE = {
     "both-edges": (0.0, np.pi),
 }
 """Phase of theta = A sin(phi) at the edges of each kind, for a detector in the centre [rad]."""
-
-SIGNIFICANT_SD = 6.0
-"""Asymmetry in standard deviations from which it determines sign and amplitude; by chance once in 1e8."""
 
 
 @dataclass(frozen=True)

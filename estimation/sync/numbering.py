@@ -35,6 +35,10 @@ MAX_STRAY_FRACTION = 0.2
 MAX_MISSING_FRACTION = 0.8
 """Fraction of missing edges above which the list is refused: the period is then that of a disturbance."""
 
+SIGNIFICANT_SD = 6.0
+"""Asymmetry of a detector in standard deviations from which it determines sign, amplitude and the kinds of edges; by
+chance once in 1e8."""
+
 FIRST_EDGES = 12
 """Edges that are tried as the first one: a stray one would number all others wrongly."""
 
@@ -106,7 +110,41 @@ def number_edges(edges: Edges) -> NumberedEdges:
             f"edges lie {length / kinds:.3g} s apart: keep one of those that belong together, and check the threshold"
         )
         raise bad(what, hint)
-    return NumberedEdges(times[first:][used], numbered[used], period[used], length, dwell, missing, doubled, stray)
+    kept = times[first:][used]
+    by_side = consistent_kinds(kept, numbered[used], period[used])
+    return NumberedEdges(kept, *by_side, length, dwell, missing, doubled, stray)
+
+
+def consistent_kinds(times: Array, kind: Index, period: Index) -> tuple[Index, Index]:
+    """Kind and period of each edge; kinds are exchanged where the long intervals begin at the other kind than before.
+
+    While the beam does not reach the detector, its phase may change by half a period, and the edges after that are then
+    numbered half a period wrong. The exchange begins after the longest interval between the two runs of edges.
+
+    Args:
+        times, kind, period: of the edges that are used, all of shape (n,).
+    """
+    starts = np.append(0, np.flatnonzero(np.diff(2 * period + kind) != 1) + 1)  # of runs in which no edge is missing
+    stops = np.append(starts[1:], times.size)
+    turned, before = np.zeros(times.size, np.int64), (0, 0)
+    for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
+        side = _long_side(times[start:stop]) * (1 - 2 * int(kind[start]))
+        if side == 0:
+            continue
+        if before[1] * side < 0:
+            at = before[0] + int(np.argmax(np.diff(times[before[0] : start + 1])))
+            turned[at + 1 :] ^= 1
+        before = stop - 1, side
+    return np.where(turned, 1 - kind, kind), period + turned * kind
+
+
+def _long_side(times: Array) -> int:
+    """Sign of the interval after the first edge less the one after the second, and so on; 0 if they do not alternate."""
+    if times.size < MIN_EDGES:
+        return 0
+    difference = np.diff(times, 2) * (1 - 2 * (np.arange(times.size - 2) % 2))  # without the drift of the period
+    sd = difference.std() / np.sqrt(difference.size)
+    return -int(np.sign(difference.mean())) if abs(difference.mean()) > SIGNIFICANT_SD * sd else 0
 
 
 @njit(cache=True)

@@ -80,6 +80,21 @@ def test_the_amplitude_of_a_transient_is_followed_by_a_detector_beside_the_centr
     assert np.sqrt(np.mean(phase_error(edges, time, phase) ** 2)) < 0.6 * 2 * np.pi * FREQUENCY_HZ * JITTER_S
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.9e-4, 1.0e-4, 1.1e-4, 2.0e-4])
+def test_both_sides_of_a_pause_have_one_sign(delay: float) -> None:
+    """The motion stops, and starts again with another phase: the intervals show which edges are of which direction."""
+    time = np.arange(100_000) / RATE_HZ
+    phase = 0.7 + 2 * np.pi * FREQUENCY_HZ * (time + delay * (time > 0.05))
+    amplitude = AMPLITUDE_RAD * np.minimum(np.abs(time - 0.05) / 0.02, 1.0) ** 2
+    detector = SyncDetector(0.01, jitter=JITTER_S)
+    times = sync_edges(amplitude * np.sin(phase), RATE_HZ, detector, np.random.default_rng(1))
+    found = phase_from_edges(make_edges("sync_x", times, {"unit": "s", "angle": 0.01}))
+    error = found.phase - np.interp(found.time, time, phase)
+    moving = np.abs(found.time - 0.05) > 0.02
+    assert found.sign == "known: sync_x"
+    assert np.abs(np.angle(np.exp(1j * error[moving]))).max() < 0.01
+
+
 @pytest.mark.parametrize("event", ["zero-crossing-up", "zero-crossing-down", "turn"])
 def test_every_event_gives_the_phase(event: str) -> None:
     time, phase = drifting(6)
