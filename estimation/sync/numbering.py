@@ -139,7 +139,7 @@ def consistent_kinds(times: Array, kind: Index, period: Index) -> tuple[Index, I
 
 
 def _long_side(times: Array) -> int:
-    """Sign of the interval after the first edge less the one after the second, and so on; 0 if they do not alternate."""
+    """Sign of the first, third, ... interval less the second, fourth, ... one; 0 if they do not alternate."""
     if times.size < MIN_EDGES:
         return 0
     difference = np.diff(times, 2) * (1 - 2 * (np.arange(times.size - 2) % 2))  # without the drift of the period
