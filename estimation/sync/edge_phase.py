@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.sync.numbering import SIGNIFICANT_SD, NumberedEdges, number_edges
-from estimation.sync.smoother import SmoothedPhase, smooth_phase
-from scanner.arrays import Array
+from estimation.sync.smoother import smooth_phase
+from scanner.arrays import Array, Mask
 from scanner.edges import Edges
+from scanner.motion import UNKNOWN_PHASE_SD_RAD
 
 NOMINAL_PHASE = {
     "zero-crossing-up": (0.0,),
@@ -20,9 +21,13 @@ NOMINAL_PHASE = {
 """Phase of theta = A sin(phi) at the edges of each kind, for a detector in the centre [rad]."""
 
 
+GAP_PERIODS = 4.0
+"""Distance in periods of the points in a gap: that of the slow clock of the other estimators."""
+
+
 @dataclass(frozen=True)
 class EdgePhase:
-    """Phase of an axis at the edges that are used.
+    """Phase of an axis at the edges that are used, and every ``GAP_PERIODS`` in the gaps between them.
 
     Attributes:
         time: shape (n,) [s].
@@ -47,6 +52,11 @@ class EdgePhase:
     numbered: NumberedEdges
     outliers: int
 
+    @property
+    def edges(self) -> int:
+        """Number of edges that are used."""
+        return self.numbered.times.size - self.outliers
+
     def describe(self, name: str) -> str:
         """Description of missing, repeated and stray edges in one line; empty if there are none."""
         counts = {
@@ -55,7 +65,7 @@ class EdgePhase:
             "out of place and left out": self.numbered.stray + self.outliers,
         }
         found = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-        return f"{name}: {self.time.size} edges are used; {found}" if found else ""
+        return f"{name}: {self.edges} edges are used; {found}" if found else ""
 
 
 def phase_from_edges(edges: Edges) -> EdgePhase:
@@ -63,33 +73,48 @@ def phase_from_edges(edges: Edges) -> EdgePhase:
     numbered = number_edges(edges)
     nominal = np.array(NOMINAL_PHASE[edges.event])
     f0, t0 = 1.0 / numbered.length, float(numbered.times[0])
-    periods = (numbered.times - t0) * f0
+    at_edges = (numbered.times - t0) * f0
     side = np.array([-1.0, 1.0] if nominal.size == 2 else [0.0, 0.0])[numbered.kind]
-    measured = 2 * np.pi * (numbered.period - periods) + nominal[numbered.kind]
-    smoothed = smooth_phase(periods, measured, side, walking_asymmetry=bool(edges.angle))
-    flipped, sign = _sign(edges, smoothed)
+    measured = 2 * np.pi * (numbered.period - at_edges) + nominal[numbered.kind]
+    periods, measured, side, is_edge = _with_points_in_gaps(at_edges, measured, side)
+    smoothed = smooth_phase(periods, measured, side, is_edge, walking_asymmetry=bool(edges.angle))
     used = smoothed.used
+    asymmetry, asymmetry_sd = (
+        np.interp(periods, periods[used], values[used]) for values in (smoothed.asymmetry, smoothed.asymmetry_sd)
+    )
+    flipped, sign = _sign(edges, asymmetry, asymmetry_sd)
+    kept = used | ~is_edge
     return EdgePhase(
-        time=numbered.times[used],
-        phase=(2 * np.pi * periods + smoothed.phase + np.pi * flipped)[used],
-        frequency=f0 * (1.0 + smoothed.rate[used] / (2 * np.pi)),
-        phase_sd=smoothed.phase_sd[used],
-        asymmetry=(-smoothed.asymmetry if flipped else smoothed.asymmetry)[used],
-        asymmetry_sd=smoothed.asymmetry_sd[used],
+        time=t0 + periods[kept] / f0,
+        phase=(2 * np.pi * periods + smoothed.phase + np.pi * flipped)[kept],
+        frequency=f0 * (1.0 + smoothed.rate[kept] / (2 * np.pi)),
+        phase_sd=np.minimum(smoothed.phase_sd[kept], UNKNOWN_PHASE_SD_RAD),
+        asymmetry=(-asymmetry if flipped else asymmetry)[kept],
+        asymmetry_sd=asymmetry_sd[kept],
         jitter_sd=smoothed.jitter_sd / (2 * np.pi * f0),
         sign=sign,
         numbered=numbered,
-        outliers=int(np.sum(~used)),
+        outliers=int(np.sum(is_edge & ~used)),
     )
 
 
-def _sign(edges: Edges, smoothed: SmoothedPhase) -> tuple[bool, str]:
+def _with_points_in_gaps(periods: Array, measured: Array, side: Array) -> tuple[Array, Array, Array, Mask]:
+    """The arguments of ``smooth_phase`` with points every ``GAP_PERIODS`` between edges that are further apart."""
+    wide = np.flatnonzero(np.diff(periods) > GAP_PERIODS)
+    points = [np.arange(periods[at] + GAP_PERIODS, periods[at + 1], GAP_PERIODS) for at in wide]
+    inserted = np.concatenate([np.empty(0), *points])
+    after = np.searchsorted(periods, inserted)
+    is_edge = np.insert(np.ones(periods.size, bool), after, False)
+    return np.insert(periods, after, inserted), np.insert(measured, after, 0.0), np.insert(side, after, 0.0), is_edge
+
+
+def _sign(edges: Edges, asymmetry: Array, sd: Array) -> tuple[bool, str]:
     """Whether the phase has to be turned by half a period, and what the edges say of the sign."""
     if edges.is_one_direction:
         return False, f"known: {edges.name}"
-    if edges.event == "turn" or not edges.angle or not is_significant(smoothed.asymmetry, smoothed.asymmetry_sd):
+    if edges.event == "turn" or not edges.angle or not is_significant(asymmetry, sd):
         return False, "ambiguous"
-    return bool(np.median(smoothed.asymmetry) * edges.angle < 0.0), f"known: {edges.name}"
+    return bool(np.median(asymmetry) * edges.angle < 0.0), f"known: {edges.name}"
 
 
 def is_significant(asymmetry: Array, sd: Array) -> bool:

@@ -16,7 +16,7 @@ from scanner.arrays import Array
 from scanner.device import AXES, Device
 from scanner.edges import Edges
 from scanner.errors import BadInput
-from scanner.motion import AxisMotion, SampledAngle
+from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion, SampledAngle
 from scanner.recording import Recording
 
 KNOT_PERIODS = 4.0
@@ -120,7 +120,8 @@ def axis_motion_from_edges(
         relative = 0.0 if harmonics is None else harmonics.at(knots, time[part]).deviation(u)
         angle[part] = np.interp(time[part], found.time, amplitude) * (np.sin(u) + relative)
     beyond = MAX_BEYOND_PERIODS / float(np.median(found.frequency))
-    angle[(time < found.time[0] - beyond) | (time > found.time[-1] + beyond)] = np.nan
+    is_known = np.interp(time, found.time, found.phase_sd) < UNKNOWN_PHASE_SD_RAD
+    angle[~is_known | (time < found.time[0] - beyond) | (time > found.time[-1] + beyond)] = np.nan
     motion = AxisMotion(
         time=knots,
         phase=phase[::step] - reference.phase(knots),
@@ -134,7 +135,7 @@ def axis_motion_from_edges(
     )
     facts: dict[str, object] = {
         "event": edges.event,
-        "edges": int(found.time.size),
+        "edges": found.edges,
         "missing": found.numbered.missing,
         "repeated": found.numbered.doubled,
         "out_of_place": found.numbered.stray + found.outliers,

@@ -61,7 +61,7 @@ class SmoothedPhase(NamedTuple):
         phase_sd: shape (n,) [rad].
         asymmetry, asymmetry_sd: alpha at each edge, shape (n,) [rad]; 0 where the edges are of one kind.
         jitter_sd: of an edge [rad].
-        used: whether an edge is no outlier, shape (n,).
+        used: whether it is an edge and no outlier, shape (n,).
     """
 
     phase: Array
@@ -73,23 +73,26 @@ class SmoothedPhase(NamedTuple):
     used: NDArray[np.bool_]
 
 
-def smooth_phase(periods: Array, measured: Array, side: Array, walking_asymmetry: bool = False) -> SmoothedPhase:
+def smooth_phase(
+    periods: Array, measured: Array, side: Array, is_edge: NDArray[np.bool_], walking_asymmetry: bool = False
+) -> SmoothedPhase:
     """Smooth the phases of edges, once more without the outliers of the first pass.
 
     Args:
         periods: time of each edge in periods, increasing, shape (n,).
         measured: psi(t_k) - s alpha as measured [rad], shape (n,).
         side: -s of each edge, shape (n,); zeros where all edges are of one kind.
+        is_edge: shape (n,); elsewhere, as in the gaps between edges, the phase is predicted, and ``measured`` not used.
         walking_asymmetry: whether the asymmetry may change, as it does with the amplitude.
     """
-    used = np.ones(periods.size)
+    used = is_edge.astype(float)
     part = slice(0, LIKELIHOOD_EDGES)
     for _ in range(2):
         walks, variance = _most_likely(periods[part], measured[part], side[part], used[part], walking_asymmetry)
         states, covariances = _smooth(periods, measured, side, used, *walks, DIFFUSE)
         residual = measured - states[:, 0] - side * states[:, 2]
-        used = (np.abs(residual) < MAX_OUTLIER_SD * np.sqrt(variance)).astype(float)
-        if used.all():
+        used = (is_edge & (np.abs(residual) < MAX_OUTLIER_SD * np.sqrt(variance))).astype(float)
+        if used.sum() == is_edge.sum():
             break
     sd = np.sqrt(variance)
     return SmoothedPhase(

@@ -95,6 +95,29 @@ def test_both_sides_of_a_pause_have_one_sign(delay: float) -> None:
     assert np.abs(np.angle(np.exp(1j * error[moving]))).max() < 0.01
 
 
+def test_the_phase_in_a_gap_is_within_its_interval_and_left_out_where_it_is_unknown() -> None:
+    pulls = []
+    for seed in range(8):
+        edges, time, phase = detected(seed, SyncDetector(0.03, jitter=JITTER_S), angle=0.03)
+        gapped = replace(edges, times=edges.times[np.abs(edges.times - 0.05) > 0.01])
+        found, error = phase_from_edges(gapped), phase_error(gapped, time, phase)
+        inside = np.abs(found.time - 0.05) < 0.009
+        assert inside.sum() > 20  # points every 4 periods
+        assert found.phase_sd[inside].max() > 10 * np.median(found.phase_sd)
+        pulls.append(error[inside] / found.phase_sd[inside])
+    assert 0.3 < np.sqrt(np.mean(np.square(pulls))) < 2.0
+
+    time, phase = drifting(7, walk=4000.0)
+    times = sync_edges(AMPLITUDE_RAD * np.sin(phase), RATE_HZ, SyncDetector(0.03), np.random.default_rng(1))
+    times = times[np.abs(times - 0.05) > 0.03]
+    wild = make_edges("sync_x", times, {"unit": "s", "angle": 0.03})
+    motion, _, facts = axis_motion_from_edges(Recording({}, None, {}), FIELD, wild, (RATE_HZ, 0.0, time.size))
+    unknown = np.isnan(motion.angle.read())
+    assert unknown[np.abs(time - 0.05) < 0.005].all()
+    assert not unknown[np.abs(time - 0.05) > 0.031].any()
+    assert facts["edges"] == times.size
+
+
 @pytest.mark.parametrize("event", ["zero-crossing-up", "zero-crossing-down", "turn"])
 def test_every_event_gives_the_phase(event: str) -> None:
     time, phase = drifting(6)
