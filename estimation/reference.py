@@ -200,6 +200,18 @@ def sampled_too_slowly(channel: Channel, what: str, frequency: float, order: int
     return BadInput(rate, file=channel.file, channel=channel.name, hint=hint)
 
 
+def not_covered(channel: Channel, what: str, start: float, end: float) -> BadInput:
+    """The error of a channel that was not recorded during all of ``what``, from ``start`` to ``end`` [s]."""
+    both = max(start, channel.start), min(end, channel.end)
+    cut = f", or cut the recording in Python: Recording.open(file).slice({both[0]:.6g}, {both[1]:.6g}).write(cut)"
+    return BadInput(
+        f"covers {channel.start:.6g} to {channel.end:.6g} s, {what} {start:.6g} to {end:.6g} s",
+        file=channel.file,
+        channel=channel.name,
+        hint="record both over the same time" + (cut if both[0] < both[1] else ""),
+    )
+
+
 def _no_oscillation(channel: Channel) -> BadInput:
     """The error for a channel without a line."""
     hint = "check that it was recorded"

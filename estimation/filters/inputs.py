@@ -9,12 +9,11 @@ import numpy as np
 
 from estimation.filters.model import FilterModel, filter_model
 from estimation.initial import InitialMotion, fit_initial_motion, initial_section_states
-from estimation.reference import PhaseReference
+from estimation.reference import PhaseReference, not_covered
 from estimation.signals import SenseChannel, drive_channel, is_capacitive, phase_reference, sense_channels
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
-from scanner.errors import BadInput
 from scanner.recording import Recording
 
 INITIAL_RELATIVE_SD = 0.02
@@ -87,10 +86,5 @@ def _at_samples(voltage: Channel | None, sense: Channel) -> Array:
     if (voltage.sample_rate, voltage.start, voltage.size) == (sense.sample_rate, sense.start, sense.size):
         return voltage.read()
     if voltage.start > sense.start + 1.0 / voltage.sample_rate or voltage.end < sense.end - 1.0 / voltage.sample_rate:
-        raise BadInput(
-            f"covers {voltage.start:.6g} to {voltage.end:.6g} s, {sense.name} {sense.start:.6g} to {sense.end:.6g} s",
-            file=voltage.file,
-            channel=voltage.name,
-            hint="record both over the same time",
-        )
+        raise not_covered(voltage, sense.name, sense.start, sense.end)
     return np.interp(sense.time(), voltage.time(), voltage.read())

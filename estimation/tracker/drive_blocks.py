@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.reference import PhaseReference
+from estimation.reference import PhaseReference, not_covered
 from estimation.tracker.averaged_dynamics import FORCE_HARMONICS, AxisParameters
 from estimation.tracker.change_points import (
     block_pieces,
@@ -19,7 +19,6 @@ from estimation.tracker.change_points import (
 from estimation.tracker.demodulation import least_squares_coefficients, project_blocks
 from scanner.arrays import Array, Complex
 from scanner.channel import Channel
-from scanner.errors import BadInput
 
 MAX_LINE_RATE_RATIO = 0.45
 """Highest frequency of a line over the sample rate: a margin of a tenth to the Nyquist frequency."""
@@ -67,12 +66,7 @@ def demodulate_drive(
     wanted = np.round((time - channel.start) * rate - 0.5 * (length - 1)).astype(np.int64)
     starts = np.clip(wanted, 0, channel.size - length)
     if channel.size < length or np.abs(starts - wanted).max() > length:
-        raise BadInput(
-            f"covers {channel.start:.6g} to {channel.end:.6g} s, the blocks {time[0]:.6g} to {time[-1]:.6g} s",
-            file=channel.file,
-            channel=channel.name,
-            hint="record both over the same time",
-        )
+        raise not_covered(channel, "the signal of the motion", time[0] - 0.5 * width, time[-1] + 0.5 * width)
     orders = np.arange(1, FORCE_HARMONICS + 2)  # two more than are used, so that they do not leak into these
     orders = law.drive_order * orders[orders * law.drive_order * w.max() < 2 * np.pi * MAX_LINE_RATE_RATIO * rate]
     lines = np.stack([np.zeros_like(orders), orders], axis=1)

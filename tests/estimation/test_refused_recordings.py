@@ -7,11 +7,14 @@ import pytest
 
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.undriven import steady_without_drive
+from estimation.estimate import estimate
 from estimation.identification.calibrate import identify
+from scanner.channel import make_channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
+from tests.support.simulated import imaging
 
 TIME = np.arange(5000) / 1e4
 DECAY = np.exp(-3.0 * TIME) * np.cos(2 * np.pi * 100.0 * TIME) + 0.01 * np.random.default_rng(1).normal(size=TIME.size)
@@ -70,3 +73,15 @@ def test_a_motion_that_persists_without_a_recorded_drive_is_refused(shape: np.nd
     if message is not None:
         with pytest.raises(BadInput, match="record the drive"):
             diagnose_with_optics([without_drive])
+
+
+@pytest.mark.parametrize("estimator", ["tracker", "ukf"])
+def test_a_drive_that_starts_later_is_refused_with_the_time_to_cut_out(estimator: str) -> None:
+    recording, _ = imaging()
+    drive = recording["drive_x"]
+    late = round(0.003 * drive.sample_rate)
+    channel = make_channel(
+        "drive_x", drive.read(late), unit="V", sample_rate=drive.sample_rate, start=drive.time(late, late + 1)[0]
+    )
+    with pytest.raises(BadInput, match=r"drive_x: covers 0\.003 to .* cut the recording in Python: .*slice\(0\.003, "):
+        estimate(recording.with_channel(channel), method=estimator)
