@@ -172,7 +172,7 @@ def conclude_identification(summary: Mapping[str, Any]) -> str:
     text = f"{counted(len(values), 'constant')} of {summary['device']} measured"
     if relative:
         worst = max(relative, key=lambda name: relative[name])
-        text += f", the least certain {worst} to {100 * relative[worst]:.2g} %"
+        text += f", the least certain {worst} to {percent(relative[worst])}"
     return text + ". Use device.toml in place of the nominal device."
 
 
@@ -192,7 +192,7 @@ def conclude_prediction(summary: Mapping[str, Any]) -> str:
     text = (
         f"From the drive alone {summary['device']} predicts "
         + {1: "the channel", 2: "both channels"}.get(len(channels), f"all {len(channels)} channels")
-        + f" with an error of {100 * channel['nrmse']:.2g} % of the signal{' or less' if len(channels) > 1 else ''} "
+        + f" with an error of {percent(channel['nrmse'])} of the signal{' or less' if len(channels) > 1 else ''} "
         + f"({f'largest in {worst}' if len(channels) > 1 else worst}, "
         f"{format_value(channel['rmse'], 3)} {channel['unit']} rms)"
     )

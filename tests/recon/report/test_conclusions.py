@@ -44,5 +44,6 @@ def test_a_prediction_as_far_off_as_none_is_no_prediction() -> None:
         channel = {"nrmse": nrmse, "rmse": 0.1, "unit": "V", "noise_sd": 0.1}
         return conclude_prediction({"device": "mirror", "channels": {"sense_x": channel}})
 
-    assert "predicts the channel with an error of 5 % of the signal" in conclude_single(0.05)
+    assert "predicts the channel with an error of 5% of the signal" in conclude_single(0.05)
+    assert "with an error of 100% of the signal" in conclude_single(0.999)
     assert "does not predict sense_x: they differ by 2 times the signal" in conclude_single(2.0)
