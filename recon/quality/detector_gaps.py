@@ -6,7 +6,7 @@ import numpy as np
 
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid, Picture
-from recon.imaging.scan_phase.bidirectional_phase import slow_period
+from recon.imaging.scan_phase.bidirectional_phase import quadrature, slow_period
 from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, WildLimits, find_wild_samples, wild_limits
 from recon.sample_ranges import SampleRanges, runs_of_true, subtract_ranges
 from scanner.arrays import Array
@@ -68,6 +68,31 @@ def describe_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocat
         "that the rest shows: the detector was off or covered there, and pixels visited then are wrong; "
         "cut the recording"
     ]
+
+
+def describe_blanked_directions(beam: Motion, intensity: Channel) -> list[str]:
+    """A line for each axis in one of whose directions the light or the detector was off, as in a scan of one direction.
+
+    Args:
+        beam, intensity: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
+    """
+    count = min(intensity.size, MAX_CHECKED_SAMPLES)
+    values, lines = intensity.read(0, count), []
+    limits = wild_limits(values)
+    for name, axis in beam.axes.items():
+        angle, periods = axis.angle.read(0, count), count / intensity.sample_rate * float(np.median(axis.frequency))
+        if not (periods >= BLOCK_PERIODS and np.isfinite(angle).any()):
+            continue
+        rate = quadrature(angle, float(np.nanmax(np.abs(angle))))
+        rising, falling = (_scatter(values[part], limits) for part in (rate > 0.0, rate < 0.0))
+        if min(rising, falling) < QUIET_SD_SHARE * max(rising, falling):
+            direction = "rises" if rising < falling else "falls"
+            lines.append(
+                f"intensity: the samples taken while {name} {direction} do not show the scene that the others show, so "
+                "that the picture is wrong: the light or the detector was off in this direction; set these samples to "
+                "NaN, which leaves them out"
+            )
+    return lines
 
 
 def _scatter(values: Array, limits: WildLimits) -> float:
