@@ -97,6 +97,8 @@ def describe_blanked_directions(beam: Motion, intensity: Channel) -> list[str]:
 
 def _scatter(values: Array, limits: WildLimits) -> float:
     """Largest standard deviation of a detector in a block without its wild samples; NaN without samples."""
+    if not len(values):
+        return np.nan
     usable = np.isfinite(values).reshape(len(values), -1) & ~find_wild_samples(values, limits)
     known = values[usable.all(axis=1)]
     return float(known.reshape(len(known), -1).std(axis=0).max()) if len(known) else np.nan
