@@ -10,6 +10,7 @@ import numpy as np
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.open_loop import fit_start_only
 from estimation.held_samples import held_runs_while_driven, without_samples
+from scanner.active_terms import stated_terms
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.recording import Recording
@@ -66,6 +67,15 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
         output.name: _at_sample_times(run, index, signal, recording, held.get(output.name, []))
         for index, (output, signal) in enumerate(zip(run.outputs, model.full_signals(x), strict=True))
     }
+
+
+def drifts(device: Device) -> dict[str, list[str]]:
+    """Effects of a device that change with time, by axis. In every recording they start again at its first sample."""
+    found = {
+        name: [each.term.effect for each in stated_terms(axis) if each.term.drifts and each.term.stage != "optics"]
+        for name, axis in device.axes.items()
+    }
+    return {name: effects for name, effects in found.items() if effects}
 
 
 def beyond_measured_laws(recording: Recording, device: Device) -> dict[str, float]:

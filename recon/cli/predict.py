@@ -41,7 +41,7 @@ def predict_file(
     """
     import numpy as np
 
-    from estimation.device_fit.predict import beyond_measured_laws, predict
+    from estimation.device_fit.predict import beyond_measured_laws, drifts, predict
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder, write_json
     from recon.report.conclusions import conclude_prediction
@@ -62,6 +62,7 @@ def predict_file(
             "recording": str(path),
             "device": used.name,
             "terms": {name: sorted(axis.terms) for name, axis in used.axes.items() if axis.terms},
+            "drifts": drifts(used),
             "beyond_measured_law": beyond_measured_laws(recording, used),
             "channels": {
                 name: {
@@ -87,6 +88,9 @@ def format_summary(summary: dict[str, Any]) -> str:
     lines.append(
         f"{summary['output']}: {counted(len(summary['channels']), 'channel')} predicted from the first samples on"
     )
+    for name, effects in summary["drifts"].items():
+        from_start = "from the first sample on, as in the recording to which the device was fitted"
+        lines.append(f"  axis {name} drifts {from_start}: {', '.join(effects)}")
     for name, fraction in summary["beyond_measured_law"].items():
         if fraction > 0.0:
             lines.append(f"  axis {name}: {fraction:.1%} of the samples lie beyond the range of its measured law")

@@ -23,4 +23,5 @@ TERM = Term(
     source="single-exponential photobleaching of a fluorophore under constant light",
     channels=("intensity",),
     output=output,
+    drifts=True,
 )

@@ -28,4 +28,5 @@ TERM = Term(
     confounders={"resonance-drift": "a drift leaves modulation and current unchanged: change the bias"},
     applies=lambda axis, scales: axis.capacitance is not None and abs(scales.voltage_mean) + scales.voltage_rms > 0,
     voltage=voltage,
+    drifts=True,
 )

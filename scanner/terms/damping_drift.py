@@ -29,4 +29,5 @@ TERM = Term(
         "quadratic-drag": "drag follows amplitude, a drift follows time: record a second amplitude",
     },
     torque=torque,
+    drifts=True,
 )

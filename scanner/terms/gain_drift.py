@@ -31,4 +31,5 @@ TERM = Term(
     },
     channels=("sense", "sense:signal"),
     output=output,
+    drifts=True,
 )

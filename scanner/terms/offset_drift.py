@@ -32,4 +32,5 @@ TERM = Term(
     source="Horowitz & Hill, The Art of Electronics, section 8.1: drift and 1/f noise",
     confounders={"gain-drift": "a gain scales the harmonics too: compare the harmonics, or record the angle"},
     output=output,
+    drifts=True,
 )

@@ -29,4 +29,5 @@ TERM = Term(
         "charging": "charging changes the modulation by the drive too: change the bias",
     },
     torque=torque,
+    drifts=True,
 )
