@@ -92,13 +92,14 @@ def search_phase_errors(samples: RegistrationSamples) -> Array:
         return np.asarray(gaussian_filter(sums, MATCH_SMOOTHING_CELLS, mode="wrap")[window])
 
     pairs, smoothed_cells = correlate(one, one), 4.0 * math.pi * MATCH_SMOOTHING_CELLS**2
-    if pairs.min() * smoothed_cells < MIN_CORRELATION_SD**2:  # not even a correlation of 1 exceeds noise there
+    if pairs.min() * smoothed_cells < 1.0:
         return np.full(2, np.nan)
     mean_a, mean_b, square_a, square_b, product = (
         correlate(*sums) / pairs for sums in ((first, one), (one, first), (second, one), (one, second), (first, first))
     )
     variance = np.maximum((square_a - mean_a**2) * (square_b - mean_b**2), np.finfo(float).tiny)
     match = (product - mean_a * mean_b) / np.sqrt(variance)
+    match[pairs * smoothed_cells < MIN_CORRELATION_SD**2] = -1.0  # not even a correlation of 1 exceeds noise there
     best_y, best_x = np.unravel_index(np.argmax(match), match.shape)
     noise_sd = 1.0 / np.sqrt(pairs[best_y, best_x] * smoothed_cells)
     if match[best_y, best_x] < MIN_CORRELATION_SD * noise_sd:
