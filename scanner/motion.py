@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.arrays import Array, Complex
-from scanner.interpolation import shift_samples
+from scanner.interpolation import interpolate_cubic
 
 if TYPE_CHECKING:
     import xarray
 
+
+SAMPLES_AT_ONCE = 1 << 18
+"""Samples of an angle that are interpolated together, so that intermediate results need little memory."""
 
 UNKNOWN_PHASE_SD_RAD = float(np.pi / np.sqrt(3.0))
 """Standard deviation of a phase of which nothing is known: the largest that an estimator states."""
@@ -121,9 +124,12 @@ class SampledAngle:
 
     def advanced(self, time: Array, phase: Array, frequency: Array) -> SampledAngle:
         """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``AngleTrack``)."""
-        lead = phase / (2.0 * np.pi * frequency)
-        own_time = self.start + np.arange(self.size) / self.sample_rate
-        return replace(self, values=shift_samples(self.values, np.interp(own_time, time, lead) * self.sample_rate))
+        lead, values = phase / (2.0 * np.pi * frequency), np.empty(self.size)
+        for first in range(0, self.size, SAMPLES_AT_ONCE):
+            index = np.arange(first, min(first + SAMPLES_AT_ONCE, self.size))
+            shift = np.interp(self.start + index / self.sample_rate, time, lead) * self.sample_rate
+            values[index] = interpolate_cubic(self.values, index + shift)
+        return replace(self, values=values)
 
     def phasors(self) -> None:
         """Return None: samples are not synthesised from phasors."""

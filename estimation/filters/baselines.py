@@ -294,7 +294,9 @@ def axis_motion_from_angle(
     phase = np.interp(time, time[known], reference.relative_phase(time[known], phasors[known]))
     phase_sd = noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block)
     phase_sd[by_block.mean(axis=1) >= 0.5] = UNKNOWN_PHASE_SD_RAD
-    resampled = resample_to_clock(angle, channel, clock).copy()
+    resampled = resample_to_clock(angle, channel, clock)
+    if held:
+        resampled = resampled.copy()
     for first, stop in held:
         begin, end = (round((channel.start + at / rate - clock[1]) * clock[0]) for at in (first, stop))
         resampled[max(begin, 0) : max(end, 0)] = np.nan

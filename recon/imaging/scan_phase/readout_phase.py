@@ -130,8 +130,9 @@ def _changes_sd(motion: Motion, corrected: Motion, estimates: Mapping[str, Reado
     """Largest change of each estimated phase from ``corrected``, in standard deviations."""
     changes = {}
     for name, estimate in estimates.items():
-        axis = advance_axis(motion.axes[name], estimate)
-        changes[name] = float(np.max(np.abs(axis.phase - corrected.axes[name].phase) / axis.phase_sd))
+        axis = motion.axes[name]
+        phase = axis.phase + np.interp(axis.time, estimate.time, estimate.mean)
+        changes[name] = float(np.max(np.abs(phase - corrected.axes[name].phase) / _advanced_sd(axis, estimate)))
     return changes
 
 
@@ -162,9 +163,13 @@ def advance_axis(axis: AxisMotion, error: ReadoutPhase) -> AxisMotion:
 
     A phase that is not known stays so.
     """
-    variance = np.interp(axis.time, error.time, error.variance)
     ahead = axis.advanced(np.interp(axis.time, error.time, error.mean))
-    return replace(ahead, phase_sd=np.where(axis.known, np.sqrt(variance), axis.phase_sd))
+    return replace(ahead, phase_sd=_advanced_sd(axis, error))
+
+
+def _advanced_sd(axis: AxisMotion, error: ReadoutPhase) -> Array:
+    """Standard deviation of the phase of a motion ahead by a phase error, shape (n,) [rad]."""
+    return np.where(axis.known, np.sqrt(np.interp(axis.time, error.time, error.variance)), axis.phase_sd)
 
 
 def widen_undetermined(axis: AxisMotion) -> AxisMotion:
