@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from estimation.signals import robust_sd
@@ -15,10 +16,13 @@ exceeds it once in 1e15 samples, and a sine, whose largest distance is 1.4 times
 MAX_NOISE_SAMPLES = 1 << 20
 """Samples, evenly spaced, from which the noise is measured: they determine it to 0.1 %, with little memory."""
 
-NEIGHBOURS = {-2: -1.0 / 6.0, -1: 4.0 / 6.0, 1: 4.0 / 6.0, 2: -1.0 / 6.0}
-"""Weights of the samples around one in the cubic through them, by their distance."""
+NEAR_WEIGHT, FAR_WEIGHT = 4.0 / 6.0, -1.0 / 6.0
+"""Weights of the two next samples, and of those after them, in the cubic through the four around a sample."""
 
-REACH = max(NEIGHBOURS)
+NEIGHBOURS = {-2: FAR_WEIGHT, -1: NEAR_WEIGHT, 1: NEAR_WEIGHT, 2: FAR_WEIGHT}
+"""The same by distance."""
+
+REACH = 2
 
 
 def find_spikes(values: Array) -> Index:
@@ -32,7 +36,7 @@ def find_spikes(values: Array) -> Index:
     """
     if values.size <= 4 * REACH:
         return np.zeros(0, np.int64)
-    distance = values - _cubic(values)
+    distance = _distance(values)
     found = _find_far(distance, np.isfinite(distance))
     if not found.size:
         return found
@@ -75,14 +79,15 @@ def without_spikes(values: Array, spikes: Index) -> Array:
     if not spikes.size:
         return values
     repaired = values.copy()
-    repaired[spikes] = _cubic(values)[spikes]
+    repaired[spikes] -= _distance(values)[spikes]
     return repaired
 
 
-def _cubic(values: Array) -> Array:
-    """Value at each sample of the cubic through the two samples on either side, shape (n,); NaN at the ends."""
-    out, first, stop = np.full(values.size, np.nan), REACH, values.size - REACH
-    out[first:stop] = 0.0
-    for step, weight in NEIGHBOURS.items():
-        out[first:stop] += weight * values[first + step : stop + step]
+@njit(cache=True)
+def _distance(values: Array) -> Array:
+    """Each sample less the cubic through the two samples on either side, shape (n,); NaN at the ends."""
+    out = np.full(values.size, np.nan)
+    for i in range(REACH, values.size - REACH):
+        near, far = values[i - 1] + values[i + 1], values[i - 2] + values[i + 2]
+        out[i] = values[i] - NEAR_WEIGHT * near - FAR_WEIGHT * far
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
 
@@ -12,9 +13,16 @@ from recon.imaging.blur import SHARP_FRACTION, within_bound
 from recon.imaging.picture import Grid, grid_of_scan
 from recon.steps.preparation import PreparedRecording
 from recon.steps.reconstruction import Options
-from scanner.device import AXES
+from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
+from scanner.recording import Recording
+
+TRIED_S = 1.0
+"""Duration from the start of a scan with which the estimators are tried: hundreds of periods of a resonant mirror."""
+
+MIN_TRIED_PERIODS = 20.0
+"""Periods of either axis in this duration; in fewer, the motion of a start from rest may be all there is."""
 
 COMPARED_SAMPLES = 1 << 18
 """Samples from the start of the scan in which two motions are compared: 50 ms at 5 MS/s."""
@@ -36,7 +44,7 @@ def choose_estimator(prepared: PreparedRecording, options: Options) -> tuple[str
     if name != "sensor" or device.scan is None:
         return name, []
     grid = grid_of_scan(*options.pixels, device.scan)
-    sensed = estimate(recording, device, "sensor")
+    recording, sensed = _sense_beginning(recording, device)
     noise = sample_noise_px(sensed, grid)
     if min(within_bound(options.p, sd=np.array([sd])) for sd in noise.values()) >= SHARP_FRACTION:
         return "sensor", []
@@ -52,6 +60,17 @@ def choose_estimator(prepared: PreparedRecording, options: Options) -> tuple[str
         "follows the motion through the noise; --estimator sensor takes the samples as they are"
     )
     return "tracker", [note]
+
+
+def _sense_beginning(recording: Recording, device: Device) -> tuple[Recording, Motion]:
+    """The first ``TRIED_S`` of a recording, and the motion from its sensors; of all of it where that is too short."""
+    if recording.duration > TRIED_S:
+        with suppress(BadInput):
+            beginning = recording.slice(recording.start, recording.start + TRIED_S)
+            sensed = estimate(beginning, device, "sensor")
+            if TRIED_S * min(float(np.median(axis.frequency)) for axis in sensed.axes.values()) >= MIN_TRIED_PERIODS:
+                return beginning, sensed
+    return recording, estimate(recording, device, "sensor")
 
 
 def sample_noise_px(motion: Motion, grid: Grid) -> Mapping[str, float]:

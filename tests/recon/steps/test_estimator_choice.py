@@ -13,6 +13,7 @@ from phantoms.waveforms import Sine
 from recon.pipeline import reconstruct
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
+from recon.steps import estimator_choice
 from recon.steps.estimator_choice import choose_estimator
 from recon.steps.preparation import prepare
 from recon.steps.reconstruction import Options, Reconstruction
@@ -51,6 +52,21 @@ def reconstructed(estimator: str | None) -> Reconstruction:
 @pytest.mark.parametrize(("noise_px", "expected"), [(0.2, "sensor"), (NOISE_PX, "tracker")])
 def test_noise_beyond_the_tolerance_is_left_to_the_tracker(noise_px: float, expected: str) -> None:
     assert choose_estimator(prepare(scan(noise_px), None, False), Options(pixels=PIXELS))[0] == expected
+
+
+@pytest.mark.parametrize("tried", [0.03, 0.02])
+@pytest.mark.parametrize(("noise_px", "expected"), [(0.2, "sensor"), (NOISE_PX, "tracker")])
+def test_the_beginning_of_a_scan_decides_or_all_of_it_where_that_is_too_short(
+    monkeypatch: pytest.MonkeyPatch, tried: float, noise_px: float, expected: str
+) -> None:
+    monkeypatch.setattr(estimator_choice, "TRIED_S", tried)
+    lengths, estimate = [], estimator_choice.estimate
+    monkeypatch.setattr(
+        estimator_choice, "estimate", lambda part, *rest: (lengths.append(part.duration), estimate(part, *rest))[1]
+    )
+    recording = scan(noise_px)
+    assert choose_estimator(prepare(recording, None, False), Options(pixels=PIXELS))[0] == expected
+    assert lengths[-1] == pytest.approx(tried if tried == 0.03 else recording.duration, rel=1e-3)
 
 
 def test_a_model_that_is_worse_than_the_noise_is_not_used() -> None:
