@@ -16,6 +16,7 @@ from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_wild_samples, w
 from recon.quality.clock_jumps import longest_segment, separate_jump
 from recon.quality.defects import Defect, describe_clipped_positions, describe_held_signals
 from recon.quality.detector_gaps import describe_blanked_directions, describe_detector_gaps
+from recon.quality.pulsed_light import describe_pulsed_light
 from recon.sample_ranges import SampleRanges
 from recon.steps.preparation import PreparedRecording
 from scanner.channel import Channel
@@ -63,7 +64,11 @@ def describe_limits(
         beam, intensity, grid, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
         defects: of the recording.
     """
-    sums = describe_running_sums(intensity) or describe_blanked_directions(beam, intensity)
+    sums = (
+        describe_running_sums(intensity)
+        or describe_pulsed_light(beam, intensity)
+        or describe_blanked_directions(beam, intensity)
+    )
     return [
         *describe_clipped_positions(defects, beam, intensity.size / intensity.sample_rate),
         *describe_held_signals(defects, beam),
