@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.imaging.wild_samples import find_wild_samples, wild_limits
 from recon.quality.detector_gaps import QUIET_SD_SHARE
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -29,7 +30,8 @@ def describe_pulsed_light(beam: Motion, intensity: Channel) -> list[str]:
         intensity: of one or several detectors.
     """
     values = intensity.read(0, min(intensity.size, SEARCHED_SAMPLES))
-    values = values.reshape(len(values), -1)
+    usable = np.isfinite(values).reshape(len(values), -1) & ~find_wild_samples(values, wild_limits(values))
+    values = np.where(usable, values.reshape(len(values), -1), np.nan)
     cycles = np.array([float(np.median(axis.frequency)) for axis in beam.axes.values()]) / intensity.sample_rate
     most, found = 0.0, 0
     for period in range(2, min(MAX_PULSE_SAMPLES, len(values) // (2 * PARTS)) + 1):
@@ -54,6 +56,7 @@ def _dark_share(values: Array) -> float:
     Args:
         values: shape (parts, periods, samples, detectors).
     """
-    scatter = values.std(axis=1).max(axis=-1)
+    with np.errstate(over="ignore", invalid="ignore"):  # of damaged samples
+        scatter = values.std(axis=1).max(axis=-1)
     dark = scatter < QUIET_SD_SHARE * scatter.max(axis=1, keepdims=True)  # not where a sample is missing: NaN
     return float(dark[0].mean()) if (dark == dark[0]).all() else 0.0
