@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from estimation.rail import upper_rail, upper_rail_of_counts
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
-from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_wild_samples, wild_limits
+from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, usable_samples, wild_limits
 from recon.sample_ranges import SampleRanges
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples
@@ -30,7 +30,7 @@ def detector_rails(intensity: Channel) -> list[tuple[float, int] | None]:
     """Return the value at which each detector saturates and the number of checked samples there; None without."""
     count = min(intensity.size, MAX_CHECKED_SAMPLES)
     values = intensity.read(0, count)
-    usable = np.isfinite(values).reshape(count, -1) & ~find_wild_samples(values, wild_limits(values))
+    usable = usable_samples(values, wild_limits(values))
     finite = [column[use] for column, use in zip(values.reshape(count, -1).T, usable.T, strict=True)]
     rails = [upper_rail(each) if each.size else None for each in finite]
     if intensity.unit not in COUNT_UNITS:

@@ -47,6 +47,11 @@ def wild_limits(values: Array) -> WildLimits:
     return WildLimits(middle, *sides)
 
 
+def usable_samples(values: Array, limits: WildLimits) -> NDArray[np.bool_]:
+    """Whether each sample is finite and not wild, shape (n, detectors); arguments as :func:`find_wild_samples`."""
+    return np.isfinite(values).reshape(len(values), -1) & ~find_wild_samples(values, limits)
+
+
 def find_wild_samples(values: Array, limits: WildLimits) -> NDArray[np.bool_]:
     """Whether each sample is far from the median and the samples beside it are not, shape (n, detectors).
 

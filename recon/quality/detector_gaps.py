@@ -7,7 +7,7 @@ import numpy as np
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.scan_phase.bidirectional_phase import quadrature, slow_period
-from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, WildLimits, find_wild_samples, wild_limits
+from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, WildLimits, usable_samples, wild_limits
 from recon.sample_ranges import SampleRanges, runs_of_true, subtract_ranges
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -99,7 +99,7 @@ def _scatter(values: Array, limits: WildLimits) -> float:
     """Largest standard deviation of a detector in a block without its wild samples; NaN without samples."""
     if not len(values):
         return np.nan
-    usable = np.isfinite(values).reshape(len(values), -1) & ~find_wild_samples(values, limits)
+    usable = usable_samples(values, limits)
     known = values[usable.all(axis=1)]
     return float(known.reshape(len(known), -1).std(axis=0).max()) if len(known) else np.nan
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.imaging.wild_samples import find_wild_samples, wild_limits
+from recon.imaging.wild_samples import usable_samples, wild_limits
 from recon.quality.detector_gaps import QUIET_SD_SHARE
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -30,7 +30,7 @@ def describe_pulsed_light(beam: Motion, intensity: Channel) -> list[str]:
         intensity: of one or several detectors.
     """
     values = intensity.read(0, min(intensity.size, SEARCHED_SAMPLES))
-    usable = np.isfinite(values).reshape(len(values), -1) & ~find_wild_samples(values, wild_limits(values))
+    usable = usable_samples(values, wild_limits(values))
     values = np.where(usable, values.reshape(len(values), -1), np.nan)
     cycles = np.array([float(np.median(axis.frequency)) for axis in beam.axes.values()]) / intensity.sample_rate
     most, found = 0.0, 0

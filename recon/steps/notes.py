@@ -64,7 +64,7 @@ def describe_limits(
         beam, intensity, grid, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
         defects: of the recording.
     """
-    sums = (
+    misleading = (
         describe_running_sums(intensity)
         or describe_pulsed_light(beam, intensity)
         or describe_blanked_directions(beam, intensity)
@@ -72,7 +72,7 @@ def describe_limits(
     return [
         *describe_clipped_positions(defects, beam, intensity.size / intensity.sample_rate),
         *describe_held_signals(defects, beam),
-        *(sums or describe_doubled_axes(beam, intensity) or describe_contradictions(beam, intensity)),
+        *(misleading or describe_doubled_axes(beam, intensity) or describe_contradictions(beam, intensity)),
         *describe_saturation(intensity),
         *describe_lower_rail(intensity),
         *describe_detector_gaps(beam, intensity, grid, unlocated),

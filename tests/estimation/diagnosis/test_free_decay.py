@@ -60,6 +60,10 @@ def test_another_amplitude_or_a_drive_excludes_all() -> None:
     }
     with_drive = Recording.from_arrays({k: (*v, 0.0) for k, v in channels.items()}, driven)
     assert listed(with_drive, device=driven) == ()
+    bias = Recording.from_arrays(
+        {**{k: (*v, 0.0) for k, v in channels.items()}, "drive_x": (np.ones(4001), "V", SAMPLE_RATE, 0.0)}, driven
+    )
+    assert listed(bias, device=driven) == listed(decay(0.2))  # a constant bias does not
 
 
 def test_the_diagnosis_lists_it_with_the_measurement_that_separates_them(monkeypatch: pytest.MonkeyPatch) -> None:
