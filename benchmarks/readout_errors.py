@@ -139,13 +139,15 @@ def scan(seed: int, range_of_photons: Sequence[float]) -> dict[str, Any]:
             "rms_deg": summary[axis]["phase_rmse_deg"],
             "sd_deg": float(np.degrees(np.sqrt(np.mean(sd**2)))),
             "coverage": float(np.mean(np.abs(error) < 1.96 * sd)),
+            "amplitude_error": float(np.sqrt(np.mean(motion.amplitude**2) / 2.0) / np.std(known.angles[axis][0])) - 1.0,
+            "amplitude_sd": summary[axis]["amplitude_sd_rad"] / summary[axis]["amplitude_rad"],
         }
     return row
 
 
 HEADINGS = (
     "imperfection", "scans", "phase error x, y, rms: median", "worst", "both within 0.05°", "95 % intervals hold x, y",
-    "picture error over that of the true motion: 95 %",
+    "picture error over that of the true motion: 95 %", "amplitude within its 95 % interval, x and y",
 )  # fmt: skip
 
 
@@ -160,7 +162,11 @@ def table(rows: list[dict[str, Any]]) -> str:
             degrees = ["{:.3f}°, {:.3f}°".format(*values) for values in (np.median(rms, axis=0), rms.max(axis=0))]
             within, ratio = np.mean(rms.max(axis=1) <= 0.05), np.quantile([row["picture"] for row in chosen], 0.95)
             held_text = "{:.1%}, {:.1%}".format(*held)
-            lines.append((kind, str(len(chosen)), *degrees, f"{within:.0%}", held_text, f"{ratio:.3f}"))
+            amplitudes = [abs(r[a]["amplitude_error"]) < 1.96 * r[a]["amplitude_sd"] for r in chosen for a in "xy"]
+            held_amplitudes = f"{sum(amplitudes)} of {len(amplitudes)}"
+            lines.append(
+                (kind, str(len(chosen)), *degrees, f"{within:.0%}", held_text, f"{ratio:.3f}", held_amplitudes)
+            )
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

@@ -47,12 +47,25 @@ def amplitude_calibration_sd(
         return device.tolerance(axis, "gain")
     if readout is None or sensed.capacitance is None:
         return None
-    gains = ("a_cir",) if isinstance(readout, Amdm) else ("R_s", "V_bias")
+    return hypot(amplitude_sd_by_gain(device, axis, amplitude), device.tolerance(axis, "theta0"))
+
+
+def amplitude_sd_by_gain(device: Device, axis: str, amplitude: float) -> float:
+    """Relative standard deviation of an amplitude by the tolerances of the gains of a capacitive signal.
+
+    Args:
+        device: with a comb and a capacitive readout of this axis.
+        axis: its name.
+        amplitude: [rad].
+    """
+    sensed = device.sensed_axis(axis)
+    assert sensed.capacitance is not None
+    gains = ("a_cir",) if isinstance(sensed.readout, Amdm) else ("R_s", "V_bias")
     gain_sd = hypot(device.tolerance(axis, "C0"), *(device.tolerance(axis, key) for key in gains))
     steps = amplitude * (1.0 + np.array([-RELATIVE_STEP, RELATIVE_STEP]))
     behind, ahead = (np.log(_second_harmonic(float(each), sensed.capacitance)) for each in steps)
     slope = max(abs(float(ahead - behind)) / (2 * RELATIVE_STEP), RELATIVE_STEP)  # d ln S / d ln A
-    return hypot(gain_sd / slope, device.tolerance(axis, "theta0"))
+    return gain_sd / slope
 
 
 def motion_calibration_sd(recording: Recording, device: Device, axis: str, motion: Motion) -> float | None:

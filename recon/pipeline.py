@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from estimation.amplitude_calibration import motion_calibration_sd
 from estimation.estimate import estimate
 from recon.evaluation import Truth, evaluate_axis
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
@@ -24,6 +23,7 @@ from recon.imaging.sample_motion.correction import describe_sample_motion, measu
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.imaging.scan_phase.image_phase import refine_motion
 from recon.imaging.scan_phase.start_shift import describe_start_shift
+from recon.quality.amplitude_check import amplitude_calibration, compare_with_signal, describe_contradictions
 from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
@@ -196,6 +196,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
     motion, beam, intensity = estimated.motion, estimated.beam, prepared.intensity
     noise = measure_noise(beam, intensity, estimated.grid)
     estimate = estimate_picture(options.picture, gridded.picture, noise, beam, intensity, gridded.unlocated)
+    amplitude_checks = compare_with_signal(prepared.recording, prepared.device, motion)
     samples, angles = (beam, intensity, estimated.grid, gridded.unlocated), truth.angles if truth else {}
     return Reconstruction(
         motion=motion,
@@ -206,9 +207,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         data_share=estimate.data_share,
         resolution_px=estimate.resolution_px,
         sample_noise=noise,
-        amplitude_calibration={
-            name: motion_calibration_sd(prepared.recording, prepared.device, name, motion) for name in motion.axes
-        },
+        amplitude_calibration=amplitude_calibration(prepared.recording, prepared.device, motion, amplitude_checks),
         p=options.p,
         spot=options.spot,
         phase_errors=estimated.phase_errors or [],
@@ -234,6 +233,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *prepared.clock_notes,
             *prepared.unknown_entries,
             *estimated.motion_notes,
+            *describe_contradictions(amplitude_checks),
             *describe_motion(motion, intensity),
             *describe_defects(prepared.defects),
             *describe_intensity(intensity),

@@ -1,0 +1,209 @@
+"""Amplitude of an axis by the harmonics of its capacitive signal, as a check of the estimated one.
+
+The size of the signal's second harmonic gives the amplitude through the gains of the comb and of the readout; the
+fourth harmonic over the second gives it through theta0 alone. An estimator weighs both and the response to the drive.
+All agree if the device describes the mirror. They differ if the device file is of another mirror, a gain is wrong, or
+the drive feeds through into the signal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from math import hypot, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from estimation.amplitude_calibration import amplitude_sd_by_gain
+from estimation.signals import SenseChannel, sense_channels
+from scanner.active_terms import stated_terms
+from scanner.arrays import Array, Complex
+from scanner.device import Axis, Device
+from scanner.harmonics import capacitance_harmonics, readout_response
+from scanner.motion import AxisMotion, Motion
+from scanner.recording import Recording
+from scanner.stages import Amdm, Capacitance, Readout, Transimpedance
+
+BLOCK_PERIODS = 20
+"""Periods of the slowest axis in a block: the harmonics of two axes are apart by several lines of the block's
+spectrum, and frequency and amplitude stay the same within it."""
+
+MAX_BLOCKS = 16
+"""Blocks, evenly over the recording. Each costs some milliseconds; their scatter gives the standard deviation."""
+
+MIN_BLOCKS = 8
+"""Fewer blocks do not give a standard deviation of the noise."""
+
+FITTED_ORDERS = (1, 2, 3, 4, 6)
+"""Harmonics of every axis that are fitted together: the two that are compared and the strongest others."""
+
+RELATIVE_STEP = 1e-3
+"""Relative change of the amplitude or of a cut-off frequency for a derivative."""
+
+MIN_CONTRADICTION_SDS = 4.0
+"""Difference of two amplitudes from which they contradict, in standard deviations. Those of the tolerances are round
+numbers of a data sheet; a normal deviation exceeds it by chance once in 16 000 axes."""
+
+
+@dataclass(frozen=True)
+class HarmonicAmplitude:
+    """Comparison of a harmonic with the one that the device gives at the estimated amplitude.
+
+    Attributes:
+        measured, expected: second harmonic of the comb's capacitance [F], or fourth over second harmonic [1].
+        difference: relative change of the amplitude that makes them equal, to first order.
+        sd: its standard deviation by the noise and by the stated tolerances.
+    """
+
+    measured: float
+    expected: float
+    difference: float
+    sd: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether noise and tolerances do not explain the difference."""
+        return abs(self.difference) > MIN_CONTRADICTION_SDS * self.sd
+
+
+class AmplitudeCheck(NamedTuple):
+    """Comparison of an estimated amplitude with the size and the shape of the signal."""
+
+    size: HarmonicAmplitude
+    shape: HarmonicAmplitude
+
+    @property
+    def error_sd(self) -> float:
+        """Relative standard deviation of the amplitude by contradictions, 0 where there is none."""
+        return max((abs(each.difference) for each in self if each.contradicts), default=0.0)
+
+
+def check_amplitudes(recording: Recording, device: Device, motion: Motion) -> dict[str, AmplitudeCheck]:
+    """Compare the amplitude of every axis with its capacitive signal.
+
+    Args:
+        recording, device: of the scan.
+        motion: estimated from its sense channels.
+
+    Returns:
+        By axis. An axis is left out if its signal is not capacitive, a term of the device changes the harmonics, or the
+        recording is too short.
+    """
+    checked = {}
+    for sense in sense_channels(recording, device, gaps_ok=True):
+        if not isinstance(sense.readout, (Amdm, Transimpedance)):
+            continue
+        for name, blocks in _harmonics(sense, motion).items():
+            axis = device.sensed_axis(name)
+            if axis.capacitance is not None and not _changes_harmonics(axis) and blocks.frequency.size >= MIN_BLOCKS:
+                checked[name] = _check(blocks, axis.capacitance, sense.readout, device, name)
+    return checked
+
+
+def _changes_harmonics(axis: Axis) -> bool:
+    """Whether the device states a term of the comb or of the readout."""
+    return any(each.term.stage not in ("mechanics", "drive", "optics") for each in stated_terms(axis))
+
+
+class _Blocks(NamedTuple):
+    """Harmonics of one axis in the blocks, each of shape (blocks,): of the signal [V], with frequency [Hz] and
+    amplitude [rad] of the motion."""
+
+    second: Complex
+    fourth: Complex
+    frequency: Array
+    amplitude: Array
+
+
+def _harmonics(sense: SenseChannel, motion: Motion) -> dict[str, _Blocks]:
+    """Harmonics of every axis of a sense channel, in blocks in which no sample is missing."""
+    channel, axes = sense.channel, {name: motion.axes[name] for name in sense.axes if name in motion.axes}
+    slowest = min(float(np.median(axis.frequency)) for axis in axes.values())
+    length = int(np.ceil(BLOCK_PERIODS / slowest * channel.sample_rate))
+    lines = list(product(axes, FITTED_ORDERS))
+    rows: dict[str, list[tuple[complex, complex, float, float]]] = {name: [] for name in axes}
+    number = min(MAX_BLOCKS, channel.size // length)
+    for first in np.linspace(0, channel.size - length, number, dtype=int) if number else ():
+        values = channel.read(first, first + length)
+        if not np.isfinite(values).all():
+            continue
+        states = {
+            name: _state(axis, channel.start + (first + length / 2) / channel.sample_rate)
+            for name, axis in axes.items()
+        }
+        frequencies = np.array([order * states[name][0] for name, order in lines])
+        found = dict(zip(lines, _fit_lines(values, frequencies / channel.sample_rate), strict=True))
+        for name, state in states.items():
+            rows[name].append((found[name, 2], found[name, 4], *state))
+    return {
+        name: _Blocks(*(np.array(column) for column in zip(*row, strict=True))) for name, row in rows.items() if row
+    }
+
+
+def _state(axis: AxisMotion, time: float) -> tuple[float, float]:
+    """Frequency [Hz] and amplitude [rad] at a time [s]."""
+    return float(np.interp(time, axis.time, axis.frequency)), float(np.interp(time, axis.time, axis.amplitude))
+
+
+def _fit_lines(values: Array, frequencies: Array) -> Complex:
+    """Least-squares coefficients c of Re(c exp(2 pi i f n)) about the middle of a signal, beside an offset.
+
+    Args:
+        values: shape (n,).
+        frequencies: f [cycles a sample], shape (lines,).
+    """
+    turns = 2 * np.pi * np.outer(np.arange(values.size) - values.size / 2, frequencies)
+    columns = np.hstack([np.cos(turns), -np.sin(turns), np.ones((values.size, 1))])
+    real, imaginary = np.split(np.linalg.lstsq(columns.T @ columns, columns.T @ values)[0][:-1], 2)
+    return np.asarray(real + 1j * imaginary)
+
+
+def _check(blocks: _Blocks, comb: Capacitance, readout: Readout, device: Device, name: str) -> AmplitudeCheck:
+    second = blocks.second / readout_response(readout, 2 * blocks.frequency)
+    fourth = blocks.fourth / readout_response(readout, 4 * blocks.frequency)
+    steps = np.array([1.0 - RELATIVE_STEP, 1.0, 1.0 + RELATIVE_STEP])
+    harmonics = np.array(
+        [[capacitance_harmonics(each, comb)[[2, 4]] for each in row] for row in np.outer(steps, blocks.amplitude)]
+    )
+    by_gain = amplitude_sd_by_gain(device, name, float(blocks.amplitude.mean()))
+    lowpass_sd = _lowpass_sds(readout, float(blocks.frequency.mean()), device, name)
+    size = _compare(np.abs(second), np.abs(harmonics[:, :, 0]), lowpass_sd[0])
+    shape = _compare(
+        _shape(second, fourth), _shape(harmonics[:, :, 0], harmonics[:, :, 1]), lowpass_sd[1] - lowpass_sd[0]
+    )
+    return AmplitudeCheck(*(replace(each, sd=hypot(each.sd, by_gain)) for each in (size, shape)))
+
+
+def _compare(measured: Array, expected: Array, relative_sd: float) -> HarmonicAmplitude:
+    """Compare in blocks.
+
+    Args:
+        measured: shape (blocks,).
+        expected: for an amplitude less than, equal to and more than the estimated one by ``RELATIVE_STEP``, shape
+            (3, blocks).
+        relative_sd: of ``measured`` beside the noise.
+    """
+    behind, at, ahead = expected
+    slope = (ahead - behind) / (2 * RELATIVE_STEP * at)  # d ln expected / d ln A
+    differences = (measured / at - 1.0) / slope
+    noise = float(np.std(differences, ddof=1)) / sqrt(differences.size)
+    systematic = relative_sd / float(np.abs(slope).mean())
+    return HarmonicAmplitude(
+        float(measured.mean()), float(at.mean()), float(differences.mean()), hypot(noise, systematic)
+    )
+
+
+def _shape(second: Complex, fourth: Complex) -> Array:
+    """Fourth harmonic over the size of the second one, in phase with the square of the second one."""
+    return np.asarray((fourth * np.conj(second) ** 2).real / np.abs(second) ** 3)
+
+
+def _lowpass_sds(readout: Readout, frequency: float, device: Device, name: str) -> Array:
+    """Relative change of the second and fourth harmonic by the tolerance of the cut-off frequencies, shape (2,)."""
+    if not isinstance(readout, Amdm):
+        return np.zeros(2)
+    higher = replace(readout, lpf_hz=tuple((1.0 + RELATIVE_STEP) * each for each in readout.lpf_hz))
+    harmonics = np.array([2.0, 4.0]) * frequency
+    changes = np.abs(readout_response(higher, harmonics) / readout_response(readout, harmonics)) - 1.0
+    return np.asarray(device.tolerance(name, "lpf_hz") / RELATIVE_STEP * changes)

@@ -1,0 +1,52 @@
+"""Whether the size and the shape of a capacitive signal agree with the amplitude that was estimated from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import hypot
+
+from estimation.amplitude_calibration import motion_calibration_sd
+from estimation.harmonic_amplitude import AmplitudeCheck, check_amplitudes
+from scanner.device import Device
+from scanner.motion import Motion
+from scanner.recording import Recording
+
+ESTIMATORS_WITHOUT_SENSE = ("picture", "edges", "sensor")
+"""Estimators whose motion does not come from a capacitive signal."""
+
+
+def compare_with_signal(recording: Recording, device: Device, motion: Motion) -> Mapping[str, AmplitudeCheck]:
+    """As :func:`estimation.harmonic_amplitude.check_amplitudes`; empty if another signal gave the motion."""
+    return {} if motion.estimator in ESTIMATORS_WITHOUT_SENSE else check_amplitudes(recording, device, motion)
+
+
+def amplitude_calibration(
+    recording: Recording, device: Device, motion: Motion, checks: Mapping[str, AmplitudeCheck]
+) -> dict[str, float | None]:
+    """Relative standard deviation of every amplitude by the stated tolerances and by what contradicts them.
+
+    Returns:
+        By axis; None where nothing calibrates the amplitude.
+    """
+    stated = {name: motion_calibration_sd(recording, device, name, motion) for name in motion.axes}
+    return {
+        name: hypot(sd, checks[name].error_sd) if sd is not None and name in checks else sd
+        for name, sd in stated.items()
+    }
+
+
+def describe_contradictions(checks: Mapping[str, AmplitudeCheck]) -> list[str]:
+    """A line for every axis whose signal contradicts the device at the estimated amplitude."""
+    lines = []
+    for name, check in checks.items():
+        if not check.error_sd:
+            continue
+        second, shape = (each.measured / each.expected for each in check)
+        lines.append(
+            f"{name}: the sense signal contradicts the device: at the estimated amplitude its second harmonic is "
+            f"{second:.3g} times what the device gives, and the ratio of the fourth to the second {shape:.3g} times, "
+            "more than the stated tolerances allow; the amplitude, and with it the scale of the picture, may be wrong "
+            f"by {100 * check.error_sd:.2g} %. Check C0, theta0 and the gain of the readout, and whether the drive "
+            "feeds through (diagnose)"
+        )
+    return lines
