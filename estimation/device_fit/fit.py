@@ -10,9 +10,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
 
 from estimation.device_fit.data import Run
+from estimation.device_fit.deviations import MIN_PULL_PROBABILITY, deviations_are_improbable
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener
 from estimation.least_squares import fit_levenberg_marquardt, laplace_neg2_log_evidence
@@ -43,10 +43,6 @@ small enough for the residual to change linearly."""
 MIN_STEP, MAX_STEP, STEP_WITHOUT_EFFECT = 1e-7, 3e-2, 1e-2
 """Bounds of a difference step, and the step of a parameter without effect, in prior standard deviations. Below the
 first, rounding dominates; above the second, the change is no longer linear."""
-
-MIN_PULL_PROBABILITY = 1e-3
-"""Probability of nominal values as far from the stated ones, in tolerances, below which they have absorbed a misfit, or
-contradict their tolerances: one false alarm in a thousand recordings without any effect."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +90,7 @@ def misfit(fit: Fit) -> float:
 
 def nominal_values_are_improbable(fit: Fit, probability: float = MIN_PULL_PROBABILITY) -> bool:
     """Whether the nominal values lie so far from the stated ones, in tolerances, that they have absorbed a misfit."""
-    pulls = fit.x[fit.model.indices("nominal")]
-    return bool(chi2_distribution.sf(pulls @ pulls, pulls.size) < probability)
+    return deviations_are_improbable(fit.x[fit.model.indices("nominal")], probability)
 
 
 def stated_values(model: Model, x: Array) -> Array:

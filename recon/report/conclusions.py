@@ -8,6 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from estimation.device_fit.deviations import deviations_are_improbable
 from recon.imaging.blur import SHARP_FRACTION
 from recon.imaging.frame_axis import format_positions
 from recon.report.numbers import format_degrees, format_interval, format_value
@@ -19,6 +22,9 @@ samples are then in a wrong pixel."""
 
 MIN_CERTAIN_PROBABILITY = 0.9
 """Probability of a finding from which it is stated without its probability."""
+
+VALUES_LISTED = 4
+"""Values of the device that are listed where they contradict their tolerances: those of a comb and its gain."""
 
 
 def condition_on_clock(summary: Mapping[str, Any]) -> str:
@@ -79,7 +85,7 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
             f" Predicted from the drive alone, the nominal motion is wrong by {format_value(blur_px[0], 2)} px rms in "
             "a picture of 400 pixels."
         )
-    text += modes
+    text += modes + _describe_values(content)
     loops = content.get("open_loop", {}).values()
     in_picture = any(finding["channel"] == "intensity" for finding in findings)
     if loops and not in_picture and all(loop["improved"] == loop["nominal"] for loop in loops):
@@ -89,6 +95,20 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}{_describe_remainder(content)}."
     return text + remarks
+
+
+def _describe_values(content: Mapping[str, Any]) -> str:
+    """Values of the device that contradict their tolerances; empty if they are as probable as in a right device."""
+    deviations = {name: value["pull"] for name, value in content.get("nominal", {}).items()}
+    if not deviations or not deviations_are_improbable(np.array(list(deviations.values()))):
+        return ""
+    far = [name for name, deviation in deviations.items() if abs(deviation) > 1.0]
+    largest = sorted(far, key=lambda name: -abs(deviations[name]))[:VALUES_LISTED]
+    listed = ", ".join(f"{name} by {format_value(deviations[name], 2)}" for name in largest)
+    return (
+        f" Values of the device, as fitted, lie far outside their tolerances: {listed} tolerances. Check that the "
+        "device file is of this mirror and that its tolerances are right: with right values less may be missing."
+    )
 
 
 def _describe_remainder(content: Mapping[str, Any]) -> str:

@@ -101,3 +101,22 @@ def test_a_prediction_that_misses_the_signal_is_called_so(rmse: float, useless: 
     loops = {"sense_x": {"nominal": open_loop(9.0), "improved": open_loop(rmse)}}
     text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("unknown", 1.0)], "open_loop": loops})
     assert ("That is no better than no prediction of sense_x." in text) is useless
+
+
+@pytest.mark.parametrize(
+    ("pulls", "stated"),
+    [
+        (
+            {"x.capacitance.C0": 7.65, "x.readout.R_s": 3.31, "x.mechanics.b": -0.12, "x.capacitance.theta0": -2.91},
+            True,
+        ),
+        ({"x.capacitance.C0": 2.4, "x.readout.R_s": 1.1, "x.mechanics.b": -1.2, "x.capacitance.theta0": -0.4}, False),
+        ({}, False),
+    ],
+)
+def test_values_far_outside_their_tolerances_are_named(pulls: dict[str, float], stated: bool) -> None:
+    nominal = {name: {"pull": pull} for name, pull in pulls.items()}
+    text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("unknown", 1.0)], "nominal": nominal})
+    listed = "x.capacitance.C0 by 7.7, x.readout.R_s by 3.3, x.capacitance.theta0 by −2.9 tolerances"
+    assert (listed in text) == stated
+    assert ("Check that the device file is of this mirror" in text) == stated
