@@ -8,6 +8,7 @@ the drive feeds through into the signal.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from math import hypot, sqrt
@@ -17,6 +18,7 @@ import numpy as np
 
 from estimation.amplitude_calibration import amplitude_sd_by_gain
 from estimation.signals import SenseChannel, sense_channels
+from estimation.tracker.demodulation import harmonic_basis
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array, Complex
 from scanner.device import Axis, Device
@@ -121,21 +123,18 @@ def _harmonics(sense: SenseChannel, motion: Motion) -> dict[str, _Blocks]:
     channel, axes = sense.channel, {name: motion.axes[name] for name in sense.axes if name in motion.axes}
     slowest = min(float(np.median(axis.frequency)) for axis in axes.values())
     length = int(np.ceil(BLOCK_PERIODS / slowest * channel.sample_rate))
-    lines = list(product(axes, FITTED_ORDERS))
+    lines = list(product(range(len(axes)), FITTED_ORDERS))
     rows: dict[str, list[tuple[complex, complex, float, float]]] = {name: [] for name in axes}
     number = min(MAX_BLOCKS, channel.size // length)
     for first in np.linspace(0, channel.size - length, number, dtype=int) if number else ():
-        values = channel.read(first, first + length)
+        values, time = channel.read(first, first + length), channel.start + (first + length / 2) / channel.sample_rate
         if not np.isfinite(values).all():
             continue
-        states = {
-            name: _state(axis, channel.start + (first + length / 2) / channel.sample_rate)
-            for name, axis in axes.items()
-        }
-        frequencies = np.array([order * states[name][0] for name, order in lines])
-        found = dict(zip(lines, _fit_lines(values, frequencies / channel.sample_rate), strict=True))
-        for name, state in states.items():
-            rows[name].append((found[name, 2], found[name, 4], *state))
+        states = [_state(axis, time) for axis in axes.values()]
+        frequencies = np.array([frequency for frequency, _ in states])
+        found = dict(zip(lines, _fit_lines(values, channel.sample_rate, lines, frequencies), strict=True))
+        for index, name in enumerate(axes):
+            rows[name].append((found[index, 2], found[index, 4], *states[index]))
     return {
         name: _Blocks(*(np.array(column) for column in zip(*row, strict=True))) for name, row in rows.items() if row
     }
@@ -146,17 +145,17 @@ def _state(axis: AxisMotion, time: float) -> tuple[float, float]:
     return float(np.interp(time, axis.time, axis.frequency)), float(np.interp(time, axis.time, axis.amplitude))
 
 
-def _fit_lines(values: Array, frequencies: Array) -> Complex:
-    """Least-squares coefficients c of Re(c exp(2 pi i f n)) about the middle of a signal, beside an offset.
+def _fit_lines(values: Array, rate: float, lines: Sequence[tuple[int, int]], frequencies: Array) -> Complex:
+    """Least-squares coefficients c of Re(c exp(i n w t)) about the middle of a signal with an offset, shape (lines,).
 
     Args:
-        values: shape (n,).
-        frequencies: f [cycles a sample], shape (lines,).
+        values: shape (n,), at ``rate`` [Hz].
+        lines: (index of the frequency, order n) of each.
+        frequencies: w / 2 pi, shape (axes,) [Hz].
     """
-    turns = 2 * np.pi * np.outer(np.arange(values.size) - values.size / 2, frequencies)
-    columns = np.hstack([np.cos(turns), -np.sin(turns), np.ones((values.size, 1))])
-    real, imaginary = np.split(np.linalg.lstsq(columns.T @ columns, columns.T @ values)[0][:-1], 2)
-    return np.asarray(real + 1j * imaginary)
+    basis = harmonic_basis(values.size, rate, np.array(lines), 2 * np.pi * frequencies)
+    coefficients = np.linalg.lstsq(basis @ basis.T, basis @ values)[0][1:]
+    return np.asarray(coefficients[::2] - 1j * coefficients[1::2])
 
 
 def _check(blocks: _Blocks, comb: Capacitance, readout: Readout, device: Device, name: str) -> AmplitudeCheck:
