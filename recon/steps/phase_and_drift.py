@@ -17,6 +17,13 @@ from recon.imaging.intensity_correction import (
 )
 from recon.imaging.scan_phase.bidirectional_phase import measure_motion_phase_errors
 from recon.imaging.scan_phase.contradicted_phase import include_contradictions
+from recon.imaging.scan_phase.detector_offset import (
+    describe_unstated_place,
+    one_direction_axes,
+    remove_detector_offsets,
+    stated_event,
+    widen_by_unstated_place,
+)
 from recon.imaging.scan_phase.phase_agreement import Contradiction, find_contradictions
 from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
@@ -82,7 +89,8 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
 
     Where the picture changes its timing at some moment, the motion is not corrected, because dropped samples are to be
-    restored first. The standard deviation of the phase includes the errors that are left.
+    restored first. The standard deviation of the phase includes the errors that are left, and the unknown place of a
+    detector with edges of one direction where the picture determines no phase.
     """
     motion = estimated.motion
 
@@ -94,15 +102,24 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         contradictions = _find_contradictions(estimated, {})
         motion = include_contradictions(motion, contradictions)
         return replace(estimated, motion=motion, phase_errors=errors, contradictions=contradictions)
-    sensed = motion
     readout_phase: Mapping[str, ReadoutPhase] = {}
-    notes: list[str] = []
     contradictions = []
+    motion, notes = remove_detector_offsets(
+        motion, lambda each: replace(estimated, motion=each).beam, estimated.prepared.intensity, estimated.grid
+    )
+    if motion is not estimated.motion:
+        errors = register(motion)
+    sensed, placed = motion, _replaced_axes(estimated.motion, motion)
     if not _loses_timing(estimated, errors):
         one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
         motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
         contradictions = _find_contradictions(replace(estimated, motion=motion), readout_phase)
-        notes = describe_readout_phase(motion, readout_phase, {each.axis for each in contradictions})
+        contradicted = {each.axis for each in contradictions}
+        undetermined = set(one_direction_axes(motion)) - set(readout_phase) - contradicted - placed
+        notes += [describe_unstated_place(name, stated_event(motion, name)) for name in sorted(undetermined)]
+        notes += describe_readout_phase(motion, readout_phase, contradicted | undetermined)
+        widened = {name: widen_by_unstated_place(motion.axes[name]) for name in undetermined}
+        motion = replace(motion, axes={**motion.axes, **widened})
     motion, remaining_notes = include_remaining_errors(motion, errors)
     without_readout, _ = include_remaining_errors(sensed, errors)
     without_readout = include_contradictions(without_readout, contradictions)
@@ -115,6 +132,11 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         estimator_phase_sd={name: axis.phase_sd for name, axis in without_readout.axes.items()},
         motion_notes=[*notes, *remaining_notes, *estimated.motion_notes],
     )
+
+
+def _replaced_axes(before: Motion, after: Motion) -> set[str]:
+    """Names of the axes whose motion was replaced."""
+    return {name for name, axis in after.axes.items() if axis is not before.axes[name]}
 
 
 def _find_contradictions(estimated: EstimatedMotion, measured: Mapping[str, ReadoutPhase]) -> list[Contradiction]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.imaging.scan_phase.detector_offset import stated_event
 from recon.imaging.scan_phase.phase_agreement import axis_phases
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -58,7 +59,7 @@ def describe_doubled_axes(beam: Motion, intensity: Channel) -> list[str]:
     """
     found = {}
     for column, name in enumerate(AXES):
-        if _event(beam, name).startswith("zero-crossing"):
+        if stated_event(beam, name).startswith("zero-crossing"):
             excess, sd = _excess_of_successive(beam, intensity, column)
             if _is_significant(excess, sd):
                 found[name] = excess
@@ -69,15 +70,9 @@ def describe_doubled_axes(beam: Motion, intensity: Channel) -> list[str]:
     return [
         f"{name}: samples of one place agree in every second period only, and differ by {np.exp(found[name]):.3g} "
         f"times their noise (squared) in successive ones, as if {name} moved at {frequency / 2:.6g} Hz in place of "
-        f"{frequency:.6g} Hz, so that the picture is wrong: sync_{name} states {_event(beam, name)} and probably holds "
-        f"the crossings in both directions; state event as both-edges"
+        f"{frequency:.6g} Hz, so that the picture is wrong: sync_{name} states {stated_event(beam, name)} and probably "
+        f"holds the crossings in both directions; state event as both-edges"
     ]
-
-
-def _event(beam: Motion, name: str) -> str:
-    """What the edges of an axis state that an edge is; empty for an axis without edges."""
-    stated = beam.info.get(f"sync_{name}")
-    return str(stated.get("event", "")) if isinstance(stated, dict) else ""
 
 
 def _excess_of_successive(beam: Motion, intensity: Channel, column: int) -> tuple[float, float]:

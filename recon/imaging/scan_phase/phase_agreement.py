@@ -205,9 +205,10 @@ def _describe(found: Contradiction, moved: AxisMotion) -> str:
     if abs(typical) > pi / 2 - SEARCH_REACH_RAD:
         return line + f"check kind in [{name}.readout], as velocity and position differ by 90°, or start of channels"
     late = 1e6 * typical / (2 * pi * frequency)
-    return line + (
-        f"check start of the channels and the sensor's delay, which would be {late:.3g} µs plus any half-periods"
-    )
+    line += f"check start of the channels and the sensor's delay, which would be {late:.3g} µs plus any half-periods"
+    if moved.sign == f"known: sync_{name}":
+        line += ", and, if the edges are of one direction, that their detector is in the centre"
+    return line
 
 
 def _slices(beam: Motion, intensity: Channel) -> list[tuple[int, int]]:
