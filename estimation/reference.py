@@ -94,7 +94,13 @@ def absolute_reference(frequency: float, start: float, end: float) -> PhaseRefer
     return PhaseReference("absolute", frequency, np.array([start, end]), np.zeros(2))
 
 
-def drive_reference(drive: Channel, kind: str, low: float = 0.0, frequency: float | None = None) -> PhaseReference:
+def drive_reference(
+    drive: Channel,
+    kind: str,
+    low: float = 0.0,
+    frequency: float | None = None,
+    span: tuple[float, float] | None = None,
+) -> PhaseReference:
     """The reference from a recorded drive voltage; the phase is interpolated linearly through gaps (NaN).
 
     Args:
@@ -102,6 +108,7 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0, frequency: floa
         kind: ``"half-drive"`` for a parametric drive, ``"drive"`` for a linear one.
         low: lower bound of the drive's frequency [Hz]; lines below come from switching it on and off.
         frequency: of the drive in an earlier segment [Hz], near which it is still; searched for where None.
+        span: first and last time of the reference [s], by default those of the drive: see ``_with_steady_ends``.
 
     Raises:
         BadInput: the drive holds no oscillation.
@@ -118,9 +125,33 @@ def drive_reference(drive: Channel, kind: str, low: float = 0.0, frequency: floa
     phase, size = np.angle(phasors), np.nan_to_num(np.abs(phasors))
     on = size > DRIVE_ON_RATIO * size.max()
     time, phase = (time[on], phase[on]) if on.sum() >= 2 else (time, phase)
-    slow = unwrap_phase(phase)
+    time, slow = _with_steady_ends(time, unwrap_phase(phase), *(span or (drive.start, drive.end)))
     ratio = 0.5 if kind == "half-drive" else 1.0
     return PhaseReference(kind, ratio * f, time, ratio * slow)
+
+
+def _with_steady_ends(time: Array, slow: Array, start: float, end: float) -> tuple[Array, Array]:
+    """Knots of a phase that continues to ``start`` and ``end`` [s] at the frequency of its part beside them.
+
+    The frequency is that of a part as long as the extension, which bounds the error of the phase at its end to a few
+    times that of single knots. Knots that reach the ends within their distance are returned as they are.
+
+    Args:
+        time, slow: of the knots, shape (n,) [s, rad].
+    """
+    if time.size < 2:
+        return time, slow
+    distance, ends = float(np.median(np.diff(time))), []
+    for at, reach in ((start, time[0] - start), (end, end - time[-1])):
+        if reach <= distance:
+            continue
+        near = np.abs(time - at) <= max(2.0 * reach, reach + distance)
+        middle = float(time[near].mean())
+        slope, level = np.polyfit(time[near] - middle, slow[near], 1) if near.sum() > 1 else (0.0, slow[near].mean())
+        ends.append((at, level + slope * (at - middle)))
+    times, phases = np.append(time, [each[0] for each in ends]), np.append(slow, [each[1] for each in ends])
+    order = np.argsort(times)
+    return times[order], phases[order]
 
 
 def drive_phasors(drive: Channel, frequency: float, cycles: float) -> tuple[Array, Complex, int]:
@@ -200,15 +231,19 @@ def sampled_too_slowly(channel: Channel, what: str, frequency: float, order: int
     return BadInput(rate, file=channel.file, channel=channel.name, hint=hint)
 
 
-def not_covered(channel: Channel, what: str, start: float, end: float) -> BadInput:
-    """The error of a channel that was not recorded during all of ``what``, from ``start`` to ``end`` [s]."""
+def not_covered(channel: Channel, what: str, start: float, end: float, remedy: str = "") -> BadInput:
+    """The error of a channel that was not recorded during all of ``what``, from ``start`` to ``end`` [s].
+
+    Args:
+        remedy: what helps beside a longer record.
+    """
     both = max(start, channel.start), min(end, channel.end)
     cut = f", or cut the recording in Python: Recording.open(file).slice({both[0]:.6g}, {both[1]:.6g}).write(cut)"
     return BadInput(
         f"covers {channel.start:.6g} to {channel.end:.6g} s, {what} {start:.6g} to {end:.6g} s",
         file=channel.file,
         channel=channel.name,
-        hint="record both over the same time" + (cut if both[0] < both[1] else ""),
+        hint="record both over the same time" + remedy + (cut if both[0] < both[1] else ""),
     )
 
 

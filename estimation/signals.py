@@ -148,6 +148,7 @@ def phase_reference(
         drive = recording[f"drive_{axis}"]
         check_signal(drive, gaps_ok=True)
         low = 0.1 * stated.resonance if stated.mechanics else 0.0
+        span = min(recording.start, drive.start), max(recording.end, drive.end)
         if stated.require_drive().kind == "linear":
             quasistatic = (
                 low > 0.0
@@ -156,8 +157,8 @@ def phase_reference(
             )
             if low and not quasistatic and drive.sample_rate < MIN_SAMPLES_PER_PERIOD * stated.resonance:
                 raise sampled_too_slowly(drive, "a drive of the resonance", stated.resonance)
-            return drive_reference(drive, "drive", 0.0 if quasistatic else low, frequency)
-        reference = drive_reference(drive, "half-drive", low, frequency and 2.0 * frequency)
+            return drive_reference(drive, "drive", 0.0 if quasistatic else low, frequency, span)
+        reference = drive_reference(drive, "half-drive", low, frequency and 2.0 * frequency, span)
         if stated.mechanics and not 0.75 < reference.frequency / stated.resonance < 1.33:
             raise BadInput(
                 f"oscillates at {2 * reference.frequency:.6g} Hz, and axis {axis} moves at half of that near its "

@@ -86,5 +86,5 @@ def _at_samples(voltage: Channel | None, sense: Channel) -> Array:
     if (voltage.sample_rate, voltage.start, voltage.size) == (sense.sample_rate, sense.start, sense.size):
         return voltage.read()
     if voltage.start > sense.start + 1.0 / voltage.sample_rate or voltage.end < sense.end - 1.0 / voltage.sample_rate:
-        raise not_covered(voltage, sense.name, sense.start, sense.end)
+        raise not_covered(voltage, sense.name, sense.start, sense.end, ", or use the estimator tracker")
     return np.interp(sense.time(), voltage.time(), voltage.read())

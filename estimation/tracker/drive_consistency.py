@@ -8,7 +8,6 @@ is left out as a gap. A drive that was switched off leaves a motion that decays,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,12 +42,15 @@ whether the damping of the device was right or 30 % wrong."""
 
 def without_contradicted_pauses(
     recording: Recording, device: Device, layout: BlockLayout
-) -> tuple[BlockLayout, list[str]]:
-    """The layout with a drive that continues through the pauses that the motion contradicts, and a note for each axis.
+) -> tuple[BlockLayout, dict[str, list[tuple[int, int]]]]:
+    """The layout with a drive that continues through the pauses that the motion contradicts, and these by axis.
 
     Args:
         recording: with the drives.
         layout: blocks of a sense channel of the recording.
+
+    Returns:
+        the layout, and ranges (first, stop) of samples of the drives.
     """
     drives = {name: recording[f"drive_{name}"] for name in layout.sense.axes if f"drive_{name}" in recording}
     found: dict[str, list[tuple[int, int]]] = {}
@@ -65,7 +67,7 @@ def without_contradicted_pauses(
             found[name] = contradicted
             recording = recording.with_channel(without_samples(drive, contradicted))
             layout = _lay_out_again(recording, device, layout)
-    return layout, [_describe(drives[name], layout.sense.channel, name, pauses) for name, pauses in found.items()]
+    return layout, found
 
 
 def _lay_out_again(recording: Recording, device: Device, layout: BlockLayout) -> BlockLayout:
@@ -122,15 +124,3 @@ def _log_likelihood(observations: BlockObservations, device: Device) -> float:
     densities = np.tile(INITIAL_DENSITIES, (len(observations.parameters), 1))
     signal = observations.signal
     return filter_blocks(observations, signal, empty_linearisation(signal), start, densities).log_likelihood
-
-
-def _describe(drive: Channel, sense: Channel, axis: str, pauses: Sequence[tuple[int, int]]) -> str:
-    """The note on the pauses of one drive that the motion contradicts."""
-    duration = sum(stop - first for first, stop in pauses) / drive.sample_rate
-    places = "one interval" if len(pauses) == 1 else f"{len(pauses)} intervals"
-    return (
-        f"{drive.name}: is recorded as off for about {1e3 * duration:.2g} ms in {places}, the first at "
-        f"{drive.start + pauses[0][0] / drive.sample_rate:.4g} s, and {sense.name} shows that {axis} was driven there: "
-        "this part of the record is not used, and the drive is taken to have continued; check the buffer of the "
-        "generator (underrun) and the cable of this channel"
-    )

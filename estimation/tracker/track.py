@@ -15,6 +15,7 @@ from estimation.signals import SenseChannel, intensity_clock, is_capacitive, pha
 from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noise, expand_clipped_blocks, track_blocks
 from estimation.tracker.continuation import TrackEnd, Tuning, continued_prior, end_of_track, find_end
 from estimation.tracker.drive_consistency import without_contradicted_pauses
+from estimation.tracker.drive_ends import describe_pauses, with_whole_drives
 from estimation.tracker.initial_state import initial_estimate, resolve_signs
 from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.observations import BlockLayout, BlockObservations, demodulate_blocks, lay_out_blocks
@@ -94,9 +95,10 @@ def track(
         curves = list(end.tuning.curves) if end else []
         for curve in curves:
             sense = replace(sense, channel=straightened_channel(sense.channel, curve))
-        layout = lay_out_blocks(recording, device, sense, references, end and (end.start, end.length))
-        layout, drive_notes = without_contradicted_pauses(recording, device, layout)
-        notes += drive_notes
+        driven = with_whole_drives(recording, sense.channel, sense.axes)
+        layout = lay_out_blocks(driven, device, sense, references, end and (end.start, end.length))
+        layout, contradicted = without_contradicted_pauses(driven, device, layout)
+        notes += describe_pauses(recording, driven, sense, contradicted)
         signs, prior = (list(end.signs), continued_prior(end, layout)) if end else ([], None)
         densities = _previous_densities(previous, sense)
         offset_density = _previous_offset_density(previous, sense)

@@ -11,6 +11,7 @@ from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Constant, Sequence
 from scanner import devices
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.recording import Recording
 from tests.support.simulated import DRIVES, shared_electrode
 from tests.support.tracks import track_errors
@@ -79,3 +80,36 @@ def decaying(length: float, damping: float = 1.0) -> tuple[Recording, Device]:
 @pytest.mark.parametrize(("length", "damping"), [(3e-4, 1.0), (4e-3, 1.0), (4e-3, 1.3), (4e-3, 0.7)])
 def test_a_drive_that_was_switched_off_is_used_as_recorded(length: float, damping: float) -> None:
     assert not track(*decaying(length, damping)).notes
+
+
+def recorded_during(recording: Recording, start: float, end: float, names: str = "xy") -> Recording:
+    """The recording with drives that were recorded from ``start`` to ``end`` [s] only."""
+    part = recording.slice(start, end)
+    for name in names:
+        recording = recording.with_channel(part[f"drive_{name}"])
+    return recording
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.01, 0.03), (0.0, 0.018), (0.012, 0.018)])
+def test_a_drive_that_was_recorded_in_part_continues_where_the_mirror_was_driven(start: float, end: float) -> None:
+    whole = shared_electrode(DURATION_S, 0.0)[0]
+    recording = recorded_during(whole, start, end)
+    assert recording.device is not None
+    notes = track(recording, recording.device).notes
+    assert [note.partition(":")[0] for note in notes] == ["drive_x", "drive_y"]
+    assert all("driven outside of the record: the drive is assumed to continue" in note for note in notes)
+    for name in "xy":
+        assert phase_rms_deg(recording, name) < 1.1 * phase_rms_deg(whole, name)
+
+
+def test_a_drive_that_was_recorded_while_it_was_on_is_off_elsewhere() -> None:
+    recording, device = decaying(DURATION_S)
+    [note] = track(recorded_during(recording, 0.0, PAUSE_START_S, "x"), device).notes
+    assert "the drive is assumed to be off there" in note
+
+
+def test_a_drive_of_another_time_is_refused() -> None:
+    recording = shared_electrode(DURATION_S, 0.0)[0]
+    assert recording.device is not None
+    with pytest.raises(BadInput, match="drive_x: covers"):
+        track(recorded_during(recording, 0.0, 0.002), recording.device)
