@@ -22,7 +22,6 @@ from recon.imaging.scan_phase.detector_offset import (
     one_direction_axes,
     remove_detector_offsets,
     stated_event,
-    widen_by_unstated_place,
 )
 from recon.imaging.scan_phase.phase_agreement import Contradiction, find_contradictions
 from recon.imaging.scan_phase.phase_error import PhaseError
@@ -89,8 +88,7 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
 
     Where the picture changes its timing at some moment, the motion is not corrected, because dropped samples are to be
-    restored first. The standard deviation of the phase includes the errors that are left, and the unknown place of a
-    detector with edges of one direction where the picture determines no phase.
+    restored first. The standard deviation of the phase includes the errors that are left.
     """
     motion = estimated.motion
 
@@ -118,8 +116,6 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         undetermined = set(one_direction_axes(motion)) - set(readout_phase) - contradicted - placed
         notes += [describe_unstated_place(name, stated_event(motion, name)) for name in sorted(undetermined)]
         notes += describe_readout_phase(motion, readout_phase, contradicted | undetermined)
-        widened = {name: widen_by_unstated_place(motion.axes[name]) for name in undetermined}
-        motion = replace(motion, axes={**motion.axes, **widened})
     motion, remaining_notes = include_remaining_errors(motion, errors)
     without_readout, _ = include_remaining_errors(sensed, errors)
     without_readout = include_contradictions(without_readout, contradictions)

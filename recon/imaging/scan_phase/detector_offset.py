@@ -30,7 +30,7 @@ from recon.imaging.scan_phase.phase_search import (
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
-from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion, SampledAngle
 
 MIN_SLICES = 4
 """Slices from which a change is estimated: a line and the scatter about it."""
@@ -49,9 +49,6 @@ MIN_COSINE = 0.2
 
 SCATTER_CELLS = 64
 """Cells along each axis of the field in which samples are compared, as few as visit each of them several times."""
-
-UNSTATED_PLACE_SD_RAD = float(np.sqrt(np.pi**2 / 4.0 - 2.0))
-"""Standard deviation of α = arcsin(a / A) for a detector anywhere within the amplitude, a / A uniform in ± 1 [rad]."""
 
 
 class DetectorOffset(NamedTuple):
@@ -210,19 +207,13 @@ def place_scatter(beam: Motion, intensity: Channel, grid: Grid) -> float:
     return float(squares.sum() / max(np.sum(count[repeated] - 1), 1))
 
 
-def widen_by_unstated_place(axis: AxisMotion) -> AxisMotion:
-    """The motion with the unknown place of a detector of one direction in its ``phase_sd``."""
-    sd = np.where(axis.known, np.hypot(axis.phase_sd, UNSTATED_PLACE_SD_RAD), axis.phase_sd)
-    return replace(axis, phase_sd=np.minimum(sd, UNKNOWN_PHASE_SD_RAD))
-
-
 def describe_unstated_place(name: str, event: str) -> str:
-    """The line on an axis whose detector of one direction may be anywhere."""
+    """The line on an axis whose phase rests on the stated event of its edges alone."""
     return (
-        f"sync_{name}: edges of one direction do not show how far the detector is from the centre, and the picture "
-        f"determines no phase of {name}: its phase rests on event = {event}. An offset of 1 % of the amplitude shifts "
-        "it by 0.6°, more while the amplitude falls; the standard deviation allows for a detector anywhere within the "
-        "amplitude. Record the edges of both directions and state angle in rad"
+        f"sync_{name}: the phase of {name} rests on event = {event}, because the picture determines none. Edges of one "
+        "direction do not show how far the detector is from the centre: an offset of 1 % of the amplitude shifts the "
+        "phase by 0.6°, more while the amplitude falls. If it is not in the centre, record the edges of both "
+        "directions and state angle in rad"
     )
 
 
