@@ -35,6 +35,7 @@ from recon.quality.dropped_samples import (
     slices_aligned,
 )
 from recon.quality.overflow import describe_overflows
+from recon.quality.resonance_check import describe_resonance_mismatch
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs, without_contradicted_signs
 from recon.quality.structure import describe_unstructured
@@ -155,6 +156,7 @@ def estimate_motion(
     motion, sign_notes = follow_signs(motion, device, prepared.intensity, recording.start)
     grid, field_notes = _picture_grid(device, motion, options)
     notes = [*notes, *sign_notes, *motion.notes, *describe_unconfirmed_signs(recording, device, motion)]
+    notes += describe_resonance_mismatch(device, motion)
     motion = without_contradicted_signs(recording, device, motion)
     return EstimatedMotion(prepared, motion, grid, field_notes, notes)
 
