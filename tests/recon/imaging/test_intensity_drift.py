@@ -82,6 +82,21 @@ def test_bleaching_is_a_gain() -> None:
     assert mean_error(pixel, corrected, clean) <= 1.02 * mean_error(pixel, best, clean)
 
 
+def test_a_gain_that_bleaches_to_a_tenth_is_positive_and_right() -> None:
+    """With photon noise; a gain in the sense of 1 plus a Gaussian drift passes through zero there."""
+    pixel, clean = crossing_scan(0.06)
+    time = np.arange(clean.size) / RATE
+    gain = np.exp(-time / 0.026)
+    counts = np.random.default_rng(2).poisson(5.0 * clean * gain).astype(float)
+    found = estimate(pixel, counts, PIXELS**2, RATE, "gain")
+    assert found is not None
+    assert found.correct(counts).min() >= 0.0
+    expected = block_means(gain / gain.mean(), found.block)
+    for part in np.array_split(np.arange(expected.size), 8):
+        measured = (1.0 + found.values[part]).mean()
+        assert measured == pytest.approx(expected[part].mean(), rel=0.03)
+
+
 @pytest.mark.parametrize("noise_sd", [0.02, NOISE_SD])
 def test_the_error_of_a_slow_gain_is_as_stated(noise_sd: float) -> None:
     """The pattern of the crossings modulates the gain, which does not count as noise."""
