@@ -20,6 +20,7 @@ from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.picture_kinds.picture_estimate import estimate_picture
 from recon.imaging.pixel_noise import measure_noise
 from recon.imaging.sample_motion.correction import describe_sample_motion, measure_sample_motion
+from recon.imaging.sample_motion.motion_check import describe_unremoved_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.imaging.scan_phase.image_phase import refine_motion
 from recon.imaging.scan_phase.start_shift import describe_start_shift
@@ -192,6 +193,16 @@ def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
     return GriddedScan(estimated, picture, unlocated, affected, field_notes)
 
 
+def _describe_unremoved_motion(gridded: GriddedScan, options: Options) -> list[str]:
+    """The line on a motion of the sample that was not to be removed; none of a stack, or where the beam is wrong."""
+    estimated = gridded.estimated
+    if options.sample_motion or estimated.contradictions or estimated.prepared.position_z is not None:
+        return []
+    return describe_unremoved_motion(
+        estimated.beam, estimated.prepared.intensity, estimated.grid, gridded.unlocated, options.p
+    )
+
+
 def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Reconstruction:
     """Compare the motion with the truth if there is one, and collect the notes."""
     estimated, prepared = gridded.estimated, gridded.estimated.prepared
@@ -227,6 +238,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_limits(*samples, prepared.defects),
             *describe_start_shift(prepared.uncorrected, motion, estimated.contradictions),
             *describe_centre_motion(prepared.recording, prepared.device, motion, estimated.grid, options.p),
+            *_describe_unremoved_motion(gridded, options),
             *(estimate.limits or describe_unstructured(gridded.picture, intensity)),
         ],
         notes=[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,25 +83,56 @@ def measure_sample_motion(beam: Motion, intensity: Channel, grid: Grid, unlocate
         grid: the pixels.
         unlocated: samples that are left out because the beam's place is unknown.
     """
-    size = min(grid.width * grid.height, intensity.size / MIN_SAMPLES_PER_CELL)
-    cell = max(max(grid.width, grid.height) / MAX_CELLS_ACROSS, float(np.sqrt(grid.width * grid.height / size)))
-    samples = ScanSamples.empty(intensity.size)
-    x, y = (beam.axes[axis].angle for axis in AXES)
-    for first in range(0, intensity.size, READ_CHUNK_SAMPLES):
-        stop = min(first + READ_CHUNK_SAMPLES, intensity.size)
-        across = 0.5 * grid.width / cell * (x.read(first, stop) / grid.half_angle_x + 1.0)
-        down = 0.5 * grid.height / cell * (y.read(first, stop) / grid.half_angle_y + 1.0)
-        samples.write(first, across, down, intensity.read(first, stop).reshape(stop - first, -1).mean(axis=1))
-    for begin, end in unlocated:
-        samples.value[begin:end] = np.nan
-    period = slow_period(beam) * intensity.sample_rate
-    shape = math.ceil(grid.height / cell), math.ceil(grid.width / cell)
-    found = estimate_sample_motion(samples, period, shape)
+    cell = cell_width(grid, intensity.size, MAX_CELLS_ACROSS)
+    samples = read_samples(beam, intensity, grid, cell, unlocated, _chunks(intensity.size))
+    found = estimate_sample_motion(samples, slow_period(beam) * intensity.sample_rate, cells(grid, cell))
     if found is None:
         return None
     vibrations = tuple(each._replace(cosine=cell * each.cosine, sine=cell * each.sine) for each in found.vibrations)
     lengths = {name: cell * getattr(found, name) for name in ("shift", "sd", "left")}
     return replace(found, vibrations=vibrations, **lengths)
+
+
+def cell_width(grid: Grid, samples: int, across: int) -> float:
+    """Width of the cells in which a number of samples is compared, at most so many cells across the field [px]."""
+    size = min(grid.width * grid.height, samples / MIN_SAMPLES_PER_CELL)
+    return max(max(grid.width, grid.height) / across, float(np.sqrt(grid.width * grid.height / size)))
+
+
+def cells(grid: Grid, cell: float) -> tuple[int, int]:
+    """Number of cells of a width [px] down and across the field."""
+    return math.ceil(grid.height / cell), math.ceil(grid.width / cell)
+
+
+def read_samples(
+    beam: Motion,
+    intensity: Channel,
+    grid: Grid,
+    cell: float,
+    unlocated: SampleRanges,
+    parts: Sequence[tuple[int, int]],
+) -> ScanSamples:
+    """Samples of parts (first, stop) of a scan, one part after the other, at places in cells of a width [px].
+
+    The other arguments are those of :func:`measure_sample_motion`.
+    """
+    samples = ScanSamples.empty(sum(stop - first for first, stop in parts))
+    x, y = (beam.axes[axis].angle for axis in AXES)
+    offset = 0
+    for first, stop in parts:
+        across = 0.5 * grid.width / cell * (x.read(first, stop) / grid.half_angle_x + 1.0)
+        down = 0.5 * grid.height / cell * (y.read(first, stop) / grid.half_angle_y + 1.0)
+        value = intensity.read(first, stop).reshape(stop - first, -1).mean(axis=1)
+        for begin, end in unlocated:
+            value[max(begin - first, 0) : max(end - first, 0)] = np.nan
+        samples.write(offset, across, down, value)
+        offset += stop - first
+    return samples
+
+
+def _chunks(size: int) -> list[tuple[int, int]]:
+    """All samples of a scan in parts that fit into memory."""
+    return [(first, min(first + READ_CHUNK_SAMPLES, size)) for first in range(0, size, READ_CHUNK_SAMPLES)]
 
 
 def relative_to_sample(beam: Motion, motion: SampleMotion | None, grid: Grid) -> Motion:

@@ -1,0 +1,71 @@
+"""Whether the sample moved during a scan whose picture assumes that it was at rest.
+
+Two halves of the scene, compared with the picture at rest, show the same displacement where the sample moves
+(``residual``), and independent noise where it does not. Only where they do is the motion estimated, which takes ten
+times as long, and has to predict the samples better than rest. Without this check a picture that is smeared over many
+pixels would be called sharp, because the phase is right.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.imaging.picture import Grid
+from recon.imaging.sample_motion.block_equations import PARTS, ScanSamples
+from recon.imaging.sample_motion.correction import cell_width, cells, read_samples
+from recon.imaging.sample_motion.motion_smoother import part_shift
+from recon.imaging.sample_motion.residual import residual_variance
+from recon.imaging.sample_motion.rigid_motion import MIN_BLOCKS, estimate_sample_motion
+from recon.imaging.scan_phase.bidirectional_phase import slow_period
+from recon.sample_ranges import SampleRanges
+from scanner.channel import Channel
+from scanner.motion import Motion
+
+MAX_CHECKED_SAMPLES = 1 << 21
+"""Samples that are compared, in periods of the slower axis spread over the scan: 1 s of computing time."""
+
+CHECKED_CELLS_ACROSS = 200
+"""Cells across the field at most: 0.3 s for the pictures of all folds; a motion of half a cell blurs each edge."""
+
+CHECK_WIDTH = 1.4
+"""Standard deviation of the kernel [cells], from the middle of the widths that an estimate of the motion compares."""
+
+
+def describe_unremoved_motion(
+    beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges, tolerance: float
+) -> list[str]:
+    """A line if the sample moved by more than the tolerance.
+
+    Args:
+        beam, intensity, grid, unlocated: as for :func:`recon.imaging.sample_motion.correction.measure_sample_motion`.
+        tolerance: displacement of a sample that is accepted [px].
+    """
+    period = slow_period(beam) * intensity.sample_rate
+    if not np.isfinite(period):
+        return []
+    length = max(round(period / PARTS), 1) * PARTS
+    blocks = intensity.size // length
+    if blocks < MIN_BLOCKS:
+        return []
+    step = -(-blocks * length // MAX_CHECKED_SAMPLES)
+    parts = [(first * length, (first + 1) * length) for first in range(0, blocks, step)]
+    cell = cell_width(grid, len(parts) * length, CHECKED_CELLS_ACROSS)
+    samples, shape = read_samples(beam, intensity, grid, cell, unlocated, parts), cells(grid, cell)
+    if len(parts) < MIN_BLOCKS or not _disagrees_with_rest(samples, len(parts), length, shape):
+        return []
+    motion = estimate_sample_motion(samples, period, shape)
+    if motion is None or not motion.moving:
+        return []
+    x, y = cell * np.ptp(motion.shift, axis=0)
+    if max(x, y) <= tolerance:
+        return []
+    return [
+        f"intensity: the sample moves by {x:.2g} x {y:.2g} pixels peak to peak (x, y) during the scan, over which the "
+        "picture is smeared: run again with --sample-motion, which removes it"
+    ]
+
+
+def _disagrees_with_rest(samples: ScanSamples, blocks: int, length: int, shape: tuple[int, int]) -> bool:
+    """Whether two halves of the scene show a motion; ``length`` of a block in samples, ``shape`` in cells."""
+    at_rest = part_shift(np.zeros((blocks, 2)), [])
+    return bool(residual_variance(samples, at_rest, length // PARTS, shape, CHECK_WIDTH).any())
