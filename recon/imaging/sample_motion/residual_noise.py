@@ -22,6 +22,10 @@ MIN_RELATIVE_VARIANCE = 1e-3
 """Lower bound on the variance relative to its mean: a dark sample is then worth at most 1000 usual ones."""
 
 
+LEAST_ITERATED_VARIANCE = 1e-12
+"""Relative variance that is added while the coefficients are fitted: samples without noise would divide by zero."""
+
+
 class ResidualNoise(NamedTuple):
     """Variance ``floor + slope * (f - dark) + place * |∇f|²`` for the expected value f, in the square of its unit.
 
@@ -57,19 +61,20 @@ def fit_residual_noise(expected: Array, gradient: Array, residual: Array) -> Res
     dark = float(np.mean(np.partition(expected, lowest - 1)[:lowest]))
     terms = np.column_stack([np.ones_like(expected), np.maximum(expected - dark, 0.0), gradient])
     square = residual**2
-    start = square.mean() / (terms.shape[1] * np.maximum(terms.mean(axis=0), 1e-300))
-    floor, slope, place = _most_likely(terms, square, start)
-    least = max(MIN_RELATIVE_VARIANCE * float(square.mean()), MIN_VARIANCE)
+    unit, sizes = max(float(square.mean()), MIN_VARIANCE), np.maximum(terms.mean(axis=0), 1e-300)
+    relative = _most_likely(terms / sizes, square / unit, np.full(sizes.size, 1.0 / sizes.size))
+    floor, slope, place = (unit * each / size for each, size in zip(relative, sizes, strict=True))
+    least = MIN_RELATIVE_VARIANCE * unit
     return ResidualNoise(max(floor, least), slope, place, dark)
 
 
 @njit(cache=True)
 def _most_likely(terms, square, values):  # type: ignore[no-untyped-def]
-    """Coefficients, from positive ones, of the terms of the variance of values with the given squares."""
+    """Coefficients, from positive ones, of the terms of the variance of values with squares whose mean is 1."""
     for _ in range(ROUNDS):
         up, down = np.zeros(values.size), np.zeros(values.size)
         for i in range(square.size):
-            variance = 0.0
+            variance = LEAST_ITERATED_VARIANCE
             for j in range(values.size):
                 variance += values[j] * terms[i, j]
             for j in range(values.size):

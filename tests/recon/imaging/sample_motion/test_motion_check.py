@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lissajous
+from recon.imaging.sample_motion.residual_noise import fit_residual_noise
 from recon.pipeline import Reconstruction
 
 RATE, DURATION, HALF_ANGLE, PIXELS = 1e6, 0.08, 0.08, 128
@@ -45,3 +46,10 @@ def test_a_motion_beyond_the_tolerance_is_a_limit_of_the_picture(x_px: float, y_
 
 def test_a_motion_that_is_removed_is_no_limit() -> None:
     assert reconstruct(6.0, -3.0, sample_motion=True).limits == []
+
+
+def test_residuals_without_noise_have_a_variance() -> None:
+    """Rounding alone is left of a scene that is the same at every visit."""
+    random = np.random.default_rng(3)
+    noise = fit_residual_noise(random.uniform(size=100), random.uniform(size=100), 1e-170 * random.normal(size=100))
+    assert noise.floor > 0.0
