@@ -238,6 +238,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_limits(*samples, prepared.defects),
             *describe_start_shift(prepared.uncorrected, motion, estimated.contradictions),
             *describe_centre_motion(prepared.recording, prepared.device, motion, estimated.grid, options.p),
+            *estimated.clock_limits,
             *_describe_unremoved_motion(gridded, options),
             *(estimate.limits or describe_unstructured(gridded.picture, intensity)),
         ],

@@ -132,8 +132,9 @@ def _phase_displacement(summary: Mapping[str, Any]) -> Displacement:
     bounds = " / ".join(sorted({f"{summary[axis]['bound_deg']:.3f}°" for axis in axes}))
     within = min(summary[axis]["within_bound"] for axis in axes)
     kind = ("rms" if measured else "1 sd") + condition_on_clock(summary)
-    noise = {axis: summary[axis]["blur_px"]["sensor"] for axis in axes}
-    if any(px > summary[axis]["blur_px"]["phase"] for axis, px in noise.items()) and within < SHARP_FRACTION:
+    outside = {axis: summary[axis]["blur_px"] for axis in axes if summary[axis]["within_bound"] < SHARP_FRACTION}
+    noise = {axis: blur["sensor"] for axis, blur in outside.items() if blur["sensor"] > blur["phase"]}
+    if noise:
         sizes = " and ".join(f"{px:.2g} px in {axis}" for axis, px in noise.items())
         return Displacement(
             within,

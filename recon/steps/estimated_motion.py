@@ -29,6 +29,7 @@ class EstimatedMotion:
         field_notes, motion_notes: what a reader has to know of the field and of the motion, a line each.
         phase_errors: of the motion, as the picture shows them; None where they were not measured.
         contradictions: axes whose motion the picture contradicts.
+        clock_limits: a line on a clock error of the intensity that was not removed.
         readout_phase, estimator_phase_sd, intensity_drift, sample_motion: as in ``Reconstruction``.
     """
 
@@ -39,6 +40,7 @@ class EstimatedMotion:
     motion_notes: list[str]
     phase_errors: list[PhaseError] | None = None
     contradictions: Sequence[Contradiction] = ()
+    clock_limits: Sequence[str] = ()
     readout_phase: Mapping[str, ReadoutPhase] = field(default_factory=dict)
     estimator_phase_sd: Mapping[str, Array] = field(default_factory=dict)
     intensity_drift: Sequence[IntensityDrift | None] = ()

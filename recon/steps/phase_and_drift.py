@@ -16,6 +16,7 @@ from recon.imaging.intensity_correction import (
     measure_intensity_drift,
 )
 from recon.imaging.scan_phase.bidirectional_phase import measure_motion_phase_errors
+from recon.imaging.scan_phase.clock_rate import describe_clock_error, find_clock_error
 from recon.imaging.scan_phase.contradicted_phase import include_contradictions
 from recon.imaging.scan_phase.detector_offset import (
     describe_unstated_place,
@@ -116,6 +117,7 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         undetermined = set(one_direction_axes(motion)) - set(readout_phase) - contradicted - placed
         notes += [describe_unstated_place(name, stated_event(motion, name)) for name in sorted(undetermined)]
         notes += describe_readout_phase(motion, readout_phase, contradicted | undetermined)
+    clock = describe_clock_error(find_clock_error(sensed, motion, errors), estimated.prepared.intensity)
     motion, remaining_notes = include_remaining_errors(motion, errors)
     without_readout, _ = include_remaining_errors(sensed, errors)
     without_readout = include_contradictions(without_readout, contradictions)
@@ -124,9 +126,10 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         motion=include_contradictions(motion, contradictions),
         phase_errors=errors,
         contradictions=contradictions,
+        clock_limits=clock if remaining_notes else (),
         readout_phase=readout_phase,
         estimator_phase_sd={name: axis.phase_sd for name, axis in without_readout.axes.items()},
-        motion_notes=[*notes, *remaining_notes, *estimated.motion_notes],
+        motion_notes=[*notes, *([] if remaining_notes else clock), *remaining_notes, *estimated.motion_notes],
     )
 
 
