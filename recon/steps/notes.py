@@ -17,6 +17,7 @@ from recon.quality.clock_jumps import longest_segment, separate_jump
 from recon.quality.defects import Defect, describe_clipped_positions, describe_held_signals
 from recon.quality.detector_gaps import describe_blanked_directions, describe_detector_gaps
 from recon.quality.pulsed_light import describe_pulsed_light
+from recon.quality.wrapped_integers import describe_wrapped_integers
 from recon.sample_ranges import SampleRanges
 from recon.steps.preparation import PreparedRecording
 from scanner.channel import Channel
@@ -65,7 +66,8 @@ def describe_limits(
         defects: of the recording.
     """
     misleading = (
-        describe_running_sums(intensity)
+        describe_wrapped_integers(intensity)
+        or describe_running_sums(intensity)
         or describe_pulsed_light(beam, intensity)
         or describe_blanked_directions(beam, intensity)
     )
