@@ -183,7 +183,7 @@ def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
     unlocated = _unlocated(estimated)
     picture = grid_intensity(beam, prepared.intensity, grid, unlocated)
     moved = estimated.sample_motion is not None and estimated.sample_motion.moving
-    field_notes = check_field(picture, estimated.motion, options.allow_outside, moved)
+    field_notes = check_field(picture, estimated.motion, options.allow_outside, moved, prepared.clock_notes)
     if not picture.coverage.any():
         hint = "check the channels' start times, and that the sensors recorded a motion throughout"
         raise BadInput("no sample was mapped: the angle is known nowhere", channel="intensity", hint=hint)

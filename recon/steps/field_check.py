@@ -60,7 +60,13 @@ def check_units(grid: Grid, motion: Motion) -> None:
                 )
 
 
-def check_field(picture: Picture, motion: Motion, allow_outside: bool, sample_moved: bool = False) -> list[str]:
+def check_field(
+    picture: Picture,
+    motion: Motion,
+    allow_outside: bool,
+    sample_moved: bool = False,
+    clock_notes: Sequence[str] = (),
+) -> list[str]:
     """Notes on samples outside the field, and on a field that the motion hardly covers.
 
     Args:
@@ -68,6 +74,7 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool, sample_mo
         motion: of the mirror.
         allow_outside: accept that most samples lie outside.
         sample_moved: whether the samples were moved with the sample.
+        clock_notes: why the sample rates are doubted; with a wrong one, few samples are mapped, at any place.
 
     Raises:
         DeviceInvalid: most samples lie outside.
@@ -86,7 +93,7 @@ def check_field(picture: Picture, motion: Motion, allow_outside: bool, sample_mo
                 hint = (
                     f"no mirror turns so far: check gain in [x.readout], in V/rad, or the unit of the angles; or {hint}"
                 )
-            raise DeviceInvalid(what, channel="scan", hint=hint)
+            raise DeviceInvalid(what, channel="scan", hint="; or: ".join((*clock_notes, hint)))
         notes.append(f"{what}; {_explain_outside(grid, motion, sample_moved)}")
     notes += _describe_centres(grid, motion)
     if any(a < MIN_AMPLITUDE_FRACTION * h for a, h in zip(amplitude, half, strict=True)):

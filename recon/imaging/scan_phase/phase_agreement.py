@@ -233,6 +233,8 @@ def axis_phases(beam: Motion, intensity: Channel, first: int, stop: int) -> tupl
     # The largest angle as amplitude makes a phase a matter of place and direction alone, in a spiral too.
     x, y = (np.arctan2(angle, quadrature(angle, float(np.abs(angle[known]).max()))) for angle in angles)
     known &= np.isfinite(x) & np.isfinite(y)  # the quadrature is not known next to an unknown angle
+    if known.sum() < 2:
+        return None
     return (x[known], y[known]), values[known]
 
 

@@ -123,3 +123,21 @@ def test_image_png_shows_unvisited_pixels_unless_filling_is_asked_for(fill: list
     else:
         assert unvisited > 0.3
         assert "not filled; blue: pixels never visited" in page
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_wrong_rate_of_the_intensity_is_named_where_nearly_no_sample_is_mapped() -> None:
+    """At 1 kHz in place of 1 MHz, all samples at known angles are at one place of the motion, outside the field."""
+    rate, time = 1e6, np.arange(100_000) / 1e6
+    angles = {
+        f"angle_{name}": (0.085 * np.cos(2 * np.pi * frequency * time), "rad", rate)
+        for name, frequency in (("x", 2000.0), ("y", 835.0))
+    }
+    counts = np.random.default_rng(1).poisson(20.0, time.size)
+    device = Device.from_toml(
+        "[x.mechanics]\nJ = 1e-10\nb = 1e-8\nk = 0.0158\n[y.mechanics]\nJ = 1e-10\nb = 1e-8\nk = 0.00275\n"
+        "[scan]\nhalf_angle_x = 0.08\nhalf_angle_y = 0.08\n"
+    )
+    recording = Recording.from_arrays({**angles, "intensity": (counts, "counts", 1e3)}, device)
+    with pytest.raises(DeviceInvalid, match="a sample_rate is wrong; or: correct half_angle_x"):
+        reconstruct(recording, Options(pixels=(60, 60)), quiet=True)
