@@ -28,6 +28,9 @@ MIN_SPECTRUM_SAMPLES = 8
 SHORT_SPECTRUM_PERIODS = 3.0
 """Periods of the lowest frequency that are searched first: enough where the line is present from the beginning."""
 
+MOTION_RATIO = 0.01
+"""Amplitude over its largest from which a motion has begun: the noise of a sensor in a block is below a thousandth."""
+
 DRIVE_ON_RATIO = 0.1
 """Amplitude relative to the largest below which the drive counts as off; its phase is then interpolated."""
 
@@ -75,8 +78,17 @@ class PhaseReference:
         return inside + 2 * np.pi * self.frequency * time
 
     def relative_phase(self, time: Array, phasors: Complex) -> Array:
-        """Phase of ``phasors`` less psi at ``time`` [s]: [rad], without jumps, within half a turn at first."""
-        return unwrap_phase(np.angle(phasors * np.exp(-1j * self.phase(time))))
+        """Phase of ``phasors`` less psi at ``time`` [s]: [rad], without jumps, within half a turn at first.
+
+        Before the first phasor of a motion the mirror is at rest, and the phases of the noise would give the unwrapped
+        ones any slope. They are within half a turn of that phasor.
+        """
+        phase, size = np.angle(phasors * np.exp(-1j * self.phase(time))), np.nan_to_num(np.abs(phasors))
+        if not size.size:
+            return phase
+        first = int(np.argmax(size >= MOTION_RATIO * size.max()))
+        rest = phase[first] + np.angle(np.exp(1j * (phase[:first] - phase[first])))
+        return np.concatenate([rest, unwrap_phase(phase[first:])])
 
     def frequency_at(self, time: Array) -> Array:
         """Frequency of the reference, psi' / 2 pi, at ``time`` [s]: shape (n,) [Hz]."""
