@@ -237,7 +237,7 @@ def _describe(name: str, offset: DetectorOffset, relative_amplitude: Array | Non
         f"beginning and {last:.3g}° after it at the end of the scan; the phase was corrected by it"
     )
     if relative_amplitude is None:
-        return line
+        return line + "; the amplitude does not change with it: check the sample rate of the intensity"
     ratio = relative_amplitude[-1] / relative_amplitude[0]
     return line + (
         f", and the amplitude, which {'falls' if ratio < 1.0 else 'grows'} to {ratio:.3g} of its first value as the "
