@@ -31,7 +31,7 @@ EFFECT = "feedthrough"
 ORDERS = (2, 4, 6)
 """Lines that are compared, in multiples of the motion's frequency. Higher ones are below 0.1 % of the second."""
 
-MAX_SAMPLES = 1 << 17
+MAX_SAMPLES = 1 << 19
 """Samples about the middle of the recording in which the lines are measured: a constant needs no more."""
 
 LINE_MODEL_SD = 2e-3
@@ -90,9 +90,6 @@ def without_feedthrough(
     Args:
         recording, device: of the motion; a device that states terms describes the signal itself.
         run: estimates the motion, also for a device with terms.
-
-    Returns:
-        The motion; if a feedthrough was removed, its ``info`` states it under ``terms``, as a device does.
     """
     if any(axis.terms for axis in device.axes.values()):
         return motion
@@ -102,7 +99,7 @@ def without_feedthrough(
         if not measured:
             break
         found = measured
-        motion = run(recording, device.with_terms(_terms(found)))
+        motion = run(recording, _with_terms(device, found))
     if not found:
         return motion
     axes = dict(motion.axes)
@@ -111,8 +108,7 @@ def without_feedthrough(
         sd = np.zeros_like(own.amplitude) if own.amplitude_sd is None else own.amplitude_sd
         axes[name] = replace(own, amplitude_sd=np.hypot(sd, each.log_amplitude_sd * own.amplitude))
     lines = [_describe(name, each, first, motion, recording) for name, each in found.items()]
-    info = {**motion.info, "terms": _terms(found)}
-    return replace(motion, axes=axes, info=info, notes=(*motion.notes, *lines))
+    return replace(motion, axes=axes, notes=(*motion.notes, *lines))
 
 
 def measure_feedthrough(recording: Recording, device: Device, motion: Motion) -> dict[str, Feedthrough]:
@@ -255,9 +251,15 @@ def _solve(
     return (value, covariance) if chi2 <= MAX_REDUCED_CHI2 * (wanted.size - value.size) else None
 
 
-def _terms(found: Mapping[str, Feedthrough]) -> dict[str, dict[str, dict[str, float]]]:
-    """The feedthroughs as terms of a device: axis -> effect -> parameter -> value."""
-    return {name: {EFFECT: {"g": each.g, "h": each.h, "omega_d": each.omega_d}} for name, each in found.items()}
+def _with_terms(device: Device, found: Mapping[str, Feedthrough]) -> Device:
+    """The device with the feedthroughs as terms."""
+    axes = {
+        name: replace(axis, terms={EFFECT: {"g": found[name].g, "h": found[name].h, "omega_d": found[name].omega_d}})
+        if name in found
+        else axis
+        for name, axis in device.axes.items()
+    }
+    return replace(device, axes=axes)
 
 
 def _describe(name: str, found: Feedthrough, before: Motion, after: Motion, recording: Recording) -> str:

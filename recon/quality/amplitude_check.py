@@ -16,14 +16,8 @@ ESTIMATORS_WITHOUT_SENSE = ("picture", "edges", "sensor")
 
 
 def compare_with_signal(recording: Recording, device: Device, motion: Motion) -> Mapping[str, AmplitudeCheck]:
-    """As :func:`estimation.harmonic_amplitude.check_amplitudes`; empty if another signal gave the motion.
-
-    An axis whose feedthrough the estimator has removed is left out: its amplitude's standard deviation allows for it.
-    """
-    if motion.estimator in ESTIMATORS_WITHOUT_SENSE:
-        return {}
-    removed = motion.info.get("terms")
-    return check_amplitudes(recording, device.with_terms(removed) if isinstance(removed, dict) else device, motion)
+    """As :func:`estimation.harmonic_amplitude.check_amplitudes`; empty if another signal gave the motion."""
+    return {} if motion.estimator in ESTIMATORS_WITHOUT_SENSE else check_amplitudes(recording, device, motion)
 
 
 def amplitude_calibration(
