@@ -62,7 +62,6 @@ def estimate(
     Raises:
         BadInput: no such estimator, or it cannot use the recording or the device.
     """
-    from estimation.feedthrough import without_feedthrough
     from estimation.signs import resolve_signs
     from estimation.term_compensation import estimate_with_terms
 
@@ -77,13 +76,7 @@ def estimate(
         check_finite(motion, recording)
         return resolve_signs(motion, recording, flips or {})
 
-    def run_with_terms(recording: Recording, device: Device) -> Motion:
-        return estimate_with_terms(recording, device, run, estimator.is_model_based, estimator.treats_clipping)
-
-    motion = run_with_terms(recording, device)
-    if estimator.name != "tracker" or before is not None:
-        return motion
-    return without_feedthrough(recording, device, motion, run_with_terms)
+    return estimate_with_terms(recording, device, run, estimator.is_model_based, estimator.treats_clipping)
 
 
 def check_finite(motion: Motion, recording: Recording) -> None:
