@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import hypot
 
-from estimation.amplitude_calibration import motion_calibration_sd
+from estimation.amplitude_calibration import MODEL_FREE_ESTIMATORS, motion_calibration_sd
+from estimation.estimators import find_estimator
 from estimation.harmonic_amplitude import AmplitudeCheck, check_amplitudes
 from scanner.device import Device
 from scanner.motion import Motion
 from scanner.recording import Recording
 
-ESTIMATORS_WITHOUT_SENSE = ("picture", "edges", "sensor")
-"""Estimators whose motion does not come from a capacitive signal."""
-
 
 def compare_with_signal(recording: Recording, device: Device, motion: Motion) -> Mapping[str, AmplitudeCheck]:
     """As :func:`estimation.harmonic_amplitude.check_amplitudes`; empty if another signal gave the motion."""
-    return {} if motion.estimator in ESTIMATORS_WITHOUT_SENSE else check_amplitudes(recording, device, motion)
+    is_sensed = "sense" in recording or all(f"sense_{name}" in recording for name in device.axes)
+    from_sense = motion.estimator not in MODEL_FREE_ESTIMATORS and find_estimator(motion.estimator).is_model_based
+    if not is_sensed or not from_sense:
+        return {}
+    return check_amplitudes(recording, device, motion)
 
 
 def amplitude_calibration(

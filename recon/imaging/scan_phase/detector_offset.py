@@ -91,13 +91,15 @@ def remove_detector_offsets(
     notes: list[str] = []
     names = one_direction_axes(motion) if set(motion.axes) == set(AXES) else []
     for _ in AXES:  # an axis whose amplitude is followed makes the other one clearer
+        if not names:
+            break
         offsets = measure_detector_offsets(motion, to_beam(motion), intensity, names)
         found = [name for name in names if name in offsets]
         for name in found:
             motion, line = _better_motion(motion, name, offsets[name], to_beam, intensity, grid)
             notes += line
         names = [name for name in names if name not in found]
-        if not found or not names:
+        if not found:
             break
     return motion, notes
 
