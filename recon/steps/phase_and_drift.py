@@ -29,6 +29,7 @@ from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
+from recon.imaging.scan_phase.searched_phase import SearchedPhase, search_phase_of
 from recon.imaging.scan_phase.slow_gain import GainPart, describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice, register_slices_separately
 from recon.steps.estimated_motion import EstimatedMotion
@@ -102,7 +103,7 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         motion = include_contradictions(motion, contradictions)
         return replace(estimated, motion=motion, phase_errors=errors, contradictions=contradictions)
     readout_phase: Mapping[str, ReadoutPhase] = {}
-    contradictions = []
+    contradictions, searched, beyond = [], SearchedPhase([], ()), dict[str, Sequence[PhaseError]]()
     motion, notes = remove_detector_offsets(
         motion, lambda each: replace(estimated, motion=each).beam, estimated.prepared.intensity, estimated.grid
     )
@@ -113,13 +114,17 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
         motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
         contradictions = _find_contradictions(replace(estimated, motion=motion), readout_phase)
+        searched = _search_unmeasured(replace(estimated, motion=motion), readout_phase)
         contradicted = {each.axis for each in contradictions}
+        beyond = dict.fromkeys(set(searched.refuted) - contradicted - set(readout_phase), searched.errors)
+        contradicted |= set(beyond)
         undetermined = set(one_direction_axes(motion)) - set(readout_phase) - contradicted - placed
         notes += [describe_unstated_place(name, stated_event(motion, name)) for name in sorted(undetermined)]
         notes += describe_readout_phase(motion, readout_phase, contradicted | undetermined)
-    clock = describe_clock_error(find_clock_error(sensed, motion, errors), estimated.prepared.intensity)
-    motion, remaining_notes = include_remaining_errors(motion, errors)
-    without_readout, _ = include_remaining_errors(sensed, errors)
+    clock_error = find_clock_error(sensed, motion, errors) or find_clock_error(sensed, motion, searched.errors)
+    clock = describe_clock_error(clock_error, estimated.prepared.intensity)
+    motion, remaining_notes = include_remaining_errors(motion, errors, beyond)
+    without_readout, _ = include_remaining_errors(sensed, errors, beyond)
     without_readout = include_contradictions(without_readout, contradictions)
     return replace(
         estimated,
@@ -144,6 +149,13 @@ def _find_contradictions(estimated: EstimatedMotion, measured: Mapping[str, Read
         return []
     found, _ = find_contradictions(estimated.beam, estimated.prepared.intensity)
     return [each for each in found if each.axis not in measured]
+
+
+def _search_unmeasured(estimated: EstimatedMotion, measured: Mapping[str, ReadoutPhase]) -> SearchedPhase:
+    """The phase errors over half a turn, of a scan with an axis whose phase the registration has not ``measured``."""
+    if set(measured) >= set(estimated.motion.axes):
+        return SearchedPhase([], ())
+    return search_phase_of(estimated.beam, estimated.prepared.intensity)
 
 
 def _loses_timing(estimated: EstimatedMotion, errors: Sequence[PhaseError]) -> bool:

@@ -294,7 +294,7 @@ def _contradicts(match: PhaseMatches, repeated: float) -> bool:
     fewer, more = sorted((match.common_cells[at], match.common_cells[match.best]))
     return bool(
         fewer >= max(MIN_COMMON_CELLS, MIN_COMMON_SHARE * more)
-        and _differs_in_bands(match, at)
+        and differs_in_bands(match, at)
         and MIN_CORRELATION_RATIO * repeated <= best <= match.same_cell / MIN_CORRELATION_RATIO
         and agreement < MAX_AGREEMENT_RATIO * best
         and best - agreement > MIN_CONTRADICTION_SD * sd
@@ -314,10 +314,10 @@ def _is_folded(match: PhaseMatches, repeated: float) -> bool:
     noise = MIN_CORRELATION_SD * float(np.hypot(match.noise_sd[match.best], match.noise_sd[at]))
     best, quarter = float(match.reflected[match.best]), float(match.reflected[at])
     is_clear = best >= max(MIN_CORRELATION_RATIO * repeated, noise) and repeated > 0.0
-    return is_clear and best - quarter < noise and not _differs_in_bands(match, at)
+    return is_clear and best - quarter < noise and not differs_in_bands(match, at)
 
 
-def _differs_in_bands(match: PhaseMatches, at: int) -> bool:
+def differs_in_bands(match: PhaseMatches, at: int) -> bool:
     """Whether the correlation at the best phase exceeds that at another one in nearly all bands of the other axis."""
     by_band = match.by_band[:, match.best] - match.by_band[:, at]
     is_significant = by_band.mean() > MIN_BAND_SDS * by_band.std(ddof=1) / np.sqrt(BANDS)

@@ -105,7 +105,7 @@ def search_phases(phase_x: Array, phase_y: Array, intensity: Array) -> tuple[Pha
         intensity: shape (n,), finite.
     """
     x, y = match_phases(phase_x, phase_y, intensity)
-    return _best_reflection(x), _best_reflection(y)
+    return best_reflection(x), best_reflection(y)
 
 
 def match_phases(phase_x: Array, phase_y: Array, intensity: Array) -> tuple[PhaseMatches, PhaseMatches]:
@@ -164,7 +164,7 @@ def _shift_rad(shift: float) -> float:
     return (shift + 1) * 2 * pi / PHASE_CELLS
 
 
-def _best_reflection(matches: PhaseMatches) -> PhaseFound:
+def best_reflection(matches: PhaseMatches) -> PhaseFound:
     """The shift of the reflected cells for which they correlate best with the cells themselves."""
     match, best = matches.reflected, matches.best
     below, at, above = match[best - 1], match[best], match[(best + 1) % PHASE_CELLS]

@@ -7,7 +7,7 @@ and its standard deviation does not either.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,16 +21,20 @@ MIN_REMAINING_SDS = 3.0
 correction, and above 15 with a clock that is 30 ppm wrong."""
 
 
-def include_remaining_errors(motion: Motion, errors: Sequence[PhaseError]) -> tuple[Motion, list[str]]:
+def include_remaining_errors(
+    motion: Motion, errors: Sequence[PhaseError], searched: Mapping[str, Sequence[PhaseError]] | None = None
+) -> tuple[Motion, list[str]]:
     """The motion with the phase errors that remain in the picture in its ``phase_sd``, and a line for each such axis.
 
     Args:
         motion: on the intensity's clock.
         errors: of the slices of the scan.
+        searched: phase errors of the axes whose phase lies beyond the reach of ``errors``, used in their place.
     """
     axes, notes = dict(motion.axes), []
     for name, axis in motion.axes.items():
-        time, value, sd = _determined(errors, name)
+        used = (searched or {}).get(name, errors)
+        time, value, sd = _determined(used, name)
         if not time.size or np.sqrt(np.mean(np.square(value / sd))) < MIN_REMAINING_SDS:
             continue
         remaining = np.interp(axis.time, axis.angle.start + time, np.abs(value))
@@ -38,7 +42,7 @@ def include_remaining_errors(motion: Motion, errors: Sequence[PhaseError]) -> tu
         rms = np.degrees(np.sqrt(np.mean(value**2)))
         notes.append(
             f"forward and backward half-periods show phase errors of {name} that were not removed, {rms:.2g}° rms in "
-            f"{time.size} of {len(errors)} slices of the scan; the standard deviation of the phase includes them"
+            f"{time.size} of {len(used)} slices of the scan; the standard deviation of the phase includes them"
         )
     return replace(motion, axes=axes), notes
 

@@ -34,7 +34,7 @@ def reconstruct(ppm: float, drift_x_rad: float = 0.0) -> Reconstruction:
     return lissajous.reconstruct(recording, pixels=(PIXELS, PIXELS))
 
 
-@pytest.mark.parametrize("ppm", [-50.0, 30.0, 100.0])
+@pytest.mark.parametrize("ppm", [-50.0, 30.0, 100.0, 400.0])
 def test_the_clock_error_and_the_true_rate_are_stated(ppm: float) -> None:
     result = reconstruct(ppm)
     [line] = [each for each in (*result.limits, *result.notes) if "ppm" in each]
@@ -42,6 +42,14 @@ def test_the_clock_error_and_the_true_rate_are_stated(ppm: float) -> None:
     assert value == pytest.approx(ppm, abs=3 * sd)
     assert sd < 0.1 * abs(ppm)
     assert rate == pytest.approx(RATE, abs=3e-6 * sd * RATE)
+
+
+def test_the_phase_sd_contains_a_clock_error_beyond_the_reach_of_the_registration() -> None:
+    """The phase of x is 29 degrees late at the end of the scan, that of y 12 degrees."""
+    result = reconstruct(400.0)
+    for name, frequency in (("x", 2000.0), ("y", 835.0)):
+        wrong = 360.0 * frequency * 400e-6 * DURATION / np.sqrt(3.0)
+        assert np.degrees(np.sqrt(np.mean(result.motion.axes[name].phase_sd ** 2))) == pytest.approx(wrong, rel=0.1)
 
 
 def test_the_conclusion_begins_with_a_clock_error_that_blurs_and_does_not_blame_noise() -> None:
