@@ -104,8 +104,9 @@ def _describe_unchecked_readout(summary: Mapping[str, Any], blurred: bool) -> st
             "that the device file does not state was assumed"
         )
     reasons += [f"the picture determines the phase of {axis} less precisely" for axis in axes if axis not in assumed]
+    subject = "The" if blurred or assumed else "No blur was found, but the"  # where nothing was measured, none can be
     return (
-        f"{'The' if blurred else 'No blur was found, but the'} phase could not be checked to within the bound of "
+        f"{subject} phase could not be checked to within the bound of "
         f"{bounds}: {'; '.join(reasons)}. The phase is thus known to {_list_sd(axes)} (1 sd), with a probability of "
         f"{min(each['within_bound'] for each in axes.values()):.1%} within the bound; with the readout exactly as "
         f"stated, to {_list_sd(as_stated)}. To settle it, record a scene with detail in both directions, more light or "
