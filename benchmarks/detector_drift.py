@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from phantoms.experiment import Experiment, simulate_experiment
 from phantoms.optics import Detector
-from recon.imaging.intensity_drift import DriftKind
+from recon.imaging.intensity_drift_equations import DriftKind
 from recon.pipeline import reconstruct
 from recon.steps.reconstruction import Options, Reconstruction
 from scanner.arrays import Array

@@ -53,13 +53,12 @@ class HarmonicAmplitude:
     """Comparison of a harmonic with the one that the device gives at the estimated amplitude.
 
     Attributes:
-        measured, expected: second harmonic of the comb's capacitance [F], or fourth over second harmonic [1].
+        ratio: of the second harmonic, or of the fourth over the second one, to what the device gives.
         difference: relative change of the amplitude that makes them equal, to first order.
         sd: its standard deviation by the noise and by the stated tolerances.
     """
 
-    measured: float
-    expected: float
+    ratio: float
     difference: float
     sd: float
 
@@ -98,7 +97,11 @@ def check_amplitudes(recording: Recording, device: Device, motion: Motion) -> di
             continue
         for name, blocks in _harmonics(sense, motion).items():
             axis = device.sensed_axis(name)
-            if axis.capacitance is not None and not _changes_harmonics(axis) and blocks.frequency.size >= MIN_BLOCKS:
+            if (
+                axis.capacitance is not None
+                and not _changes_harmonics(axis)
+                and (blocks.amplitude > 0.0).sum() >= MIN_BLOCKS
+            ):
                 checked[name] = _check(blocks, axis.capacitance, sense.readout, device, name)
     return checked
 
@@ -158,44 +161,47 @@ def _fit_lines(values: Array, rate: float, lines: Sequence[tuple[int, int]], fre
     return np.asarray(coefficients[::2] - 1j * coefficients[1::2])
 
 
+class _Ratio(NamedTuple):
+    """Measured over expected harmonic, its standard deviation by the noise, and d ln expected / d ln A."""
+
+    value: float
+    sd: float
+    slope: float
+
+
 def _check(blocks: _Blocks, comb: Capacitance, readout: Readout, device: Device, name: str) -> AmplitudeCheck:
     second = blocks.second / readout_response(readout, 2 * blocks.frequency)
     fourth = blocks.fourth / readout_response(readout, 4 * blocks.frequency)
-    steps = np.array([1.0 - RELATIVE_STEP, 1.0, 1.0 + RELATIVE_STEP])
-    harmonics = np.array(
-        [[capacitance_harmonics(each, comb)[[2, 4]] for each in row] for row in np.outer(steps, blocks.amplitude)]
-    )
+    in_phase = (fourth * np.exp(-2j * np.angle(second))).real  # at the phase that the second one determines
+    amplitudes = np.outer([1.0 - RELATIVE_STEP, 1.0, 1.0 + RELATIVE_STEP], blocks.amplitude)
+    expected = np.array([[capacitance_harmonics(each, comb)[[2, 4]] for each in row] for row in amplitudes])
+    two, four = _ratio(np.abs(second), np.abs(expected[:, :, 0])), _ratio(in_phase, expected[:, :, 1].real)
+    shape = _Ratio(four.value / two.value, hypot(four.sd, two.sd * four.value) / two.value, four.slope - two.slope)
     by_gain = amplitude_sd_by_gain(device, name, float(blocks.amplitude.mean()))
-    lowpass_sd = _lowpass_sds(readout, float(blocks.frequency.mean()), device, name)
-    size = _compare(np.abs(second), np.abs(harmonics[:, :, 0]), lowpass_sd[0])
-    shape = _compare(
-        _shape(second, fourth), _shape(harmonics[:, :, 0], harmonics[:, :, 1]), lowpass_sd[1] - lowpass_sd[0]
+    lowpass = _lowpass_sds(readout, float(blocks.frequency.mean()), device, name)
+    return AmplitudeCheck(
+        _compare(two, float(lowpass[0]), by_gain), _compare(shape, float(lowpass[1] - lowpass[0]), by_gain)
     )
-    return AmplitudeCheck(*(replace(each, sd=hypot(each.sd, by_gain)) for each in (size, shape)))
 
 
-def _compare(measured: Array, expected: Array, relative_sd: float) -> HarmonicAmplitude:
-    """Compare in blocks.
+def _ratio(measured: Array, expected: Array) -> _Ratio:
+    """Least-squares factor of an expected harmonic; blocks with a large amplitude have a large weight.
 
     Args:
         measured: shape (blocks,).
         expected: for an amplitude less than, equal to and more than the estimated one by ``RELATIVE_STEP``, shape
             (3, blocks).
-        relative_sd: of ``measured`` beside the noise.
     """
     behind, at, ahead = expected
-    slope = (ahead - behind) / (2 * RELATIVE_STEP * at)  # d ln expected / d ln A
-    differences = (measured / at - 1.0) / slope
-    noise = float(np.std(differences, ddof=1)) / sqrt(differences.size)
-    systematic = relative_sd / float(np.abs(slope).mean())
-    return HarmonicAmplitude(
-        float(measured.mean()), float(at.mean()), float(differences.mean()), hypot(noise, systematic)
-    )
+    value = measured @ at / (at @ at)
+    noise = sqrt(np.sum((at * (measured - value * at)) ** 2) * at.size / (at.size - 1)) / (at @ at)
+    return _Ratio(float(value), float(noise), float(at @ (ahead - behind) / (2 * RELATIVE_STEP * (at @ at))))
 
 
-def _shape(second: Complex, fourth: Complex) -> Array:
-    """Fourth harmonic over the size of the second one, in phase with the square of the second one."""
-    return np.asarray((fourth * np.conj(second) ** 2).real / np.abs(second) ** 3)
+def _compare(ratio: _Ratio, lowpass_sd: float, amplitude_sd: float) -> HarmonicAmplitude:
+    """The amplitude by a ratio, which has a standard deviation by the low-pass; ``amplitude_sd`` is by the gain."""
+    sd = hypot(hypot(ratio.sd, lowpass_sd) / ratio.slope, amplitude_sd)
+    return HarmonicAmplitude(ratio.value, (ratio.value - 1.0) / ratio.slope, sd)
 
 
 def _lowpass_sds(readout: Readout, frequency: float, device: Device, name: str) -> Array:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from estimation.device_fit.predict import Predicted
     from estimation.diagnosis.diagnose import Diagnosis
     from estimation.identification.calibrate import Identification
-    from recon.imaging.intensity_drift import DriftKind
+    from recon.imaging.intensity_drift_equations import DriftKind
     from recon.imaging.picture_kinds.picture_estimate import PictureKind
     from recon.steps.reconstruction import Reconstruction
     from scanner.motion import Motion
@@ -148,7 +148,7 @@ def reconstruct(
         BadInput: an option has no meaning, or the recording or the device lacks what is needed.
     """
     from recon.evaluation import load_truth, truth_from_simulation
-    from recon.imaging.intensity_drift import DriftKind
+    from recon.imaging.intensity_drift_equations import DriftKind
     from recon.pipeline import reconstruct as reconstruct_recording
     from recon.steps.reconstruction import Options
 

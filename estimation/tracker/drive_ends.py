@@ -90,7 +90,7 @@ def _describe_pauses(drive: Channel, sense: Channel, axis: str, pauses: Sequence
     return (
         f"{drive.name}: is recorded as off for about {1e3 * duration:.2g} ms in {places}, the first at "
         f"{drive.start + pauses[0][0] / drive.sample_rate:.4g} s, and {sense.name} shows that {axis} was driven there: "
-        "this part of the record is not used, and the drive is taken to have continued; check the buffer of the "
+        "this part of the record is not used, and the drive is assumed to have continued; check the buffer of the "
         "generator (underrun) and the cable of this channel"
     )
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.gridding import find_sample_pixels
-from recon.imaging.intensity_drift import DriftKind, IntensityDrift, SampleReader, estimate_intensity_drift
+from recon.imaging.intensity_drift import IntensityDrift, SampleReader, estimate_intensity_drift
+from recon.imaging.intensity_drift_equations import DriftKind
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples

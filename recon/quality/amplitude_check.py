@@ -43,10 +43,10 @@ def describe_contradictions(checks: Mapping[str, AmplitudeCheck]) -> list[str]:
     for name, check in checks.items():
         if not check.error_sd:
             continue
-        second, shape = (each.measured / each.expected for each in check)
         lines.append(
             f"{name}: the sense signal contradicts the device: at the estimated amplitude its second harmonic is "
-            f"{second:.3g} times what the device gives, and the ratio of the fourth to the second {shape:.3g} times, "
+            f"{check.size.ratio:.3g} times what the device gives, and the ratio of the fourth to the second "
+            f"{check.shape.ratio:.3g} times, "
             "more than the stated tolerances allow; the amplitude, and with it the scale of the picture, may be wrong "
             f"by {100 * check.error_sd:.2g} %. Check C0, theta0 and the gain of the readout, and whether the drive "
             "feeds through (diagnose)"

@@ -6,7 +6,6 @@ effect on the picture. Everything that is computed from the mechanics is then wr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import isclose
 
 import numpy as np
@@ -41,14 +40,14 @@ def describe_resonance_mismatch(device: Device, motion: Motion) -> list[str]:
         frequency = float(np.median(own.frequency))
         ratio = frequency / axis.resonance
         if MIN_RESONANT_RATIO < ratio < 1.0 / MAX_DRIVE_RATIO or ratio > MAX_DRIVE_RATIO:
-            lines.append(_describe(name, frequency, axis.resonance, COMMON_CAUSES))
+            lines.append(_describe(name, frequency, axis.resonance))
     return lines
 
 
-def _describe(name: str, frequency: float, resonance: float, causes: Sequence[tuple[float, str]]) -> str:
+def _describe(name: str, frequency: float, resonance: float) -> str:
     """The line on one axis; frequencies of the motion and of the resonance [Hz]."""
     ratio = frequency / resonance
-    named = "".join(f"; {cause}" for at, cause in causes if isclose(ratio, at, rel_tol=SAME_FREQUENCY))
+    named = "".join(f"; {cause}" for at, cause in COMMON_CAUSES if isclose(ratio, at, rel_tol=SAME_FREQUENCY))
     return (
         f"{name}: moves at {frequency:.6g} Hz, {ratio:.3g} times the resonance of {resonance:.6g} Hz that J and k in "
         f"[{name}.mechanics] state: check both, and the sample_rate of the signal, unless the axis is driven off its "

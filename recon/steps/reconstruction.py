@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from recon.evaluation import AxisEvaluation, Truth
 from recon.imaging import blur
-from recon.imaging.intensity_drift import DriftKind, IntensityDrift
+from recon.imaging.intensity_drift import IntensityDrift
+from recon.imaging.intensity_drift_equations import DriftKind
 from recon.imaging.picture import Picture
 from recon.imaging.picture_kinds.picture_estimate import PictureKind
 from recon.imaging.pixel_noise import SampleNoise

@@ -62,7 +62,7 @@ def test_a_right_amplitude_agrees_with_size_and_shape() -> None:
     for check in checks(signal(IMAGING)).values():
         assert check.error_sd == 0.0
         for each in check:
-            assert each.measured == pytest.approx(each.expected, rel=0.01)
+            assert each.ratio == pytest.approx(1.0, abs=0.01)
 
 
 def test_the_noise_is_stated() -> None:
@@ -110,3 +110,17 @@ def test_what_cannot_be_compared_is_left_out() -> None:
     by_picture = replace(motion(), estimator="picture")
     recording = Recording.from_arrays({"sense": (signal(IMAGING), "V", RATE)}, IMAGING)
     assert compare_with_signal(recording, IMAGING, by_picture) == {}
+
+
+@pytest.mark.parametrize("before", [0.0, 1e-9])
+def test_a_part_at_rest_has_no_weight(before: float) -> None:
+    values, estimated = signal(IMAGING), motion()
+    moving = estimated.axes["x"]
+    at_rest = moving.time < 0.45 * DURATION  # the change is between the middles of two blocks
+    axes = {**estimated.axes, "x": replace(moving, amplitude=np.where(at_rest, before, moving.amplitude))}
+    recording = Recording.from_arrays({"sense": (values, "V", RATE)}, IMAGING)
+    found = check_amplitudes(recording, IMAGING, replace(estimated, axes=axes))
+    if before:
+        assert found["x"].size.ratio == pytest.approx(1.0, abs=0.01)
+    else:
+        assert "x" not in found  # too few blocks with a motion

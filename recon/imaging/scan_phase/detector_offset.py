@@ -17,16 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.imaging.picture import Grid
-from recon.imaging.scan_phase.bidirectional_phase import slow_period
-from recon.imaging.scan_phase.phase_agreement import axis_phases
 from recon.imaging.scan_phase.phase_search import (
     MIN_CORRELATION_SD,
     MIN_FOUND_FRACTION,
-    PERIODS_PER_SEARCH,
-    PHASE_CELLS,
-    cut_slices,
-    search_phases,
 )
+from recon.imaging.scan_phase.slice_search import SEARCH_ROUNDING_SD_RAD, search_slices, searched_slices
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
@@ -37,9 +32,6 @@ MIN_SLICES = 4
 
 MAX_DEGREE = 2
 """Largest degree of the polynomial of sin α in time: within 1 % of one over an exponential that falls to a half."""
-
-MIN_SLICE_SD_RAD = np.pi / PHASE_CELLS / np.sqrt(12.0)
-"""Least standard deviation of α in a slice [rad]: that of the rounding to a cell of the search, 0.4 degrees."""
 
 SIGNIFICANT_SDS = 5.0
 """Standard deviations from which sin α changes, and from which it determines the amplitude: by chance once in 1e6."""
@@ -130,18 +122,12 @@ def measure_detector_offsets(
         intensity: shape (n,) or (n, detectors); detectors are averaged.
         names: of the axes whose edges are of one direction.
     """
-    slices = cut_slices(intensity, PERIODS_PER_SEARCH * slow_period(beam))
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
-    for first, stop in slices:
-        phases = axis_phases(beam, intensity, first, stop)
-        if phases is None:
-            continue
-        middle = intensity.start + 0.5 * (first + stop) / intensity.sample_rate
-        for name, phase in zip(AXES, search_phases(*phases[0], phases[1]), strict=True):
-            if name in names and phase.significance >= MIN_CORRELATION_SD:
-                found[name].append((middle, phase.value))
+    slices = searched_slices(beam, intensity)
+    searched = search_slices(beam, intensity, slices)
     offsets = {}
-    for name, pairs in found.items():
+    for name in names:
+        found = [(intensity.start + each.time, each.phase(name)) for each in searched]
+        pairs = [(time, phase.value) for time, phase in found if phase.significance >= MIN_CORRELATION_SD]
         if len(pairs) >= max(MIN_SLICES, MIN_FOUND_FRACTION * len(slices)):
             time, value = np.array(pairs).T
             offset = fit_offset(time, value, motion.axes[name].time)
@@ -162,7 +148,7 @@ def fit_offset(time: Array, value: Array, at: Array) -> DetectorOffset | None:
     """
     scale = max(float(np.ptp(time)), np.finfo(float).tiny) / 2.0
     u, v, sine = (time - time.mean()) / scale, (at - time.mean()) / scale, np.sin(value)
-    sd = MIN_SLICE_SD_RAD * np.maximum(np.cos(value), MIN_COSINE)
+    sd = SEARCH_ROUNDING_SD_RAD * np.maximum(np.cos(value), MIN_COSINE)
 
     def fit(degree: int) -> tuple[float, Array, Array]:
         """Criterion, coefficients and their covariance; the scatter about the fit may widen the errors."""

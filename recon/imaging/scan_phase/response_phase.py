@@ -19,7 +19,6 @@ from estimation.tracker.drive_only import explain_phase, stiffness_sd
 from estimation.tracker.steady_motion import TOLERANCE_REACH
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.imaging.scan_phase.bidirectional_search import SEARCH_REACH_RAD
-from recon.imaging.scan_phase.phase_agreement import axis_phases
 from recon.imaging.scan_phase.phase_search import (
     MIN_FOUND_FRACTION,
     PERIODS_PER_SEARCH,
@@ -27,8 +26,8 @@ from recon.imaging.scan_phase.phase_search import (
     PhaseFound,
     continue_phases,
     cut_slices,
-    search_phases,
 )
+from recon.imaging.scan_phase.slice_search import search_slices
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES, Device
@@ -66,9 +65,10 @@ def check_response(
     """
     check = ResponseCheck({}, [], [])
     slices = cut_slices(intensity, slow_period(motion) * PERIODS_PER_SEARCH)
-    found = _search_slices(beam, intensity, slices)
-    for column, name in enumerate(AXES):
-        clear = [(middle, axes[column]) for middle, axes in found if axes[column].is_clear]
+    searched = search_slices(beam, intensity, slices)
+    for name in AXES:
+        found = [(intensity.start + each.time, each.phase(name)) for each in searched]
+        clear = [(middle, phase) for middle, phase in found if phase.is_clear]
         if not clear or len(clear) < MIN_FOUND_FRACTION * len(slices):
             continue
         time = np.array([middle for middle, _ in clear])
@@ -95,19 +95,6 @@ def check_response(
             "determines the amplitude"
         )
     return check
-
-
-def _search_slices(
-    beam: Motion, intensity: Channel, slices: list[tuple[int, int]]
-) -> list[tuple[float, tuple[PhaseFound, PhaseFound]]]:
-    """Times of the middles [s] and phase errors of both axes of the slices that hold a signal."""
-    found = []
-    for first, stop in slices:
-        samples = axis_phases(beam, intensity, first, stop)
-        if samples is not None:
-            (x, y), values = samples
-            found.append((float(intensity.time(first, stop).mean()), search_phases(x, y, values)))
-    return found
 
 
 def _nearest_errors(found: list[PhaseFound]) -> Array:

@@ -13,24 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.imaging.scan_phase.bidirectional_phase import slow_period
-from recon.imaging.scan_phase.detector_offset import MIN_SLICE_SD_RAD
-from recon.imaging.scan_phase.phase_agreement import MIN_CONTRADICTION_SD, axis_phases, differs_in_bands
+from recon.imaging.scan_phase.phase_agreement import MIN_CONTRADICTION_SD, differs_in_bands
 from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
 from recon.imaging.scan_phase.phase_search import (
     MIN_FOUND_FRACTION,
-    PERIODS_PER_SEARCH,
+    PhaseFound,
     PhaseMatches,
     best_reflection,
-    cut_slices,
-    match_phases,
 )
+from recon.imaging.scan_phase.slice_search import SEARCH_ROUNDING_SD_RAD, search_slices, searched_slices
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
-
-MAX_SEARCHED_SLICES = 64
-"""Slices, spread over the scan, that are searched: 0.02 s of computing time each at 1e5 samples."""
 
 UNDETERMINED = PhaseEstimate(nan, inf)
 """A phase error that the samples do not determine."""
@@ -55,26 +49,18 @@ def search_phase_of(beam: Motion, intensity: Channel) -> SearchedPhase:
         beam: motion whose angles are on the intensity's clock.
         intensity: shape (n,) or (n, detectors); detectors are averaged.
     """
-    slices = cut_slices(intensity, PERIODS_PER_SEARCH * slow_period(beam))
-    slices = slices[:: -(-len(slices) // MAX_SEARCHED_SLICES)]
-    found, refuted = [], dict.fromkeys(AXES, False)
-    for first, stop in slices:
-        phases = axis_phases(beam, intensity, first, stop)
-        if phases is None:
-            continue
-        matches = dict(zip(AXES, match_phases(*phases[0], phases[1]), strict=True))
-        found.append((0.5 * (first + stop) / intensity.sample_rate, [_estimate(each) for each in matches.values()]))
-        refuted = {name: refuted[name] or _refutes(each) for name, each in matches.items()}
-    columns = [_continued([row[axis] for _, row in found], len(slices)) for axis in range(len(AXES))]
-    errors = [PhaseError(time, x, y) for (time, _), x, y in zip(found, *columns, strict=True)]
+    slices = searched_slices(beam, intensity)
+    searched = search_slices(beam, intensity, slices)
+    x, y = (_continued([_estimate(each.phase(name)) for each in searched], len(slices)) for name in AXES)
+    errors = [PhaseError(each.time, *both) for each, both in zip(searched, zip(x, y, strict=True), strict=True)]
+    refuted = {name for name in AXES if any(_refutes(each.matches[name]) for each in searched)}
     determined = {name for name in AXES if any(getattr(each, name).sd < inf for each in errors)}
-    return SearchedPhase(errors, {name for name in determined if refuted[name]})
+    return SearchedPhase(errors, determined & refuted)
 
 
-def _estimate(match: PhaseMatches) -> PhaseEstimate:
+def _estimate(found: PhaseFound) -> PhaseEstimate:
     """Phase error at which the samples of opposite directions agree."""
-    found = best_reflection(match)
-    return PhaseEstimate(found.value, MIN_SLICE_SD_RAD) if found.is_clear else UNDETERMINED
+    return PhaseEstimate(found.value, SEARCH_ROUNDING_SD_RAD) if found.is_clear else UNDETERMINED
 
 
 def _refutes(match: PhaseMatches) -> bool:

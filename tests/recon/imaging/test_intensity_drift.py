@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.imaging.intensity_drift import (
-    DriftKind,
-    IntensityDrift,
-    SceneSums,
-    estimate_intensity_drift,
-    fit_drift_model,
-)
+from recon.imaging.intensity_drift import IntensityDrift, estimate_intensity_drift, fit_drift_model
+from recon.imaging.intensity_drift_equations import DriftKind, SceneSums
 from tests.support.simulated import imaging
 
 RATE, PIXELS, NOISE_SD = 5e6, 200, 0.1

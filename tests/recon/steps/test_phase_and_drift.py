@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.evaluation import truth_from_simulation
-from recon.imaging.intensity_drift import DriftKind
+from recon.imaging.intensity_drift_equations import DriftKind
 from recon.pipeline import reconstruct
 from recon.steps.reconstruction import Options
 from scanner.device import AXES
