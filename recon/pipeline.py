@@ -99,7 +99,7 @@ def reconstruct(
         BadInput: the recording or the device lacks what is needed.
     """
     began = time.perf_counter()
-    prepared = prepare(recording, options.device, options.undo_lag)
+    prepared = prepare(recording, options.device)
     sensor_notes = check_sensor_noise(prepared.recording, prepared.device, options.estimator)
     result = _reconstruct_prepared(prepared, options, truth, quiet)
     result = _repair_dropped_samples(prepared, result, options, truth, quiet)
@@ -274,7 +274,7 @@ def _repair_dropped_samples(
     dropped, recorded = timing_break.dropped, prepared.uncorrected["intensity"]
     if dropped is not None:
         timed = restore_timing(prepared.uncorrected, dropped)
-        restored = prepare_segment(timed, prepared.device, prepared.clock_jumps, options.undo_lag)
+        restored = prepare_segment(timed, prepared.device, prepared.clock_jumps)
         repaired = _reconstruct_prepared(restored, options, truth, quiet)
         if slices_aligned(repaired.phase_errors, repaired.motion).all():
             start, stop = (recorded.start + at / recorded.sample_rate for at in (dropped.first, dropped.stop))

@@ -160,7 +160,8 @@ def add_part(
         BadInput: the motion cannot be estimated, or in the first part a sensor holds only noise.
     """
     estimated = _estimate_part(recording, start, stop, scan, options)
-    sensed, intensity = estimated.motion, estimated.prepared.intensity
+    sensed = estimated.motion
+    intensity = (estimated.prepared if options.undo_lag else estimated.prepared.with_lag()).intensity
     known = scan.readout_phase if scan else {}
     estimated = replace(estimated, motion=apply_readout_phase(sensed, known))
     first = max(0, round((start - intensity.start) * intensity.sample_rate))
@@ -216,7 +217,7 @@ def keep_part(sensed: Motion, estimated: EstimatedMotion, duration: float) -> Fr
         if name in ("intensity", "position_z")
     }
     recording = replace(cut, channels=MappingProxyType(channels))
-    prepared = replace(prepared, recording=recording, uncorrected=recording)
+    prepared = replace(prepared, recording=recording, lagging=recording["intensity"], uncorrected=recording)
     return FramePart(sensed, replace(estimated, prepared=prepared), duration)
 
 
@@ -275,12 +276,12 @@ def _estimate_part(
     """The motion from ``start`` to ``stop`` [s], continued from the part before if it ended at ``start``."""
     device = scan.device if scan else select_device(recording, options.device)
     if scan is None:
-        prepared = prepare_frame(recording, device, start, stop, options.undo_lag)
+        prepared = prepare_frame(recording, device, start, stop)
         check_sensor_noise(prepared.recording, device, options.estimator)
         return estimate_motion(prepared, options)
     end = track_end(scan.motion) if scan.stop == start else None
     begin = start - LEAD_IN_PERIODS * slow_period(scan.motion) if end is None else min(end, start)
-    prepared = prepare_frame(recording, device, begin, stop, options.undo_lag)
+    prepared = prepare_frame(recording, device, begin, stop)
     estimated = estimate_motion(prepared, options, scan.motion, scan.grid)
     return replace(estimated, motion=match_signs(estimated.motion, scan.motion))
 

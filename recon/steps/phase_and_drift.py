@@ -15,6 +15,8 @@ from recon.imaging.intensity_correction import (
     exceeds_uncertainty,
     measure_intensity_drift,
 )
+from recon.imaging.intensity_drift import IntensityDrift
+from recon.imaging.intensity_drift_equations import DriftKind
 from recon.imaging.scan_phase.bidirectional_phase import measure_motion_phase_errors
 from recon.imaging.scan_phase.clock_rate import describe_clock_error, find_clock_error
 from recon.imaging.scan_phase.contradicted_phase import include_contradictions
@@ -26,13 +28,14 @@ from recon.imaging.scan_phase.detector_offset import (
 )
 from recon.imaging.scan_phase.phase_agreement import Contradiction, find_contradictions
 from recon.imaging.scan_phase.phase_error import PhaseError
-from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase
+from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase, widen_undetermined
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.imaging.scan_phase.searched_phase import SearchedPhase, search_phase_of
 from recon.imaging.scan_phase.slow_gain import GainPart, describe_slow_gain
 from recon.quality.dropped_samples import first_late_slice, register_slices_separately
 from recon.steps.estimated_motion import EstimatedMotion
+from recon.steps.preparation import PreparedRecording
 from recon.steps.reconstruction import Options
 from recon.steps.registration_segments import registration_segments
 from scanner.motion import Motion
@@ -47,16 +50,36 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
 
     If there is a drift, the phase is estimated again, from the uncorrected motion and the intensity without the drift.
     The drift is then measured again in the intensity as recorded, at the corrected positions. Without a drift the first
-    phase is kept.
+    phase is kept. All this is measured without the low-pass of a slow detector, which displaces detail of different
+    size by a different time; the intensity that the picture is made of has it as ``options`` want it.
     """
     phased = correct_readout_phase(estimated, options)
     if options.intensity_drift is None:
-        return replace(phased, motion_notes=[*phased.motion_notes, *_describe_gain(phased)])
-    corrected = correct_intensity_drift(phased, options)
-    if not exceeds_uncertainty(corrected.intensity_drift):
-        return corrected
-    without_drift = correct_readout_phase(replace(estimated, prepared=corrected.prepared), options)
-    return correct_intensity_drift(replace(without_drift, prepared=estimated.prepared), options)
+        notes = [*phased.motion_notes, *_describe_gain(phased)]
+        return replace(phased, prepared=_for_picture(phased.prepared, options), motion_notes=notes)
+    drifts = _measure_drift(phased, options.intensity_drift)
+    if exceeds_uncertainty(drifts):
+        without_drift = replace(estimated, prepared=_without_drift(estimated.prepared, drifts))
+        phased = replace(correct_readout_phase(without_drift, options), prepared=estimated.prepared)
+        drifts = _measure_drift(phased, options.intensity_drift)
+    prepared = _without_drift(_for_picture(estimated.prepared, options), drifts)
+    notes = [*phased.motion_notes, *describe_drift(drifts, prepared.intensity.unit)]
+    return replace(phased, prepared=prepared, intensity_drift=drifts, motion_notes=notes)
+
+
+def _for_picture(prepared: PreparedRecording, options: Options) -> PreparedRecording:
+    """The recording with the intensity that the picture is made of."""
+    return prepared if options.undo_lag else prepared.with_lag()
+
+
+def _measure_drift(estimated: EstimatedMotion, kind: DriftKind) -> Sequence[IntensityDrift | None]:
+    """The drift of the detectors."""
+    return measure_intensity_drift(estimated.beam, estimated.prepared.intensity, estimated.grid, kind)
+
+
+def _without_drift(prepared: PreparedRecording, drifts: Sequence[IntensityDrift | None]) -> PreparedRecording:
+    """The recording with the drift of the detectors removed from its intensity."""
+    return replace(prepared, recording=prepared.recording.with_channel(correct_drift(prepared.intensity, drifts)))
 
 
 def _describe_gain(estimated: EstimatedMotion) -> list[str]:
@@ -89,7 +112,7 @@ def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
 def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
     """Remove the phase error of the readout that the picture shows, and keep the phase errors that are left.
 
-    Where the picture changes its timing at some moment, the motion is not corrected, because dropped samples are to be
+    Where the picture changes its timing at some moment, the phase counts as undetermined: dropped samples are to be
     restored first. The standard deviation of the phase includes the errors that are left.
     """
     motion = estimated.motion
@@ -110,7 +133,9 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     if motion is not estimated.motion:
         errors = register(motion)
     sensed, placed = motion, _replaced_axes(estimated.motion, motion)
-    if not _loses_timing(estimated, errors):
+    if _loses_timing(estimated, errors):
+        motion = replace(motion, axes={name: widen_undetermined(axis) for name, axis in motion.axes.items()})
+    else:
         one_readout = motion.estimator == "tracker" and estimated.prepared.device.readout is not None
         motion, errors, readout_phase = remove_readout_phase(motion, errors, register, one_readout)
         contradictions = _find_contradictions(replace(estimated, motion=motion), readout_phase)
@@ -170,17 +195,3 @@ def _loses_timing(estimated: EstimatedMotion, errors: Sequence[PhaseError]) -> b
         return False
     separate = register_slices_separately(estimated.beam, intensity, estimated.grid, len(errors))
     return first_late_slice(separate, estimated.motion) is not None
-
-
-def correct_intensity_drift(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:
-    """Remove the drift of the detectors from the intensity if it is asked for."""
-    if options.intensity_drift is None:
-        return estimated
-    prepared = estimated.prepared
-    drifts = measure_intensity_drift(estimated.beam, prepared.intensity, estimated.grid, options.intensity_drift)
-    intensity = correct_drift(prepared.intensity, drifts)
-    recording = prepared.recording.with_channel(intensity)
-    notes = [*estimated.motion_notes, *describe_drift(drifts, intensity.unit)]
-    return replace(
-        estimated, prepared=replace(prepared, recording=recording), intensity_drift=drifts, motion_notes=notes
-    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isclose
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ class PreparedRecording:
 
     Attributes:
         recording: the segment in use; its intensity is corrected for the optics terms of the device.
+        lagging: the intensity corrected for delay and gain, and not for the low-pass of a slow detector.
         uncorrected: the same segment with the recorded intensity.
         device: the device in use.
         clock_jumps: phase jumps of the whole recording. The segment contains none of them.
@@ -53,6 +54,7 @@ class PreparedRecording:
     """
 
     recording: Recording
+    lagging: Channel
     uncorrected: Recording
     device: Device
     clock_jumps: tuple[Defect, ...]
@@ -66,19 +68,22 @@ class PreparedRecording:
         """The corrected intensity of the segment."""
         return self.recording["intensity"]
 
+    def with_lag(self) -> PreparedRecording:
+        """The recording with the low-pass of a slow detector, with which averages have less electronic noise."""
+        return replace(self, recording=self.recording.with_channel(self.lagging))
+
     @property
     def position_z(self) -> Channel | None:
         """Position of the objective or the stage; None where it was not recorded."""
         return self.recording.channels.get("position_z")
 
 
-def prepare(recording: Recording, device: DeviceSource | None = None, undo_lag: bool = False) -> PreparedRecording:
+def prepare(recording: Recording, device: DeviceSource | None = None) -> PreparedRecording:
     """Check a recording and cut it to its longest segment without a clock jump.
 
     Args:
         recording: with an intensity, and whatever channels the estimator needs.
         device: in place of the recording's own.
-        undo_lag: as for :func:`estimation.optics.correction.correct_intensity`.
 
     Raises:
         BadInput: no intensity, or one that is not a signal; no device, a device without an
@@ -96,54 +101,47 @@ def prepare(recording: Recording, device: DeviceSource | None = None, undo_lag: 
     check_signals(recording, device)
     check_rates(recording, device)
     check_duration(recording, device)
-    return prepare_segment(recording, device, clock_jumps, undo_lag)
+    return prepare_segment(recording, device, clock_jumps)
 
 
-def prepare_segment(
-    segment: Recording, device: Device, clock_jumps: Sequence[Defect], undo_lag: bool = False
-) -> PreparedRecording:
+def prepare_segment(segment: Recording, device: Device, clock_jumps: Sequence[Defect]) -> PreparedRecording:
     """Correct and inspect a segment between clock jumps.
 
     Args:
         segment: with an intensity.
         device: of the recording.
         clock_jumps: of the whole recording.
-        undo_lag: as for :func:`estimation.optics.correction.correct_intensity`.
     """
-    recording = correct_intensity(segment, device, undo_lag)
-    inspected = correct_intensity(segment, device)  # clipping is found before the low-pass is undone
+    recording, lagging = correct_intensity(segment, device, undo_lag=True), correct_intensity(segment, device)
     return PreparedRecording(
         recording=recording,
+        lagging=lagging["intensity"],
         uncorrected=segment,
         device=device,
         clock_jumps=tuple(clock_jumps),
-        defects=(*clock_jumps, *find_defects(inspected, device, segment["intensity"])),
+        defects=(*clock_jumps, *find_defects(lagging, device, segment["intensity"])),
         unknown_entries=tuple(_unknown_entries(recording, device)),
         clock_notes=tuple(_describe_intensity_clock(recording)),
         origin=recording.start,
     )
 
 
-def prepare_frame(
-    recording: Recording, device: Device, start: float, stop: float, undo_lag: bool = False
-) -> PreparedRecording:
+def prepare_frame(recording: Recording, device: Device, start: float, stop: float) -> PreparedRecording:
     """Prepare the part of a growing recording from ``start`` to ``stop`` [s], without a search for clock jumps.
-
-    ``undo_lag`` is as for :func:`estimation.optics.correction.correct_intensity`.
 
     Raises:
         BadInput: the part holds no intensity.
     """
-    frame = correct_intensity(recording, device, undo_lag).slice(start, stop)
-    inspected = correct_intensity(recording, device).slice(start, stop)
+    frame, lagging = (correct_intensity(recording, device, undo_lag=each).slice(start, stop) for each in (True, False))
     frame.require("intensity", "a picture needs it")
     uncorrected = recording.slice(start, stop)
     return PreparedRecording(
         recording=frame,
+        lagging=lagging.require("intensity", "a picture needs it"),
         uncorrected=uncorrected,
         device=device,
         clock_jumps=(),
-        defects=tuple(find_defects(inspected, device, uncorrected.channels.get("intensity"))),
+        defects=tuple(find_defects(lagging, device, uncorrected.channels.get("intensity"))),
         unknown_entries=(),
         clock_notes=(),
         origin=recording.start,

@@ -83,7 +83,7 @@ def test_the_stated_lag_of_the_detector_leaves_no_channel_missing() -> None:
     assert recording.device is not None
     text = recording.device.to_toml() + "\n[x.terms.detector-lag]\nf_c = 200e3\n"
     prepared = prepare(recording, Device.from_toml(text))
-    assert prepared.intensity.start < recording["sense"].start - 2.0 / SAMPLE_RATE_HZ
+    assert prepared.lagging.start < recording["sense"].start - 2.0 / SAMPLE_RATE_HZ
     assert not prepared.defects
 
 

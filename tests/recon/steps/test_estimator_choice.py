@@ -51,7 +51,7 @@ def reconstructed(estimator: str | None) -> Reconstruction:
 
 @pytest.mark.parametrize(("noise_px", "expected"), [(0.2, "sensor"), (NOISE_PX, "tracker")])
 def test_noise_beyond_the_tolerance_is_left_to_the_tracker(noise_px: float, expected: str) -> None:
-    assert choose_estimator(prepare(scan(noise_px), None, False), Options(pixels=PIXELS))[0] == expected
+    assert choose_estimator(prepare(scan(noise_px)), Options(pixels=PIXELS))[0] == expected
 
 
 @pytest.mark.parametrize("tried", [0.03, 0.02])
@@ -65,7 +65,7 @@ def test_the_beginning_of_a_scan_decides_or_all_of_it_where_that_is_too_short(
         estimator_choice, "estimate", lambda part, *rest: (lengths.append(part.duration), estimate(part, *rest))[1]
     )
     recording = scan(noise_px)
-    assert choose_estimator(prepare(recording, None, False), Options(pixels=PIXELS))[0] == expected
+    assert choose_estimator(prepare(recording), Options(pixels=PIXELS))[0] == expected
     assert lengths[-1] == pytest.approx(tried if tried == 0.03 else recording.duration, rel=1e-3)
 
 
@@ -77,7 +77,7 @@ def test_a_model_that_is_worse_than_the_noise_is_not_used() -> None:
     steps = GAIN * 0.07 * (np.floor(time / 0.005) % 2.0 - 0.5) * 2.0
     noise = np.random.default_rng(3).normal(0.0, 0.024, time.size)
     stepped = recording.with_channel(replace(sense, raw=steps + noise, gain=1.0, offset=0.0))
-    assert choose_estimator(prepare(stepped, None, False), Options(pixels=PIXELS))[0] == "sensor"
+    assert choose_estimator(prepare(stepped), Options(pixels=PIXELS))[0] == "sensor"
 
 
 def test_the_noise_of_single_samples_counts_where_the_sensor_is_asked_for() -> None:
