@@ -38,11 +38,14 @@ class DriveInput:
         voltage: at the start, middle and end of every step, shape (n, 3) [V].
         step: length of a step [s].
         t0: start on the recording's clock, which is the time origin of all drifts [s].
+        is_bias: whether it is the recorded DC bias of the current of a transimpedance readout. The current under
+            another voltage has the stated bias.
     """
 
     voltage: Array
     step: float
     t0: float = 0.0
+    is_bias: bool = False
 
     @cached_property
     def time(self) -> Array:
@@ -263,9 +266,13 @@ def _before_channel_terms(readout: Readout, motions: Sequence[AxisTrajectory]) -
         case MotionSensor():
             signal = motion_voltage(motions[0].derivative(readout.order), readout.gain, readout.offset)
         case _:
-            # The bias of the current is the voltage on the comb. Without a recorded one that is the nominal bias.
             currents = [
-                transimpedance_voltage(_capacitance_slope(motion), motion.rate, readout.R_s, motion.voltage)
+                transimpedance_voltage(
+                    _capacitance_slope(motion),
+                    motion.rate,
+                    readout.R_s,
+                    motion.voltage if motion.drive.is_bias else readout.V_bias,
+                )
                 for motion in motions
             ]
             signal = sum(currents[1:], start=currents[0])

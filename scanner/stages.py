@@ -130,7 +130,7 @@ class Transimpedance(Checked):
 
     Attributes:
         R_s: feedback resistor [ohm].
-        V_bias: bias voltage on the comb [V].
+        V_bias: bias voltage on the comb [V]. Where a channel ``bias_x`` without a drive is recorded, that is the bias.
         noise_sd: standard deviation of the output's noise [V].
         bits: resolution of the converter.
     """

@@ -150,6 +150,7 @@ def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Ru
             _voltage(drives[name], _rest_voltage(device, name, drives[name]), grid_start, step, n),
             step,
             grid_start - origin,
+            is_bias=f"bias_{name}" in recording and f"drive_{name}" not in recording,
         )
         for name in axes
     }
