@@ -72,6 +72,30 @@ def max_residual_ratio(likelihood: Likelihood, first: Fit, stop: float) -> float
     return max(MAX_RESIDUAL_RATIO, MAX_RATIO_GROWTH * residual_ratio(likelihood, first, stop))
 
 
+def follow_motion(likelihood: Likelihood, early: Sequence[Fit], stops: Sequence[float]) -> Fit:
+    """The last of the fits over growing windows, or one over windows in between where only that follows the motion.
+
+    An oscillation that grows when a swept drive reaches a resonance is not predicted by the window before. Where
+    windows in between do not follow the motion to its end either, an effect is missing, and the last fit stays.
+
+    Args:
+        early: fits of the nominal device over the windows ``stops``, the last one over the whole recording.
+    """
+    if residual_ratio(likelihood, early[-1]) < MAX_CORRECTABLE_RATIO:
+        return early[-1]
+    reached = _last_that_follows(likelihood, early, stops, MAX_CORRECTABLE_RATIO)
+    grown = fit_growing(likelihood, early[-1].model, early[reached].x, stops[reached])
+    return grown if residual_ratio(likelihood, grown) < MAX_CORRECTABLE_RATIO else early[-1]
+
+
+def _last_that_follows(likelihood: Likelihood, early: Sequence[Fit], stops: Sequence[float], limit: float) -> int:
+    """Index of the last fit up to which all after the first have a residual ratio below a limit in their window."""
+    reached = 0
+    while reached + 1 < len(early) and residual_ratio(likelihood, early[reached + 1], stops[reached + 1]) < limit:
+        reached += 1
+    return reached
+
+
 def fit_anchor(
     likelihood: Likelihood,
     nominal: Fit,
@@ -94,9 +118,7 @@ def fit_anchor(
     limit = max_residual_ratio(likelihood, early[0], stops[0])
     if residual_ratio(likelihood, nominal) < limit:
         return nominal, []
-    fits, reached = list[Fit](), 0
-    while reached + 1 < len(early) and residual_ratio(likelihood, early[reached + 1], stops[reached + 1]) < limit:
-        reached += 1
+    fits, reached = list[Fit](), _last_that_follows(likelihood, early, stops, limit)
     for terms in groups:
         model = nominal.model.with_candidates([*nominal.model.candidates, *terms])
         start = model.map_parameters_from(early[reached].model, early[reached].x)

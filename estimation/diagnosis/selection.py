@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from estimation.candidate_terms.anchor import fit_anchor, fit_growing, max_residual_ratio, residual_ratio
+from estimation.candidate_terms.anchor import fit_anchor, fit_growing, follow_motion, max_residual_ratio, residual_ratio
 from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.candidate_terms.linear_model import RivalFit
 from estimation.candidate_terms.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
@@ -158,8 +158,9 @@ def select_terms(
     stops = window_schedule(model)
     likelihood = Likelihood(runs, flat_whiteners(model))
     early = fit_progressively(likelihood, model, stops)
-    likelihood = Likelihood(runs, min_entropy_whiteners(fit_hum_variants(likelihood, early[-1])))
-    nominal = select_mains_hum(likelihood, fit_model(likelihood, model, early[-1].x))
+    whole = follow_motion(likelihood, early, stops)
+    likelihood = Likelihood(runs, min_entropy_whiteners(fit_hum_variants(likelihood, whole)))
+    nominal = select_mains_hum(likelihood, fit_model(likelihood, model, whole.x))
     nominal = with_interference_line(likelihood, nominal)
     certain = {candidate.term.effect for candidate in clipped}
     named = [term for term in terms.values() if term.effect not in certain]
