@@ -1,0 +1,28 @@
+"""The current of a comb: -C'(θ) θ' times the bias, whatever drives the comb."""
+
+import numpy as np
+import pytest
+
+from scanner.device import Axis
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis
+from scanner.laws import capacitance
+from scanner.stages import Capacitance, Drive, Mechanics, Transimpedance
+
+BIAS_V = 5.0
+
+
+@pytest.mark.parametrize(("is_bias", "ratio"), [(False, 1.0), (True, 2.0)])
+def test_the_bias_of_the_current_is_the_stated_one_unless_it_was_recorded(is_bias: bool, ratio: float) -> None:
+    rate = 2 * np.pi * 3000.0
+    axis = Axis(
+        Mechanics(1e-14, 1e-14 * rate / 300.0, 1e-14 * rate**2),
+        Capacitance(2e-12, 1e-11, 0.2, 0.0),
+        Drive("electrostatic"),
+        Transimpedance(2e7, BIAS_V, noise_sd=1e-3),
+        name="x",
+    )
+    recorded = DriveInput(np.full((400, 3), 2.0 * BIAS_V), 5e-6, is_bias=is_bias)
+    motion = simulate_axis(axis, (), recorded, (3e-3, 0.0))
+    found = sense_signal(axis.require_readout(), [motion])
+    expected = -2e7 * BIAS_V * np.gradient(capacitance(motion.angle, 2e-12, 1e-11, 0.2, 0.0), 5e-6, edge_order=2)
+    assert np.std(found - ratio * expected) < 0.01 * np.std(found)
