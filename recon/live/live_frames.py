@@ -161,7 +161,7 @@ def add_part(
     """
     estimated = _estimate_part(recording, start, stop, scan, options)
     sensed = estimated.motion
-    intensity = (estimated.prepared if options.undo_lag else estimated.prepared.with_lag()).intensity
+    intensity = estimated.prepared.for_picture(options.undo_lag).intensity
     known = scan.readout_phase if scan else {}
     estimated = replace(estimated, motion=apply_readout_phase(sensed, known))
     first = max(0, round((start - intensity.start) * intensity.sample_rate))

@@ -56,20 +56,15 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
     phased = correct_readout_phase(estimated, options)
     if options.intensity_drift is None:
         notes = [*phased.motion_notes, *_describe_gain(phased)]
-        return replace(phased, prepared=_for_picture(phased.prepared, options), motion_notes=notes)
+        return replace(phased, prepared=phased.prepared.for_picture(options.undo_lag), motion_notes=notes)
     drifts = _measure_drift(phased, options.intensity_drift)
     if exceeds_uncertainty(drifts):
         without_drift = replace(estimated, prepared=_without_drift(estimated.prepared, drifts))
         phased = replace(correct_readout_phase(without_drift, options), prepared=estimated.prepared)
         drifts = _measure_drift(phased, options.intensity_drift)
-    prepared = _without_drift(_for_picture(estimated.prepared, options), drifts)
+    prepared = _without_drift(estimated.prepared.for_picture(options.undo_lag), drifts)
     notes = [*phased.motion_notes, *describe_drift(drifts, prepared.intensity.unit)]
     return replace(phased, prepared=prepared, intensity_drift=drifts, motion_notes=notes)
-
-
-def _for_picture(prepared: PreparedRecording, options: Options) -> PreparedRecording:
-    """The recording with the intensity that the picture is made of."""
-    return prepared if options.undo_lag else prepared.with_lag()
 
 
 def _measure_drift(estimated: EstimatedMotion, kind: DriftKind) -> Sequence[IntensityDrift | None]:

@@ -68,9 +68,13 @@ class PreparedRecording:
         """The corrected intensity of the segment."""
         return self.recording["intensity"]
 
-    def with_lag(self) -> PreparedRecording:
-        """The recording with the low-pass of a slow detector, with which averages have less electronic noise."""
-        return replace(self, recording=self.recording.with_channel(self.lagging))
+    def for_picture(self, undo_lag: bool) -> PreparedRecording:
+        """The recording with the intensity that a picture is made of.
+
+        Args:
+            undo_lag: without the low-pass of a slow detector; with it, averages have less electronic noise.
+        """
+        return self if undo_lag else replace(self, recording=self.recording.with_channel(self.lagging))
 
     @property
     def position_z(self) -> Channel | None:
