@@ -53,7 +53,7 @@ def find_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: 
     inside = subtract_ranges(quiet, unlocated)
     others = subtract_ranges(subtract_ranges([(0, count * length)], quiet), unlocated)
     off, on = (_grid(beam, intensity, grid, ranges) for ranges in (inside, others))
-    return quiet if _misses_scene(off, on) else []
+    return quiet if misses_scene(off, on) else []
 
 
 def describe_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> list[str]:
@@ -109,7 +109,7 @@ def _grid(beam: Motion, intensity: Channel, grid: Grid, ranges: SampleRanges) ->
     return grid_intensity(beam, intensity, grid, subtract_ranges([(0, intensity.size)], ranges))
 
 
-def _misses_scene(off: Picture, on: Picture) -> bool:
+def misses_scene(off: Picture, on: Picture) -> bool:
     """Whether every detector's structure in ``on`` is missing in ``off``, in the pixels that both visited."""
     both = (off.coverage > 0) & (on.coverage > 1)
     if np.count_nonzero(both) < MIN_COMMON_PIXELS:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.imaging.gridding import map_samples
+from recon.imaging.picture import Grid
 from recon.imaging.wild_samples import usable_samples, wild_limits
-from recon.quality.detector_gaps import QUIET_SD_SHARE
-from scanner.arrays import Array
+from recon.quality.detector_gaps import QUIET_SD_SHARE, misses_scene
+from scanner.arrays import Array, Mask
 from scanner.channel import Channel
+from scanner.device import AXES
 from scanner.motion import Motion
 
 SEARCHED_SAMPLES = 1 << 16
@@ -20,27 +23,36 @@ MAX_PULSE_SAMPLES = 64
 """Longest period of the pulses that is searched: each of its samples then comes 256 times in a part."""
 
 
-def describe_pulsed_light(beam: Motion, intensity: Channel) -> list[str]:
+def describe_pulsed_light(beam: Motion, intensity: Channel, grid: Grid) -> list[str]:
     """A line if some of every few samples do not show the scene, as between the pulses of a light source.
 
-    Periods in whose multiples the motion repeats are left out: a sample of these always shows the same places.
+    Periods in which the motion repeats are left out: a sample of these always shows the same places. Where it repeats
+    in a multiple, a sample shows few places, which may be dark: there the other samples have to show a scene.
 
     Args:
         beam: the motion.
         intensity: of one or several detectors.
+        grid: the pixels.
     """
     values = intensity.read(0, min(intensity.size, SEARCHED_SAMPLES))
     usable = usable_samples(values, wild_limits(values))
     values = np.where(usable, values.reshape(len(values), -1), np.nan)
     cycles = np.array([float(np.median(axis.frequency)) for axis in beam.axes.values()]) / intensity.sample_rate
+    x, y = (beam.axes[axis].angle.read(0, len(values)) for axis in AXES)
     most, found = 0.0, 0
     for period in range(2, min(MAX_PULSE_SAMPLES, len(values) // (2 * PARTS)) + 1):
         count = len(values) // (PARTS * period)
-        if (np.abs(cycles * period - np.round(cycles * period)) * count < 1.0).any():
+        turns = period * np.outer(np.arange(1, MAX_PULSE_SAMPLES + 1), cycles)  # in multiples of the period
+        repeats = (np.abs(turns - np.round(turns)) * count < 1.0).any(axis=1)
+        if repeats[0]:
             continue
-        share = _dark_share(values[: PARTS * count * period].reshape(PARTS, count, period, -1))
-        if share > most:
-            most, found = share, period
+        dark = _dark_samples(values[: PARTS * count * period].reshape(PARTS, count, period, -1))
+        if not dark.mean() > most:
+            continue
+        off = dark[np.arange(len(values)) % period]
+        pictures = (map_samples(x[part], y[part], values[part], grid) for part in (off, ~off))
+        if not repeats.any() or misses_scene(*pictures):
+            most, found = float(dark.mean()), period
     if not found:
         return []
     return [
@@ -50,8 +62,8 @@ def describe_pulsed_light(beam: Motion, intensity: Channel) -> list[str]:
     ]
 
 
-def _dark_share(values: Array) -> float:
-    """Share of the samples of a period that are dark in all parts, 0 where others are in each.
+def _dark_samples(values: Array) -> Mask:
+    """Which samples of a period are dark in all parts, none where others are in each; shape (samples,).
 
     Args:
         values: shape (parts, periods, samples, detectors).
@@ -59,4 +71,4 @@ def _dark_share(values: Array) -> float:
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged samples
         scatter = values.std(axis=1).max(axis=-1)
     dark = scatter < QUIET_SD_SHARE * scatter.max(axis=1, keepdims=True)  # not where a sample is missing: NaN
-    return float(dark[0].mean()) if (dark == dark[0]).all() else 0.0
+    return np.asarray(dark[0] & (dark == dark[0]).all())

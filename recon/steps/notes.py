@@ -68,7 +68,7 @@ def describe_limits(
     misleading = (
         describe_wrapped_integers(intensity)
         or describe_running_sums(intensity)
-        or describe_pulsed_light(beam, intensity)
+        or describe_pulsed_light(beam, intensity, grid)
         or describe_blanked_directions(beam, intensity)
     )
     return [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.support.two_axis_scan import FIELD, RATE_HZ, READOUTS, angles, light, reconstruct, sensors
+from tests.support.two_axis_scan import FIELD, HALF_RAD, RATE_HZ, READOUTS, angles, light, reconstruct, sensors
 
 LINE = "the light is pulsed"
 
@@ -40,3 +40,17 @@ def test_steady_light_and_samples_that_are_left_out_are_no_error() -> None:
     index = np.arange(light(1).size)
     assert not limits(index >= 0, 0.0)
     assert not limits(index % 5 == 0, np.nan)
+
+
+@pytest.mark.parametrize("samples_per_cycle", [36, 40, 50, 100])
+def test_a_scene_with_a_dark_border_is_no_pulse_where_the_clock_follows_the_scanner(samples_per_cycle: int) -> None:
+    """A sample of some periods shows few places of x, which are dark at any time where they lie at the border."""
+    rate = 2000.0 * samples_per_cycle
+    time = np.arange(40_000) / rate
+    x, y = np.sin(2 * np.pi * 2000.0 * time + 0.1), np.sin(2 * np.pi * 833.1 * time)
+    scene = (np.hypot(x, y) < 0.6) * (1.0 + 0.8 * np.sin(20.0 * x + 1.0) * np.sin(17.0 * y + 2.0))
+    values = np.random.default_rng(1).poisson(300.0 * scene).astype(float)
+    noise = np.random.default_rng(2).normal(0.0, 2e-3, (2, time.size))
+    senses = {f"sense_{a}": (20.0 * HALF_RAD * v + n, "V", rate) for a, v, n in zip("xy", (x, y), noise, strict=True)}
+    result = reconstruct({**senses, "intensity": (values, "V", rate)}, READOUTS + FIELD)
+    assert not any(LINE in limit for limit in result.limits)
