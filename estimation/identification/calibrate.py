@@ -101,6 +101,12 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
             responses[name] = result.responses
             if any(result.by_torque.get(key) for key in MECHANICS_KEYS):
                 scaled.append(name)
+            if axis.terms:
+                notes.append(
+                    f"{name}: the constants are fitted without the terms that the device states "
+                    f"({', '.join(axis.terms)}); they contain the effect of these terms, and their intervals do not "
+                    "allow for it; `lissajous diagnose` fits constants and terms together"
+                )
     if scaled:
         notes.append(
             f"{', '.join(scaled)}: the intervals of J, b and k contain the uncertainty of the torque, of the readout's "

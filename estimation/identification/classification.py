@@ -15,7 +15,8 @@ MIN_DRIVE_VARIATION = 1e-3
 """Standard deviation of a drive relative to its largest value below which it counts as constant."""
 
 WHITE_NOISE_MARGIN = 1.2
-"""Standard deviation of a signal over that of white noise with the same differences, above which it shows motion."""
+"""Standard deviation of a signal over that of white noise with the same differences or the same median of the spectrum,
+above which it shows motion."""
 
 
 def classify_recording(recording: Recording, name: str) -> str | None:
@@ -54,5 +55,12 @@ def lock_in_only(recording: Recording, name: str) -> bool:
 
 
 def shows_motion(values: Array) -> bool:
-    """Whether a signal is more than white noise: neighbouring samples of noise differ as much as distant ones."""
-    return bool(np.std(values) > WHITE_NOISE_MARGIN * np.std(np.diff(values)) / np.sqrt(2.0))
+    """Whether a signal is more than white noise: neighbouring samples of noise differ as much as distant ones.
+
+    With less than five samples a period those of a motion do so too, and a line in the spectrum shows it: the power of
+    white noise is distributed exponentially, with a median of ln 2 times its mean.
+    """
+    if np.std(values) > WHITE_NOISE_MARGIN * np.std(np.diff(values)) / np.sqrt(2.0):
+        return True
+    power = np.abs(np.fft.rfft(values - np.mean(values))[1:]) ** 2
+    return bool(np.mean(power) > WHITE_NOISE_MARGIN**2 * np.median(power) / np.log(2.0))

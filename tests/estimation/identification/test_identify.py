@@ -278,3 +278,24 @@ def test_driven_recordings_without_a_reference_angle_are_refused(tmp_path, capsy
     assert not (tmp_path / "out").exists()
     with pytest.raises(BadInput, match="no recording"):
         identify([], DRIVEN)
+
+
+def test_terms_that_the_device_states_are_named_as_left_out() -> None:
+    """A Duffing resonator, whose device file states its cubic stiffness: the fitted law has none."""
+    linear = linear_axis(1000.0, 50.0)
+    axis = replace(linear, terms={"cubic-stiffness": {"k3": 0.1 * linear.require_mechanics().k / 0.1**2}})
+    plan = Plan({"x": Constant(0.0)}, 0.05, 2e5, references=("angle",))
+    recording, _ = simulate(Device("d", {"x": axis}), plan, start={"x": InitialState(0.05, 0.0)}, seed=1)
+    channels = {"angle_x": (recording["angle_x"].read(), "rad", 2e5)}
+    for each, count in ((axis, 1), (linear, 0)):
+        found = identify([Recording.from_arrays(channels)], Device("d", {"x": each}))
+        assert sum("without the terms that the device states (cubic-stiffness)" in n for n in found.notes) == count
+
+
+@pytest.mark.parametrize("samples_per_period", [2.3, 3.3, 4.1, 4.9])
+def test_a_motion_of_few_samples_a_period_is_no_rest(samples_per_period: float) -> None:
+    time, rng = np.arange(4000), np.random.default_rng(0)
+    motion = np.exp(-time / 1000) * np.sin(2 * np.pi * time / samples_per_period)
+    noise = rng.normal(0.0, 1e-3, time.size)
+    for values, kind in ((motion + noise, "free decay without a reference angle"), (noise, "rest")):
+        assert classify_recording(Recording.from_arrays({"sense_x": (values, "V", 1e4)}), "x") == kind
