@@ -217,7 +217,7 @@ def accumulate_samples(
     """Add samples to the sums and counts of their pixels, in one pass and without temporaries.
 
     For a long recording, call it once a chunk with the sums and counts that the previous call returned. A sample
-    outside the field, or with NaN in an angle or in any detector, is left out.
+    outside the field, or masked or NaN in an angle or in any detector, is left out.
 
     Args:
         theta_x, theta_y: mechanical angles, shape (n,) [rad].
@@ -232,7 +232,10 @@ def accumulate_samples(
     Raises:
         BadInput: the shapes do not match, or values are not real numbers.
     """
-    theta_x, theta_y, intensity = np.asarray(theta_x), np.asarray(theta_y), np.asarray(intensity)
+    theta_x, theta_y, intensity = (
+        np.ma.filled(np.ma.array(values, float), np.nan) if np.ma.is_masked(values) else np.asarray(values)
+        for values in (theta_x, theta_y, intensity)
+    )
     for name, values in (("theta_x", theta_x), ("theta_y", theta_y), ("intensity", intensity)):
         if values.dtype.kind not in "biuf":
             raise BadInput(f"holds {values.dtype}, not real numbers", channel=name, hint="give integers or floats")

@@ -199,3 +199,13 @@ def test_the_time_for_a_fill_is_the_first_sample_that_reaches_it():
         time_for_fill(x, x, 10.0, grid, 1.1)
     with pytest.raises(BadInput, match="sample rate"):
         time_for_fill(x, x, 0.0, grid, 0.5)
+
+
+def test_masked_samples_are_left_out():
+    """Read errors are often masked by a value that is no measurement, such as 65535."""
+    centre, values = np.zeros(3), np.array([1, 2, 65535])
+    mask = np.array([False, False, True])
+    for angle, intensity in ((centre, np.ma.array(values, mask=mask)), (np.ma.array(centre, mask=mask), values)):
+        picture = map_samples(angle, centre, intensity, Grid(1, 1, 1.0, 1.0))
+        assert picture.image[0, 0] == 1.5
+        assert picture.coverage[0, 0] == 2
