@@ -27,6 +27,7 @@ from recon.report.movie import write_movie
 from recon.sample_ranges import SampleRanges, to_sample_ranges
 from recon.steps.reconstruction import Options, Reconstruction
 from recon.steps.z_slices import ZSlices, find_z_slices
+from scanner.arguments import check_numbers, check_whole_numbers
 from scanner.errors import BadInput
 
 if TYPE_CHECKING:
@@ -162,11 +163,14 @@ def frames(
         z_step: thickness of a slice [m]: samples are sorted by z, whether it rests or not.
 
     Raises:
-        BadInput: a number is not positive; both count and time are given; a frame or a slice would hold less than one
-            sample; slices are asked for, and ``position_z`` is missing or does not rest.
+        BadInput: a number is not positive, or ``count`` is not whole; both count and time are given; a frame or a
+            slice would hold less than one sample; slices are asked for, and ``position_z`` is missing or does not rest.
     """
     for name, value in (("count", count), ("frame_time", frame_time), ("z_step", z_step)):
-        if value is not None and not 0.0 < value < math.inf:
+        if value is None:
+            continue
+        (check_whole_numbers if name == "count" else check_numbers)(**{name: value})
+        if not 0.0 < value < math.inf:
             raise BadInput(f"is {value}", channel=name, hint="give a positive number")
     if count is not None and frame_time is not None:
         raise BadInput("is given beside a count", channel="frame_time", hint="give one of the two")

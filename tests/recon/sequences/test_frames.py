@@ -173,3 +173,9 @@ def test_the_noise_of_a_frame_is_not_that_of_a_scene_that_changed_later() -> Non
         film = frames(reconstruct(own, Options(pixels=(60, 50)), quiet=True), 2)
         sd.append(float(np.nanmedian(next(iter(film.estimates())).sd)))
     assert sd[1] == pytest.approx(sd[0], rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "value"), [("count", 2.5), ("count", "3"), ("frame_time", "0.1"), ("z_step", [1e-6])])
+def test_numbers_of_frames_that_are_none_are_refused(result: Reconstruction, name: str, value: object) -> None:
+    with pytest.raises(BadInput, match=f"^{name}: is "):
+        frames(result, **{name: value})
