@@ -61,7 +61,9 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check_values(self)
-        for change in self.drift.values():
+        for axis, change in self.drift.items():
+            if axis not in AXES:
+                raise BadInput(f"names {axis!r}", channel="drift", hint=f"name the axes {' and '.join(AXES)}")
             if checked_number(change, FINITE["must"], "drift") <= -1.0:
                 raise BadInput(f"is {change:g}", channel="drift", hint="give a relative change above -1")
 
