@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
 from estimation.identification.classification import (
     UNREFERENCED_DECAY,
     UNREFERENCED_DRIVE,
@@ -136,6 +137,7 @@ class _AxisIdentification:
         self.swept: list[SweptRecord] = []
         self.gain_tolerance = 0.0  # of the reference angle of driven motion
         self.decays: list[Decay] = []
+        self.open_after_decay: str | None = None  # beside J, after a free decay without a reference angle
         self.by_torque: dict[str, float] = {}  # standard deviation that the drive's torque adds to a value
 
     def add(self, recording: Recording) -> None:
@@ -215,18 +217,13 @@ class _AxisIdentification:
         return phase.frequency
 
     def _take_ratios(self, found: dict[str, IdentifiedValue], readout: Readout | None) -> None:
-        """Take ratios of the mechanics from a free decay without an angle, with a note on the values that stay open."""
+        """Take ratios of the mechanics from a free decay without an angle; ``conclude`` names the values left open."""
         self.values = combine_values([self.values, found])
-        open_values = "J"
+        self.open_after_decay = ""
         if isinstance(readout, MotionSensor) and readout is self.axis.readout:
-            open_values = "J, and the gain of the readout"
+            self.open_after_decay = ", and the gain of the readout"
         elif readout is not None and not isinstance(readout, MotionSensor):
-            open_values = "J, theta0, C0, the gain of the readout, and the sign of the angle"
-        self.notes.append(
-            f"{self.name}: without a reference angle a free decay determines k/J and b/J (resonance and Q) only; "
-            f"{open_values} stay{'s' if open_values == 'J' else ''} as stated; record angle_{self.name}, and driven "
-            "motion for J"
-        )
+            self.open_after_decay = ", theta0, C0, the gain of the readout, and the sign of the angle"
 
     def _rest(self, recording: Recording) -> None:
         sense = recording[f"sense_{self.name}"].read()
@@ -258,6 +255,7 @@ class _AxisIdentification:
         axis = self.device_axis()  # with the capacitance as identified
         if self.decays:
             self._take(axis, lambda axis: mechanics_from_decays(axis, self.decays))
+        decay = {key: value for key, value in self.values.items() if key in ("k_over_J", "b_over_J")}
         several = len({round(record.frequency) for record in self.driven}) > 1
         if several:
             self._take(axis, lambda axis: fit_mechanics(axis, self.driven))
@@ -271,6 +269,14 @@ class _AxisIdentification:
             self.notes.append(
                 f"{self.name}: the driven motion does not determine J; record two or more drive frequencies, or a "
                 "sweep through the resonance"
+            )
+        if several:
+            self._average_ratios(decay)
+        elif self.open_after_decay is not None:
+            self.notes.append(
+                f"{self.name}: without a reference angle a free decay determines k/J and b/J (resonance and Q) only; "
+                f"J{self.open_after_decay} stay{'' if self.open_after_decay else 's'} as stated; record "
+                f"angle_{self.name}, and driven motion for J"
             )
         if several and self.gain_tolerance:
             for key in MECHANICS_KEYS:
@@ -298,6 +304,29 @@ class _AxisIdentification:
             for name in found:
                 moved = off[name].value - found[name].value if name in off else 0.0
                 self.by_torque[name] = float(np.hypot(self.by_torque[name], moved))
+
+    def _average_ratios(self, decay: Mapping[str, IdentifiedValue]) -> None:
+        """Average the ratios of driven motion with those of free decays; k and b follow from them and the driven J.
+
+        Where the two differ by more than their noise, as by a drift between the recordings or a stiffness that depends
+        on the amplitude, the interval is widened until it contains the difference (Birge ratio).
+        """
+        J = self.values["J"]
+        for key, value in decay.items():
+            driven, name = self.values[key], key[0]
+            mean = combine_values([{key: value}, {key: driven}])[key]
+            distance = abs(value.value - driven.value) / float(np.hypot(value.sd, driven.sd))
+            ratio = self.values[key] = IdentifiedValue(mean.value, mean.sd * max(1.0, distance))
+            self.by_torque[key] *= (mean.sd / driven.sd) ** 2  # the weight of driven motion
+            sd = float(np.hypot(ratio.sd * J.value, ratio.value * J.sd))
+            self.values[name] = IdentifiedValue(ratio.value * J.value, sd)
+            self.by_torque[name] = ratio.value * self.by_torque["J"]
+            if distance > DISCRIMINATION_SIGMA:
+                self.notes.append(
+                    f"{self.name}: free decay and driven motion differ in {name}/J by {distance:.3g} standard "
+                    f"deviations ({value.value / driven.value - 1.0:+.2%}): the device changed between them, or its "
+                    "law is not linear; `lissajous diagnose` of the driven motion names such a law"
+                )
 
     def marginal(self) -> dict[str, IdentifiedValue]:
         """The values with their complete uncertainty, that of the torque included."""

@@ -11,13 +11,13 @@ import pytest
 from estimation.identification.calibrate import identify
 from estimation.identification.decay_without_angle import fit_decay_without_angle
 from phantoms.forward import InitialState, Plan, simulate
-from phantoms.waveforms import Constant
+from phantoms.waveforms import Constant, Sweep
 from recon.cli import main
 from scanner import devices
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
-from scanner.stages import Acceleration, Mechanics, MotionSensor, Position, Velocity
+from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position, Velocity
 
 W, QUALITY = 2 * np.pi * 5000.0, 80.0
 SENSORS = [Position(10.0, 0.01), Velocity(10.0 / W, 0.01), Acceleration(10.0 / W**2, 0.01)]
@@ -73,3 +73,13 @@ def test_seven_cycles_are_refused_and_so_is_another_motion() -> None:
     wrong = Recording.from_arrays({"sense_x": (np.sin(2 * np.pi * 5000 * time + 4.0 * np.sin(60 * time)), "V", 2e5)})
     with pytest.raises(BadInput, match="does not follow a free decay"):
         fit_decay_without_angle(device.axes["x"], wrong["sense_x"])
+
+
+def test_no_note_asks_for_the_driven_motion_that_was_recorded() -> None:
+    recording, device = decay(SENSORS[0], 100.0, 5)
+    axis = replace(device.axes["x"], drive=Drive("linear", torque_per_volt=1e-4))
+    plan = Plan({"x": Sweep(4900.0, 5100.0, 0.1, 1.0)}, 0.1, 2e5)
+    driven, _ = simulate(Device("d", {"x": axis}), plan, seed=1)
+    found = identify([recording, driven], Device("d", {"x": axis}))
+    assert "J" in found.values["x"]
+    assert not any("driven motion for J" in note for note in found.notes)

@@ -299,3 +299,30 @@ def test_a_motion_of_few_samples_a_period_is_no_rest(samples_per_period: float) 
     noise = rng.normal(0.0, 1e-3, time.size)
     for values, kind in ((motion + noise, "free decay without a reference angle"), (noise, "rest")):
         assert classify_recording(Recording.from_arrays({"sense_x": (values, "V", 1e4)}), "x") == kind
+
+
+@pytest.mark.parametrize("softening", [0.0, 0.01])
+def test_ratios_of_a_free_decay_and_of_noisy_driven_motion_are_averaged(softening: float) -> None:
+    """The decay determines resonance and Q, the driven motion J; a decay of another stiffness contradicts it."""
+    true = linear_axis(1000.0, 50.0)
+    m = true.require_mechanics()
+    changed = replace(true, mechanics=replace(m, k=(1.0 - softening) * m.k))
+    plan = Plan({"x": Constant(0.0)}, 0.05, 1e5, references=("angle",))
+    free, _ = simulate(Device("d", {"x": changed}), plan, start={"x": InitialState(0.05, 0.0)}, seed=1)
+    noise = np.random.default_rng(0)
+    quiet = free["angle_x"].read() + 1e-4 * noise.standard_normal(free["angle_x"].size)
+    decay = Recording.from_arrays({"angle_x": (quiet, "rad", 1e5)})
+    tones = []
+    for f in (980.0, 1020.0):
+        angle, drive = driven(true, f, 0.05, 0.1, Drift())
+        noisy = angle + 0.005 * noise.standard_normal(angle.size)
+        volt = drive(np.arange(angle.size) / 1e6)
+        tones.append(Recording.from_arrays({"angle_x": (noisy, "rad", 1e6), "drive_x": (volt, "V", 1e6)}))
+    alone, both = (identify(each, Device("d", {"x": true})) for each in (tones, [decay, *tones]))
+    ratio = both.values["x"]["k_over_J"]
+    assert ratio.value == pytest.approx((1.0 - softening) * m.k / m.J, abs=4.0 * ratio.sd)
+    assert both.values["x"]["J"] == alone.values["x"]["J"]
+    assert any("free decay and driven motion differ in k/J" in note for note in both.notes) == (softening > 0.0)
+    if not softening:
+        assert ratio.sd < 0.5 * alone.values["x"]["k_over_J"].sd
+        assert both.values["x"]["k"].value == pytest.approx(ratio.value * both.values["x"]["J"].value)
