@@ -170,7 +170,8 @@ class _AxisIdentification:
             self._rest(recording)
         elif kind == UNREFERENCED_DECAY:
             channel, readout = recording[f"sense_{self.name}"], self.axis.require_readout()
-            self._take_ratios(fit_decay_without_angle(self.axis, channel), readout)
+            found = fit_decay_without_angle(self.axis, channel)
+            self._take_ratios(self._with_bias_stiffness(found, self._volt(recording)), readout)
 
     def _use_reference(self, recording: Recording, kind: str) -> str:
         """Use a free decay or driven motion with a reference; the words that name it if it is no angle channel."""
@@ -215,6 +216,19 @@ class _AxisIdentification:
             self.driven += steady_segments(angle, drive, phase.frequency_at(time), rate)
         self.gain_tolerance = max(self.gain_tolerance, reference.gain_tolerance)
         return phase.frequency
+
+    def _with_bias_stiffness(self, found: dict[str, IdentifiedValue], volt: float) -> dict[str, IdentifiedValue]:
+        """Widen the interval of k/J by the stiffness of a bias, which depends on the amplitude in rad; with a note."""
+        comb, ratio = self.axis.capacitance, found["k_over_J"]
+        if comb is None or not volt:
+            return found
+        stiffness = comb.C0 * (volt / comb.theta0) ** 2 / self.axis.require_mechanics().J  # of small motions
+        self.notes.append(
+            f"{self.name}: the bias of {volt:.3g} V on the comb stiffens the decay by up to "
+            f"{stiffness / ratio.value:.2%}; k/J contains this, and its interval allows for it; record "
+            f"angle_{self.name}, with which it is separated"
+        )
+        return found | {"k_over_J": IdentifiedValue(ratio.value, float(np.hypot(ratio.sd, stiffness)))}
 
     def _take_ratios(self, found: dict[str, IdentifiedValue], readout: Readout | None) -> None:
         """Take ratios of the mechanics from a free decay without an angle; ``conclude`` names the values left open."""

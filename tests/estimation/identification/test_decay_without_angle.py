@@ -83,3 +83,16 @@ def test_no_note_asks_for_the_driven_motion_that_was_recorded() -> None:
     found = identify([recording, driven], Device("d", {"x": axis}))
     assert "J" in found.values["x"]
     assert not any("driven motion for J" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("volt", [0.0, 10.0])
+def test_the_interval_contains_the_stiffness_of_a_bias(volt: float) -> None:
+    """Of chen2019: 0.7 % of k for small motions, 500 times the interval by the noise."""
+    device = devices.load("chen2019")
+    recording, _ = simulate(device, Plan({"x": Constant(volt)}, 0.1, 2e5), start={"x": InitialState(0.12, 0.0)}, seed=1)
+    channels = {"sense_x": (recording["sense_x"].read(), "V", 2e5), "bias_x": (np.full(20_000, volt), "V", 2e5)}
+    found = identify([Recording.from_arrays(channels)], device)
+    mechanics, ratio = device.axes["x"].require_mechanics(), found.values["x"]["k_over_J"]
+    assert ratio.ci95[0] < mechanics.k / mechanics.J < ratio.ci95[1]
+    assert (ratio.sd > 1e-4 * ratio.value) == (volt > 0.0)
+    assert any("bias of 10 V" in note for note in found.notes) == (volt > 0.0)
