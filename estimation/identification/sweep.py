@@ -25,8 +25,8 @@ from scanner.arrays import Array, Complex, Mask
 from scanner.device import Axis
 
 WINDOW_CYCLES = 8.0
-"""Cycles of the Hann window that separates the motion from its harmonics and its mean: first zero at a quarter of the
-frequency."""
+"""Cycles of the squared Hann window that separates the motion from its harmonics and its mean: first zero at three
+eighths of the frequency."""
 
 HOPS_PER_WINDOW = 16
 """Points per window: the equation is taken at overlapping windows, whose dependence the covariance allows for."""
@@ -133,12 +133,13 @@ def _equations(axis: Axis, record: SweptRecord) -> _Equations:
     angle, torque = (
         (values - values.mean()) * carrier for values in (record.driven.angle, drive_torque(axis, record.driven))
     )
-    hann, first, second = _windows(hop, rate)
+    plain, first, second = _windows(hop, rate)
     windows = tuple(
-        np.asarray(each, np.complex128) for each in (hann, 1j * w * hann + first, second + 2j * w * first - w**2 * hann)
+        np.asarray(each, np.complex128)
+        for each in (plain, 1j * w * plain + first, second + 2j * w * first - w**2 * plain)
     )
     z, velocity, acceleration = (_averaged(angle, window, hop) for window in windows)
-    motion = np.stack([z, velocity, -_averaged(torque, hann, hop)], axis=1)
+    motion = np.stack([z, velocity, -_averaged(torque, plain, hop)], axis=1)
     balance = _one_frequency(record)
     if balance:
         direction = z.conj() / np.maximum(np.abs(z), np.finfo(float).tiny)
@@ -233,17 +234,19 @@ def _residual_correlation(equations: _Equations, ratios: Array) -> Complex:
 
 
 def _windows(hop: int, rate: float) -> tuple[Array, Array, Array]:
-    """Hann window of ``HOPS_PER_WINDOW`` hops and its first and second derivative in time, of the sum 1.
+    """Squared Hann window of ``HOPS_PER_WINDOW`` hops and its first and second derivative in time, of the sum 1.
 
     The average under a derivative of the window is the derivative of the average under the window, because the window
-    and its first derivative are 0 at both ends.
+    and its first derivative are 0 at both ends. The second derivative is so too: sums then equal the integrals also of
+    the line at -2 w, which has few samples a period. Under a Hann window b/J is 0.3 % wrong at six samples a period.
     """
     size = HOPS_PER_WINDOW * hop
     turn = 2.0 * np.pi * np.arange(size + 1) / size
     w = 2.0 * np.pi * rate / size
-    curved = w**2 * np.cos(turn)
-    curved[[0, -1]] /= 2.0  # the trapezoidal rule, as the second derivative is not 0 at the ends
-    return tuple(each / size for each in (1.0 - np.cos(turn), w * np.sin(turn), curved))  # type: ignore[return-value]
+    window = 1.5 - 2.0 * np.cos(turn) + 0.5 * np.cos(2.0 * turn)
+    first = w * (2.0 * np.sin(turn) - np.sin(2.0 * turn))
+    second = w**2 * (2.0 * np.cos(turn) - 2.0 * np.cos(2.0 * turn))
+    return tuple(each / (1.5 * size) for each in (window, first, second))  # type: ignore[return-value]
 
 
 def _averaged(values: Array | Complex, window: Array | Complex, hop: int) -> Complex:

@@ -188,3 +188,18 @@ def test_noise_alone_is_no_motion() -> None:
     driven = Recording.from_arrays({"sense_x": (noise, "V", RATE), "drive_x": (drive, "V", RATE)})
     with pytest.raises(BadInput, match="shows no motion above white noise in sense_x"):
         identify([driven], nominal(SENSORS["angle"]))
+
+
+@pytest.mark.parametrize("rate", [6e3, 12e3])
+def test_a_sweep_of_few_samples_a_period_has_no_bias(rate: float) -> None:
+    w, quality, duration = 2 * np.pi * 2000.0, 100.0, 0.2
+    axis = Axis(Mechanics(1e-9, 1e-9 * w / quality, 1e-9 * w**2), drive=Drive("linear", 1e-4), name="x")
+    device = Device("d", {"x": axis})
+    plan = Plan({"x": Sweep(1960.0, 2040.0, duration, 1.0)}, duration, 10 * rate, references=("angle",))
+    recording, _ = simulate(device, plan, start={"x": InitialState(0.0, 0.0)}, seed=1)
+    angle, drive = (recording[name].read()[::10] for name in ("angle_x", "drive_x"))
+    noisy = angle + 2e-3 * np.abs(angle).max() * np.random.default_rng(0).standard_normal(angle.size)
+    channels = {"angle_x": (noisy, "rad", rate), "drive_x": (drive, "V", rate)}
+    found = identify([Recording.from_arrays(channels)], device).values["x"]
+    assert found["k_over_J"].value == pytest.approx(w**2, abs=4.0 * found["k_over_J"].sd)
+    assert found["b_over_J"].value == pytest.approx(w / quality, abs=4.0 * found["b_over_J"].sd)
