@@ -22,8 +22,8 @@ MAX_WINDINGS = 20_000
 """Most cycles of an axis in one picture. It bounds the pairs that are compared to some millions, a few seconds, and
 the beam's path over 400 pixels to the samples of ``scan_design.MAX_PICTURE_SAMPLES``."""
 
-PHASES = ("best", "worst")
-"""Phases between the axes at which a figure is evaluated: of the finest and of the coarsest mesh."""
+PHASES = {"best": 0.5, "worst": 0.0}
+"""Phases between the axes of the finest and of the coarsest mesh, as parts of the way from one coarsest to the next."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class LissajousFigure:
         n_x, n_y = self.windings
         return 0.5 * math.pi / n_y, 0.5 * math.pi / n_x
 
-    def angles(self, rate: float, phase: str) -> tuple[Array, Array]:
+    def angles(self, rate: float, phase: float, delay: float = 0.0) -> tuple[Array, Array]:
         """Return the angles of one picture, shape (samples per picture,) [rad].
 
         The figure runs into a corner where both motions reverse at once: n_y phi_x - n_x phi_y = (n_y - n_x) pi/2,
@@ -55,11 +55,12 @@ class LissajousFigure:
 
         Args:
             rate: samples per second [Hz].
-            phase: one of ``PHASES``.
+            phase: part of the way from a worst phase to the next one, see ``PHASES``.
+            delay: of the first sample, in periods of the sample clock.
         """
         n_x, n_y = self.windings
-        turn = 2.0 * np.pi * self.frame_rate * np.arange(round(rate / self.frame_rate)) / rate
-        phi_x = 0.5 * math.pi * (n_y - n_x + (phase == "best")) / n_y
+        turn = 2.0 * np.pi * self.frame_rate * (np.arange(round(rate / self.frame_rate)) + delay) / rate
+        phi_x = math.pi * (0.5 * (n_y - n_x) + phase) / n_y
         return self.amplitude[0] * np.sin(n_x * turn + phi_x), self.amplitude[1] * np.sin(n_y * turn)
 
     def mesh_diameter(self, grid: Grid) -> float:
@@ -73,6 +74,10 @@ class LissajousFigure:
         x = self.windings[0] * self.amplitude[0] / grid.half_angle_x * grid.width
         y = self.windings[1] * self.amplitude[1] / grid.half_angle_y * grid.height
         return 2.0 * math.pi * self.frame_rate * max(x, y)
+
+    def skips_pixels(self, rate: float, grid: Grid) -> bool:
+        """Return whether the beam moves more than a pixel between samples at ``rate`` [Hz]."""
+        return rate < 0.5 * self.path_rate(grid)
 
 
 def enumerate_figures(

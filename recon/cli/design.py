@@ -152,9 +152,12 @@ def _candidate_summary(candidate: ScanCandidate, requirements: ScanRequirements)
 
 
 def _design_notes(best: ScanCandidate, requirements: ScanRequirements) -> list[str]:
+    from recon.scan_design import SKIPPING_STARTS
+
     notes = []
-    reached = best.fill_reached(requirements.fill)
-    if reached == "at the best phase":
+    reached, grid, rate = best.fill_reached(requirements.fill), requirements.grid, requirements.sample_rate
+    skips = rate is not None and best.figure.skips_pixels(rate, grid)
+    if reached == "at the best phase" and not skips:
         x, y = map(degrees, best.figure.phase_best_to_worst)
         notes.append(
             f"the fill is reached at the best phase between the axes only; {x:.2g}° further in the phase of x, or "
@@ -162,11 +165,11 @@ def _design_notes(best: ScanCandidate, requirements: ScanRequirements) -> list[s
         )
     if reached == "no":
         notes.append(f"no pair reaches a fill of {requirements.fill:.1%}: choose a lower frame rate or fewer pixels")
-    needed = best.figure.path_rate(requirements.grid) / 2.0
-    if requirements.sample_rate is not None and requirements.sample_rate < needed:
+    if skips:
         notes.append(
-            f"at {requirements.sample_rate:g} samples a second the beam skips pixels; from {needed:.3g} on it moves "
-            "one at most"
+            f"at {rate:g} samples a second the beam skips pixels, and the fill depends on the instant of the first "
+            f"sample too (best and worst of {SKIPPING_STARTS} pictures at random phases); from "
+            f"{best.figure.path_rate(grid) / 2.0:.3g} on it moves one at most"
         )
     return notes
 

@@ -13,7 +13,7 @@ from recon.lissajous_figure import PHASES
 from recon.report.figures import COLOURS, figure_uri, new_figure, use_plain_ticks
 from recon.report.page import Figure, Section, Table, render
 from recon.report.reconstruction import coverage_figure, scale_bar
-from recon.scan_design import ScanCandidate, ScanRequirements, SustainedBand
+from recon.scan_design import SKIPPING_STARTS, ScanCandidate, ScanRequirements, SustainedBand
 
 SHOWN_CANDIDATES = 3
 """Candidates in the plots over time: six curves can be distinguished."""
@@ -57,7 +57,7 @@ def design_report(
     )
     coverage = []
     for phase in PHASES:
-        x, y = best.figure.angles(_rate(best, requirements), best.phases[phase])
+        x, y = best.figure.angles(_rate(best, requirements), *best.starts[phase])
         picture = map_samples(x, y, x, grid)
         shown = coverage_figure(picture.coverage, scale_bar(grid))
         caption = f"windings {_name(best)} at the {phase} phase between the axes: {shown.caption}"
@@ -75,7 +75,9 @@ def design_report(
 PAIRS_TEXT = (
     "Motions at n_x and n_y times the frame rate, without a common divisor, repeat as one figure. Its mesh is finest "
     "at one phase between the axes and twice as coarse at another. The best phase is that of the two at which more "
-    "pixels are visited, mostly that of the finest mesh. A drifting resonance passes through both. "
+    "pixels are visited, mostly that of the finest mesh. A drifting resonance passes through both. Where samples skip "
+    "pixels, the fill depends on the instant of the first sample too: best and worst are then those of "
+    f"{SKIPPING_STARTS} random phases and instants. "
     "Gap: diameter of the largest disc that contains no visited pixel."
 )
 TIME_TEXT = "During one picture of each of the first pairs. Solid: best phase between the axes; dashed: worst phase."
@@ -118,7 +120,7 @@ def _against_time(candidates: Sequence[ScanCandidate], requirements: ScanRequire
     for candidate, colour in zip(candidates, COLOURS, strict=False):
         for phase, line in zip(PHASES, ("-", "--"), strict=True):
             rate = _rate(candidate, requirements)
-            x, y = candidate.figure.angles(rate, candidate.phases[phase])
+            x, y = candidate.figure.angles(rate, *candidate.starts[phase])
             time, fill = fill_against_time(x, y, rate, requirements.grid)
             few = slice(None, None, max(1, time.size // 400))
             label = _name(candidate) if phase == "best" else None
