@@ -19,6 +19,7 @@ from estimation.device_fit.fit import (
 )
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
+from estimation.parallel import map_fits
 from scanner.arrays import Array
 from scanner.terms.term import AMPLITUDE_KINDS
 
@@ -51,6 +52,25 @@ def fit_from_stated_values(likelihood: Likelihood, nominal: Fit, terms: Sequence
 def fit_with_stated_values(likelihood: Likelihood, model: Model, x: Array, first: float) -> Fit:
     """The fit over growing windows from ``x`` with the nominal values kept as stated."""
     return fit_growing(likelihood, model, stated_values(model, x), first, fixed=model.indices("nominal"))
+
+
+def fit_in_another_minimum(likelihood: Likelihood, nominal: Fit, drifting: Sequence[Fit]) -> Fit | None:
+    """The nominal device in a minimum in which it leaves but noise, reached from fits with drifts; None where none is.
+
+    With the device file of another scanner, fits of its first window from the stated values end in a wrong minimum.
+
+    Args:
+        nominal: which leaves more than noise, else there is none.
+        drifting: fits with drifts from the stated values.
+    """
+    if residual_is_noise(nominal):
+        return None
+
+    def without_drifts(fit: Fit) -> Fit:
+        return fit_model(likelihood, nominal.model, nominal.model.map_parameters_from(fit.model, fit.x))
+
+    fits = filter(residual_is_noise, map_fits(without_drifts, drifting, likelihood.steps))
+    return min(fits, key=misfit, default=None)
 
 
 def fit_nonlinear_law(

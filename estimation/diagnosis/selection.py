@@ -33,6 +33,7 @@ from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.clipping import clipped_readouts
 from estimation.diagnosis.from_stated_values import (
     fit_from_stated_values,
+    fit_in_another_minimum,
     fit_nonlinear_law,
     fit_with_stated_values,
     nonlinear_starts,
@@ -179,7 +180,11 @@ def _choose_terms(search: _Search) -> SelectedTerms:
     anchor, tried = fit_anchor(likelihood, nominal, search.early, search.stops, groups[:1])
     explained = anchor is not nominal and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)
     if not explained:
-        from_stated_values = _choose_from_stated_values(search)
+        drifting = _fit_drifts_from_stated_values(search)
+        other = fit_in_another_minimum(likelihood, nominal, drifting)
+        if other is not None:
+            return SelectedTerms(likelihood, other, other)
+        from_stated_values = _choose_from_stated_values(search, drifting)
         if from_stated_values is not None:
             return _with_nonlinear_term(search, from_stated_values)
         if anchor is nominal:
@@ -198,28 +203,41 @@ def _choose_terms(search: _Search) -> SelectedTerms:
     return _with_nonlinear_term(search, selected or SelectedTerms(likelihood, nominal, nominal))
 
 
-def _choose_from_stated_values(search: _Search) -> SelectedTerms | None:
+def _fit_drifts_from_stated_values(search: _Search) -> list[Fit]:
+    """Fits from the stated values with the drifts of ``ABSORBED_EFFECTS``; none where nominal values are probable."""
+    groups = [search.of_effects(effects) for effects in ABSORBED_EFFECTS]
+    if not groups[0] or not nominal_values_are_improbable(search.nominal, MAX_ABSORBED_PROBABILITY):
+        return []
+    search.progress("stated values, with drifting resonances")
+
+    def fit(drifts: Sequence[Candidate]) -> Fit:
+        return fit_from_stated_values(search.likelihood, search.nominal, drifts, search.stops[0])
+
+    return map_fits(fit, groups, search.likelihood.steps)
+
+
+def _choose_from_stated_values(search: _Search, drifting: Sequence[Fit]) -> SelectedTerms | None:
     """Named laws around a fit from the stated values, where nominal values have absorbed a misfit.
 
-    It is that with the drifts of ``ABSORBED_EFFECTS`` that have the best evidence or, where all drifts leave more than
-    noise, with a law that is linear in no amplitude and leaves but noise. None where nominal values have absorbed
-    nothing, where drifts follow the motion neither with probable nor with improbable nominal values, or where the named
-    laws are not the answer or leave improbable values too.
+    It is that with the drifts that have the best evidence or, where all drifts leave more than noise, with a law that
+    is linear in no amplitude and leaves but noise. None where nominal values have absorbed nothing, where drifts follow
+    the motion neither with probable nor with improbable nominal values, or where the named laws are not the answer or
+    leave improbable values too.
+
+    Args:
+        drifting: fits with drifts from the stated values.
     """
-    likelihood, nominal, first = search.likelihood, search.nominal, search.stops[0]
-    groups = [search.of_effects(effects) for effects in ABSORBED_EFFECTS]
-    if not groups[0] or not nominal_values_are_improbable(nominal, MAX_ABSORBED_PROBABILITY):
+    if not drifting:
         return None
-    search.progress("stated values, with drifting resonances")
-    fits = map_fits(lambda drifts: fit_from_stated_values(likelihood, nominal, drifts, first), groups, likelihood.steps)
-    if not any(map(residual_is_noise, fits)):
+    likelihood, nominal, first = search.likelihood, search.nominal, search.stops[0]
+    if not any(map(residual_is_noise, drifting)):
         search.progress("stated values, with laws that are linear in no amplitude")
         nonlinear = fit_nonlinear_law(likelihood, nominal, search.pool, search.stops)
         if nonlinear is not None:
             selected = _choose_beside_nonlinear_term(search, likelihood, nominal, nonlinear)
             if selected is not None and _is_answer(selected):
                 return selected
-    base = min(fits, key=lambda fit: fit.neg2_log_evidence)
+    base = min(drifting, key=lambda fit: fit.neg2_log_evidence)
     absorbed = nominal_values_are_improbable(nominal) or evidence_gain(likelihood, nominal, base)
     follows = residual_ratio(likelihood, base) < max_residual_ratio(likelihood, search.early[0], first)
     if not absorbed or (nominal_values_are_improbable(base) and not follows):

@@ -6,12 +6,39 @@ import numpy as np
 import pytest
 
 from benchmarks.blind.generator import Case
-from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD
-from estimation.device_fit.fit import nominal_values_are_improbable
+from estimation.candidate_terms.screening import all_candidates
+from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD, residual_is_noise
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.fit import Likelihood, fit_model, nominal_values_are_improbable
+from estimation.device_fit.initial import fit_progressively, flat_whiteners, window_schedule
+from estimation.device_fit.model import Model
+from estimation.diagnosis.from_stated_values import fit_in_another_minimum
 from scanner.terms import catalogue
+from tests.support.bench import DEVICE, bench_recording
 from tests.support.blind_recordings import search_blind_recording
 
 RIVALS = ("drive-droop", "coulomb-friction", "inertia-scale", "cubic-stiffness", "quadratic-drag")
+
+
+def test_a_device_in_a_wrong_minimum_is_fitted_again_from_its_fit_with_drifts() -> None:
+    """The wrong minimum is a fit that was stopped at a stiffness many tolerances too high."""
+    run = prepare_run(bench_recording(), DEVICE)
+    model = Model([run], DEVICE)
+    likelihood = Likelihood([run], flat_whiteners(model))
+    right = fit_model(likelihood, model, fit_progressively(likelihood, model, window_schedule(model))[-1].x)
+    wrong = fit_model(
+        likelihood, model, right.x + 50.0 * np.eye(right.x.size)[model.indices("nominal")[2]], max_iterations=0
+    )
+    drift = [c for c in all_candidates(model, catalogue().values()) if c.term.effect == "resonance-drift"]
+    with_drift = model.with_candidates(drift)
+    drifting = fit_model(likelihood, with_drift, with_drift.map_parameters_from(model, right.x))
+    assert residual_is_noise(right)
+    assert not residual_is_noise(wrong)
+    found = fit_in_another_minimum(likelihood, wrong, [drifting])
+    assert found is not None
+    np.testing.assert_allclose(found.x, right.x, atol=0.05)
+    assert fit_in_another_minimum(likelihood, right, [drifting]) is None
+    assert fit_in_another_minimum(likelihood, wrong, []) is None
 
 
 @pytest.mark.slow
