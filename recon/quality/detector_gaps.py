@@ -26,34 +26,54 @@ MIN_COMMON_PIXELS = 100
 """Pixels that both parts of the scan visited from which they can be compared."""
 
 MAX_SLOPE = 0.2
-"""Slope of the means of the quiet blocks against those of the others up to which the quiet ones do not show the scene.
-Blocks that are quiet because the scene is dark there have a slope near 1."""
+"""Slope of the quiet part's means against those of the rest up to which the quiet part does not show the scene.
+Parts that are quiet because the scene is dark there have a slope near 1."""
 
-MIN_CONTRAST = 4.0
-"""Variance of the means of the other blocks in the common pixels, over that of their noise, from which the scene has
-structure there that the quiet blocks would show."""
+MIN_SIGNIFICANCE = 3.0
+"""Lacking structure of the quiet blocks, in its standard deviations, from which it is more than chance: few points of
+light are missed by many paths of the beam, and few photons scatter."""
+
+PIECES_PER_PERIOD = 3
+"""Pieces of a period of the slower axis, used in turn to choose the quiet blocks and to judge them. It is odd, so that
+either purpose has every phase of that axis in two periods."""
 
 
 def find_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> SampleRanges:
     """Return the samples in which no detector shows the scene that it shows in the rest of the scan.
 
+    Blocks of the scan are chosen because they scatter little. Where points of light are smaller than a pixel, or fewer
+    than the blocks, a block may do so because the beam passed between them. Therefore half of each block's samples
+    choose, and the other half is compared with the rest of the scan. If the longest run of quiet blocks is a gap and
+    others are not, it is found by itself.
+
     Args:
         beam, intensity, grid, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
     """
-    length = max(round(BLOCK_PERIODS * slow_period(beam) * intensity.sample_rate), -(-intensity.size // MAX_BLOCKS), 2)
+    pieces = round(BLOCK_PERIODS * PIECES_PER_PERIOD)
+    length = max(
+        round(BLOCK_PERIODS * slow_period(beam) * intensity.sample_rate), -(-intensity.size // MAX_BLOCKS), pieces
+    )
     count = intensity.size // length
     if count < 2:
         return []
-    limits = wild_limits(intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES)))
-    scatter = np.array([_scatter(intensity.read(k * length, (k + 1) * length), limits) for k in range(count)])
-    loud = np.nanpercentile(scatter, 75) if np.isfinite(scatter).any() else 0.0
-    quiet = [(a * length, b * length) for a, b in runs_of_true(scatter < QUIET_SD_SHARE * loud)]
+    edges = [round(length * piece / pieces) for piece in range(pieces + 1)]
+    choosing, judging = (list(zip(edges[k:-1:2], edges[k + 1 :: 2], strict=True)) for k in (0, 1))
+    quiet = _quiet_blocks(intensity, length, count, choosing)
     if not quiet:
         return []
-    inside = subtract_ranges(quiet, unlocated)
-    others = subtract_ranges(subtract_ranges([(0, count * length)], quiet), unlocated)
-    off, on = (_grid(beam, intensity, grid, ranges) for ranges in (inside, others))
-    return quiet if misses_scene(off, on) else []
+
+    def picture(blocks: SampleRanges, parts: SampleRanges) -> Picture:
+        starts = (block * length for run in blocks for block in range(*run))
+        inside = [(start + first, start + stop) for start in starts for first, stop in parts]
+        return _grid(beam, intensity, grid, subtract_ranges(inside, unlocated))
+
+    rest = subtract_ranges([(0, count)], quiet)
+    shown, again = picture(rest, judging), picture(rest, choosing)
+    longest = [max(quiet, key=lambda run: run[1] - run[0])]
+    for blocks in (quiet, longest) if len(quiet) > 1 else (quiet,):
+        if lacks_structure(picture(blocks, judging), shown, again):
+            return [(first * length, stop * length) for first, stop in blocks]
+    return []
 
 
 def describe_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> list[str]:
@@ -95,6 +115,22 @@ def describe_blanked_directions(beam: Motion, intensity: Channel) -> list[str]:
     return lines
 
 
+def _quiet_blocks(intensity: Channel, length: int, count: int, parts: SampleRanges) -> SampleRanges:
+    """Runs of blocks that scatter less than others.
+
+    Args:
+        intensity: of one or several detectors.
+        length: of a block [samples].
+        count: of the blocks.
+        parts: samples of each block that are used.
+    """
+    limits = wild_limits(intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES)))
+    used = np.concatenate([np.arange(*part) for part in parts])
+    scatter = np.array([_scatter(intensity.read(k * length, (k + 1) * length)[used], limits) for k in range(count)])
+    loud = np.nanpercentile(scatter, 75) if np.isfinite(scatter).any() else 0.0
+    return runs_of_true(scatter < QUIET_SD_SHARE * loud)
+
+
 def _scatter(values: Array, limits: WildLimits) -> float:
     """Largest standard deviation of a detector in a block without its wild samples; NaN without samples."""
     if not len(values):
@@ -109,14 +145,24 @@ def _grid(beam: Motion, intensity: Channel, grid: Grid, ranges: SampleRanges) ->
     return grid_intensity(beam, intensity, grid, subtract_ranges([(0, intensity.size)], ranges))
 
 
-def misses_scene(off: Picture, on: Picture) -> bool:
-    """Whether every detector's structure in ``on`` is missing in ``off``, in the pixels that both visited."""
-    both = (off.coverage > 0) & (on.coverage > 1)
-    if np.count_nonzero(both) < MIN_COMMON_PIXELS:
+def lacks_structure(quiet: Picture, shown: Picture, again: Picture) -> bool:
+    """Whether structure of every detector that two pictures of the scene have in common is missing in a third.
+
+    The slope of the quiet picture against the scene is cov(quiet, again) / cov(shown, again): noise, and points of
+    light that a pixel's samples met by chance, are independent in ``shown`` and ``again`` and do not lower it. The
+    difference of the covariances is compared with its standard deviation among the pixels.
+
+    Args:
+        quiet: of the samples that are judged.
+        shown, again: of two separate sets of the other samples.
+    """
+    common = (quiet.coverage > 0) & (shown.coverage > 0) & (again.coverage > 0)
+    count = np.count_nonzero(common)
+    if count < MIN_COMMON_PIXELS:
         return False
-    dark, bright = (picture.image[both].reshape(np.count_nonzero(both), -1).astype(float) for picture in (off, on))
-    dark, bright = dark - dark.mean(axis=0), bright - bright.mean(axis=0)
-    slope = (dark * bright).sum(axis=0) / np.maximum((bright**2).sum(axis=0), 1e-300)
-    neighbours = np.diff(on.image, axis=1).reshape(on.image.shape[0], on.image.shape[1] - 1, -1)
-    noise = np.nanmedian(np.abs(neighbours), axis=(0, 1)) ** 2
-    return bool((slope < MAX_SLOPE).all() and ((bright**2).mean(axis=0) > MIN_CONTRAST * noise).all())
+    means = (picture.image[common].reshape(count, -1).astype(float) for picture in (quiet, shown, again))
+    judged, scene, reference = (values - values.mean(axis=0) for values in means)
+    missing = (scene - judged) * reference
+    significant = missing.sum(axis=0) > MIN_SIGNIFICANCE * np.sqrt((missing**2).sum(axis=0))
+    flat = (judged * reference).sum(axis=0) < MAX_SLOPE * (scene * reference).sum(axis=0)
+    return bool((significant & flat).all())

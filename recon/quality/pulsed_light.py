@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from recon.imaging.gridding import map_samples
-from recon.imaging.picture import Grid
+from recon.imaging.picture import Grid, Picture
 from recon.imaging.wild_samples import usable_samples, wild_limits
-from recon.quality.detector_gaps import QUIET_SD_SHARE, misses_scene
+from recon.quality.detector_gaps import MAX_SLOPE, MIN_COMMON_PIXELS, QUIET_SD_SHARE
 from scanner.arrays import Array, Mask
 from scanner.channel import Channel
 from scanner.device import AXES
@@ -21,6 +21,10 @@ PARTS = 4
 
 MAX_PULSE_SAMPLES = 64
 """Longest period of the pulses that is searched: each of its samples then comes 256 times in a part."""
+
+MIN_CONTRAST = 4.0
+"""Variance of the means of the other samples in the common pixels, over that of their noise, from which the scene has
+structure there that the dark samples would show."""
 
 
 def describe_pulsed_light(beam: Motion, intensity: Channel, grid: Grid) -> list[str]:
@@ -51,7 +55,7 @@ def describe_pulsed_light(beam: Motion, intensity: Channel, grid: Grid) -> list[
             continue
         off = dark[np.arange(len(values)) % period]
         pictures = (map_samples(x[part], y[part], values[part], grid) for part in (off, ~off))
-        if not repeats.any() or misses_scene(*pictures):
+        if not repeats.any() or _misses_scene(*pictures):
             most, found = float(dark.mean()), period
     if not found:
         return []
@@ -72,3 +76,16 @@ def _dark_samples(values: Array) -> Mask:
         scatter = values.std(axis=1).max(axis=-1)
     dark = scatter < QUIET_SD_SHARE * scatter.max(axis=1, keepdims=True)  # not where a sample is missing: NaN
     return np.asarray(dark[0] & (dark == dark[0]).all())
+
+
+def _misses_scene(off: Picture, on: Picture) -> bool:
+    """Whether every detector's structure in ``on`` is missing in ``off``, in the pixels that both visited."""
+    both = (off.coverage > 0) & (on.coverage > 1)
+    if np.count_nonzero(both) < MIN_COMMON_PIXELS:
+        return False
+    dark, bright = (picture.image[both].reshape(np.count_nonzero(both), -1).astype(float) for picture in (off, on))
+    dark, bright = dark - dark.mean(axis=0), bright - bright.mean(axis=0)
+    slope = (dark * bright).sum(axis=0) / np.maximum((bright**2).sum(axis=0), 1e-300)
+    neighbours = np.diff(on.image, axis=1).reshape(on.image.shape[0], on.image.shape[1] - 1, -1)
+    noise = np.nanmedian(np.abs(neighbours), axis=(0, 1)) ** 2
+    return bool((slope < MAX_SLOPE).all() and ((bright**2).mean(axis=0) > MIN_CONTRAST * noise).all())
