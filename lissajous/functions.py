@@ -177,7 +177,7 @@ def reconstruct(
     )
     if isinstance(recording, Mapping):
         recording = _recording_of_arrays(recording, sample_rate)
-    elif sample_rate is not None:
+    elif sample_rate is not None and isinstance(recording, (Recording, str, Path)):
         raise BadInput("is for arrays; a recording has its own rates", channel="sample_rate", hint="leave it out")
     known = truth_from_simulation(truth) if truth is not None else None
     if known is None and isinstance(recording, (str, Path)) and mapping is None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from scanner.arguments import check_type
 from scanner.arrays import Array
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block
@@ -76,8 +77,10 @@ def truth_from_simulation(simulated: Mapping[str, Any], path: Path | None = None
         path: of the file, for error messages.
 
     Raises:
-        BadInput: a true angle has no sample_rate, or a value is no number or no array of the shape that belongs to it.
+        BadInput: it is no mapping, a true angle has no sample_rate, or a value is no number or no array of the shape
+            that belongs to it.
     """
+    check_type(Mapping, "give the truth that lissajous.simulate returns", truth=simulated)
 
     def numbers(value: object, dimensions: int, name: str) -> Array:
         try:

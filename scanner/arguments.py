@@ -41,6 +41,22 @@ def check_whole_numbers(**numbers: object) -> None:
     _check_types(Integral, "give a whole number", numbers)
 
 
+def check_type(kind: type, hint: str, **values: object) -> None:
+    """Check that every argument is of a type.
+
+    Args:
+        kind: the type.
+        hint: what to give in place of another one.
+        values: by the name of their argument.
+
+    Raises:
+        BadInput: one is of another type; the error names the argument and the types.
+    """
+    for name, value in values.items():
+        if not isinstance(value, kind):
+            raise BadInput(f"is a {type(value).__name__}, no {kind.__name__}", channel=name, hint=hint)
+
+
 def _check_types(kind: type, hint: str, values: Mapping[str, object]) -> None:
     for name, value in values.items():
         if not isinstance(value, kind) or isinstance(value, bool):

@@ -14,6 +14,7 @@ from typing import Any
 import tomli_w
 
 from scanner import device_toml
+from scanner.arguments import check_type
 from scanner.device_toml import NOT_NEGATIVE
 from scanner.errors import DeviceInvalid
 from scanner.files import parse_toml, read_toml
@@ -160,9 +161,10 @@ class Device:
         """Return the device that a TOML text describes.
 
         Raises:
-            BadInput: the text is not TOML.
+            BadInput: the text is none, or is not TOML.
             DeviceInvalid: it lacks a needed key or holds a value that is not physical; the message names the key.
         """
+        check_type(str, "give the text of a device file; Device.load reads a file", text=text)
         return cls.from_table(parse_toml(text, source), source)
 
     @classmethod

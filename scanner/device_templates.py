@@ -184,11 +184,15 @@ def _fill(scanner: ScannerKind, typical: KnownAxis, known: KnownAxis) -> KnownAx
     """Known values, and typical ones in place of the others; a known drive frequency determines the resonance."""
     quality = known.quality or typical.quality or 1.0
     ratio = comb_frequency(1.0, quality) if scanner.is_parametric else 1.0
-    off_resonance = typical.drive_frequency is not None
-    from_drive = None if off_resonance or known.drive_frequency is None else known.drive_frequency / ratio
+    from_drive = known.drive_frequency / ratio if known.drive_frequency and _is_driven_at_resonance(typical) else None
     resonance = known.resonance or from_drive or typical.resonance or 1.0
     drive = known.drive_frequency or typical.drive_frequency or ratio * resonance
     return KnownAxis(resonance, quality, known.amplitude or typical.amplitude, drive)
+
+
+def _is_driven_at_resonance(typical: KnownAxis) -> bool:
+    """Whether an axis of typical values is driven at its resonance, so that the drive's frequency determines it."""
+    return typical.drive_frequency is None
 
 
 def _heading(kind: str, scanner: ScannerKind, filled: Mapping[str, KnownAxis]) -> str:
@@ -217,25 +221,26 @@ def _theta0(axis: KnownAxis) -> float:
     return (axis.amplitude or 1.0) / COMB_AMPLITUDE_THETA0
 
 
-def _mechanics(axis: str, known: KnownAxis, filled: KnownAxis, inertia: float) -> str:
+def _mechanics(scanner: ScannerKind, axis: str, known: KnownAxis, filled: KnownAxis, inertia: float) -> str:
     omega = 2 * pi * (filled.resonance or 1.0)
     k, b = inertia * omega**2, inertia * omega / (filled.quality or 1.0)
-    of_resonance = known.resonance or known.drive_frequency
+    by_drive = not known.resonance and known.drive_frequency and _is_driven_at_resonance(getattr(scanner, axis))
+    source = ", from the stated drive frequency" if by_drive else _mark(known.resonance)
     return f"""\
 [{axis}.mechanics]  # J theta'' + b theta' + k theta = torque
 J = {inertia:.6g}  # kg m2, typical; resonance and Q follow from b / J and k / J
 b = {b:.6g}  # N m s, for a Q of {filled.quality:g}{_mark(known.quality)}
-k = {k:.6g}  # N m / rad, for a resonance of {filled.resonance:.8g} Hz{_mark(of_resonance)}
+k = {k:.6g}  # N m / rad, for a resonance of {filled.resonance:.8g} Hz{source}
 
 [{axis}.tolerance]  # relative standard uncertainty of a value; 2 % where none is stated
-k = {0.002 if of_resonance else 0.02}  # twice that of the resonance
+k = {0.002 if known.resonance or by_drive else 0.02}  # twice that of the resonance
 b = {0.05 if known.quality else 0.2}"""
 
 
 def _comb_axis(scanner: ScannerKind, axis: str, known: KnownAxis, filled: KnownAxis) -> str:
     inertia = COMB_STIFFNESS / (2 * pi * (filled.resonance or 1.0)) ** 2
     return f"""\
-{_mechanics(axis, known, filled, inertia)}
+{_mechanics(scanner, axis, known, filled, inertia)}
 C0 = 0.02
 theta0 = 0.02
 
@@ -256,7 +261,7 @@ def _linear_axis(scanner: ScannerKind, axis: str, known: KnownAxis, filled: Know
     response = hypot(1.0 - ratio**2, ratio / (filled.quality or 1.0))
     torque = MIRROR_INERTIA * omega**2 * (filled.amplitude or 1.0) * response / LINEAR_VOLTS
     return f"""\
-{_mechanics(axis, known, filled, MIRROR_INERTIA)}
+{_mechanics(scanner, axis, known, filled, MIRROR_INERTIA)}
 torque_per_volt = {TYPICAL_SD}  # state a smaller one with a measured value
 gain = {TYPICAL_SD}  # the same
 

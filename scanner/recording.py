@@ -6,7 +6,7 @@ values of a simulation, ``/truth``, are not part of it: :func:`scanner.truth.rea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil, isfinite
@@ -154,6 +154,17 @@ class Recording:
         text = None if device is None else find(device).to_toml()
         return cls(MappingProxyType(made), MappingProxyType(attrs), device_toml=text, edges=MappingProxyType(edges))
 
+    def __reduce__(self) -> tuple[Callable[..., Recording], tuple[object, ...]]:
+        """For pickle and copy: the arrays of a recording in memory.
+
+        Raises:
+            BadInput: the channels are read from an open file.
+        """
+        if self._file is not None:
+            what = "cannot be pickled: its channels are read from an open file"
+            raise BadInput(what, file=self.path, hint="pass the path, and open it there")
+        return _from_pickle, (dict(self.channels), dict(self.attrs), self.path, self.device_toml, dict(self.edges))
+
     def __repr__(self) -> str:
         device = "no device" if self.device_toml is None else "with a device"
         lines = [f"Recording {self.name!r}: {self.duration:.6g} s from {self.start:.6g} s, {device}"]
@@ -278,6 +289,13 @@ class Recording:
                 file.create_group("device").attrs["toml"] = self.device_toml
             if truth is not None:
                 write_truth(file.create_group("truth"), truth)
+
+
+def _from_pickle(
+    channels: dict[str, Channel], attrs: dict[str, Any], path: Path | None, text: str | None, edges: dict[str, Edges]
+) -> Recording:
+    """The recording of which :meth:`Recording.__reduce__` returned the parts."""
+    return Recording(MappingProxyType(channels), MappingProxyType(attrs), path, text, edges=MappingProxyType(edges))
 
 
 def _edges_from_tuple(name: str, given: object) -> Edges:

@@ -108,7 +108,9 @@ def format_summary(summary: dict[str, Any]) -> str:
     lines = [f"{summary['recording']}: {summary['duration']:.6g} s, from {summary['source']} ({summary['format']})"]
     for name, own in summary["channels"].items():
         by = own["stated_by"]
-        line = f"  {name}: {own['variable']}, {own['unit']} ({by['unit']})"
+        stated = own["stated_unit"] or own["unit"]
+        line = f"  {name}: {own['variable']}, {stated} ({by['unit']})"
+        line += "" if stated == own["unit"] else f" converted to {own['unit']}"
         line += f", {own['sample_rate']:.9g} Hz ({by['sample_rate']})"
         line += f", from {own['start']:.9g} s ({by['start']}), {counted(own['shape'][0], 'sample')}"
         line += "".join(f"; the file states {key} {value}" for key, value in own["overruled"].items())

@@ -72,7 +72,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quiet-time",
         type=parse_positive,
-        default=5.0,
         metavar="S",
         help="follow: end when nothing came for so long (5)",
     )
@@ -158,6 +157,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise BadInput("each recording is a plane, and cannot be a stack itself", channel="--stack", hint=hint)
     if args.z_step and (options.frames or options.frame_time):
         raise BadInput("sorts the samples by z, not by time", channel="--z-step", hint="give --frames without a number")
+    if args.quiet_time is not None and not args.follow:
+        raise BadInput("has no effect without --follow", channel="--quiet-time", hint="add --follow, or leave it out")
     if args.zarr:
         import_extra("zarr", "zarr")
     if args.fill and args.picture != "mean":
@@ -171,9 +172,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         if args.follow and getattr(args, option[2:].replace("-", "_")):
             raise BadInput("needs a whole recording", channel=option, hint="leave out --follow")
     if args.follow:
-        from recon.live.follow import follow_recording
+        from recon.live.follow import QUIET_TIME_S, follow_recording
 
-        times = {"frame_time": args.frame_time, "quiet_time": args.quiet_time}
+        times = {"frame_time": args.frame_time, "quiet_time": args.quiet_time or QUIET_TIME_S}
         live = follow_recording(args.recordings[0], args.output, options, args.mapping, **times).summary()
     return reconstruct_file(args.recordings[0], args.output, options, args.mapping, live=live)
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.picture import MAX_PIXELS, Grid, Picture
+from scanner.arguments import check_type
 from scanner.errors import BadInput
 
 BLOCK_SAMPLES = 256
@@ -230,8 +231,9 @@ def accumulate_samples(
         ``sums``, float64, and ``counts``, uint32.
 
     Raises:
-        BadInput: the shapes do not match, or values are not real numbers.
+        BadInput: the shapes do not match, values are not real numbers, or ``grid`` is no Grid.
     """
+    check_type(Grid, "give a lissajous.Grid", grid=grid)
     theta_x, theta_y, intensity = (
         np.ma.filled(np.ma.array(values, float), np.nan) if np.ma.is_masked(values) else np.asarray(values)
         for values in (theta_x, theta_y, intensity)

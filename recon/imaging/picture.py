@@ -38,8 +38,8 @@ class Grid:
         angle: kind of the angles that files and reports state, ``"mechanical"`` or ``"optical"``.
 
     Raises:
-        BadInput: a size or an angle is no number, or not positive and finite, or there are ``MAX_PIXELS`` pixels or
-            more.
+        BadInput: a size, an angle or the scale is no number, or not positive and finite, the kind of the angles is
+            another one, or there are ``MAX_PIXELS`` pixels or more.
     """
 
     width: int
@@ -56,6 +56,13 @@ class Grid:
             raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint="give at least 1x1")
         if self.width * self.height >= MAX_PIXELS:
             raise BadInput(f"a picture of {self.width}x{self.height} pixels", hint=f"give fewer than {MAX_PIXELS}")
+        if self.angle not in Scan.ANGLES:
+            raise BadInput(f"is {self.angle!r}", channel="angle", hint="give 'mechanical' or 'optical'")
+        if self.metres_per_radian is not None:
+            check_numbers(metres_per_radian=self.metres_per_radian)
+            if not 0.0 < self.metres_per_radian < math.inf:
+                hint = "give a positive, finite number, or None"
+                raise BadInput(f"is {self.metres_per_radian}", channel="metres_per_radian", hint=hint)
         if not all(math.isfinite(half) and half > 0 for half in (self.half_angle_x, self.half_angle_y)):
             raise BadInput(
                 f"half angles of {self.half_angle_x} and {self.half_angle_y} rad", hint="give positive, finite angles"

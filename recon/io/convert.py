@@ -92,9 +92,10 @@ def convert_file(source: Path, mapping: Path | Plan, output: Path, by_options: b
 
     Returns:
         Summary: ``recording``, ``source``, ``format``, ``duration`` [s], ``device`` (its name or None) and, for each of
-        ``channels``, ``variable``, ``unit``, ``sample_rate`` [Hz], ``start`` [s], ``shape``, ``stated_by`` (the source
-        of unit, rate and start) and ``overruled`` (statements of the file that the mapping contradicts); for each of
-        ``edges``, ``number`` and ``event``; ``notes`` on what may be misunderstood.
+        ``channels``, ``variable``, ``unit``, ``stated_unit`` (from which the samples were converted to ``unit``),
+        ``sample_rate`` [Hz], ``start`` [s], ``shape``, ``stated_by`` (the source of unit, rate and start) and
+        ``overruled`` (statements of the file that the mapping contradicts); for each of ``edges``, ``number`` and
+        ``event``; ``notes`` on what may be misunderstood.
 
     Raises:
         BadInput: as :func:`convert`.
@@ -192,4 +193,5 @@ def _origin(spec: Mapping[str, Any], contents: Contents, mapping: str) -> dict[s
         for key, value in stated.items()
         if key in spec and value not in (None, spec[key]) and not (is_scaled(spec) and key == "unit")
     }
-    return {"variable": ", ".join(names), "stated_by": by, "overruled": overruled}
+    unit = spec.get("unit", variable.unit)
+    return {"variable": ", ".join(names), "stated_unit": unit, "stated_by": by, "overruled": overruled}

@@ -55,6 +55,9 @@ MAX_PENDING_FRAMES = 2
 FIRST_REPEAT_SEARCH_S = 0.01
 """Length of the recording at which the scan's repeat time is first estimated. It doubles after each failure."""
 
+QUIET_TIME_S = 5.0
+"""Time without new samples after which the recording has ended, unless another one is given."""
+
 MAX_REPEAT_PERIODS = 4000
 """Periods of the slower axis within which the figure has to repeat."""
 
@@ -98,7 +101,7 @@ def follow_recording(
     options: Options,
     mapping: Path | None = None,
     frame_time: float | None = None,
-    quiet_time: float = 5.0,
+    quiet_time: float = QUIET_TIME_S,
     quiet: bool = False,
 ) -> FollowSummary:
     """Write the frames of a growing recording as image.tif, image_sd.tif and image.png, each over the previous one.

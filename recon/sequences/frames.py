@@ -27,7 +27,7 @@ from recon.report.movie import write_movie
 from recon.sample_ranges import SampleRanges, to_sample_ranges
 from recon.steps.reconstruction import Options, Reconstruction
 from recon.steps.z_slices import ZSlices, find_z_slices
-from scanner.arguments import check_numbers, check_whole_numbers
+from scanner.arguments import check_numbers, check_type, check_whole_numbers
 from scanner.errors import BadInput
 
 if TYPE_CHECKING:
@@ -163,9 +163,11 @@ def frames(
         z_step: thickness of a slice [m]: samples are sorted by z, whether it rests or not.
 
     Raises:
-        BadInput: a number is not positive, or ``count`` is not whole; both count and time are given; a frame or a
-            slice would hold less than one sample; slices are asked for, and ``position_z`` is missing or does not rest.
+        BadInput: ``result`` is no result; a number is not positive, or ``count`` is not whole; both count and time are
+            given; a frame or a slice would hold less than one sample; slices are asked for, and ``position_z`` is
+            missing or does not rest.
     """
+    check_type(Reconstruction, "give what lissajous.reconstruct returns", result=result)
     for name, value in (("count", count), ("frame_time", frame_time), ("z_step", z_step)):
         if value is None:
             continue

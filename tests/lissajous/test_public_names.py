@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -185,6 +187,29 @@ def test_what_is_no_recording_is_named(function: Callable, source: object) -> No
         function(source)
 
 
+def small_recording() -> lissajous.Recording:
+    channels = {"sense_x": (np.arange(5.0), "V", 1e3), "sync_y": ([0.1, 0.2], "s", {"event": "zero-crossing-up"})}
+    return lissajous.Recording.from_arrays(channels, "imaging", name="small")
+
+
+def test_recordings_in_memory_and_simulations_are_pickled(tmp_path: Path) -> None:
+    recording = small_recording()
+    copy = pickle.loads(pickle.dumps(recording))
+    assert (repr(copy), copy.attrs, copy.device) == (repr(recording), recording.attrs, recording.device)
+    np.testing.assert_array_equal(copy["sense_x"].read(), recording["sense_x"].read())
+    np.testing.assert_array_equal(copy.edges["sync_y"].times, recording.edges["sync_y"].times)
+    simulated = lissajous.simulate(duration=0.001)
+    assert repr(pickle.loads(pickle.dumps(simulated))) == repr(simulated)
+    recording.write(tmp_path / "small.h5")
+    with (
+        lissajous.Recording.open(tmp_path / "small.h5") as opened,
+        pytest.raises(
+            lissajous.BadInput, match=r"small\.h5: cannot be pickled: its channels are read from an open file"
+        ),
+    ):
+        pickle.dumps(opened)
+
+
 def test_from_arrays_takes_the_name_of_a_device() -> None:
     recording = lissajous.Recording.from_arrays({"sense": (np.zeros(3), "V", 1e3)}, "imaging")
     assert recording.device == lissajous.load_device("imaging")
@@ -204,6 +229,16 @@ def test_a_bound_needs_positive_numbers_of_pixels() -> None:
         (lambda: lissajous.Grid("a", 10, 0.1, 0.1), "width: is 'a'; give a whole number"),
         (lambda: lissajous.Grid(10, 10.5, 0.1, 0.1), "height: is 10.5; give a whole number"),
         (lambda: lissajous.Grid(10, 10, 0.1, None), "half_angle_y: is None; give a number"),
+        (lambda: lissajous.Grid(10, 10, 0.1, 0.1, angle="foo"), "angle: is 'foo'; give 'mechanical' or 'optical'"),
+        (lambda: lissajous.Grid(10, 10, 0.1, 0.1, "x"), "metres_per_radian: is 'x'; give a number"),
+        (lambda: lissajous.Grid(10, 10, 0.1, 0.1, -1.0), "metres_per_radian: is -1.0; give a positive"),
+        (
+            lambda: lissajous.map_samples(*np.zeros((3, 5)), (10, 10)),
+            "grid: is a tuple, no Grid; give a lissajous.Grid",
+        ),
+        (lambda: lissajous.reconstruct(small_recording(), truth=3), "truth: is a int, no Mapping; give the truth"),
+        (lambda: lissajous.frames(small_recording()), "result: is a Recording, no Reconstruction; give what"),
+        (lambda: lissajous.Device.from_toml(3), "text: is a int, no str; give the text"),
         (lambda: lissajous.phase_bound("a", 100.0), "p: is 'a'; give a number"),
         (lambda: lissajous.design(frame_rate="a"), "frame_rate: is 'a'; give a number"),
         (lambda: lissajous.design(volts="ab"), "volts: is 'a'; give a number"),
@@ -231,3 +266,10 @@ def test_a_table_of_columns_is_no_recording_and_the_message_says_how_to_give_it(
 
     with pytest.raises(lissajous.BadInput, match=r"is a Table, no recording; give dict\(table\) and sample_rate="):
         lissajous.estimate(Table())
+
+
+def test_a_table_that_is_no_mapping_is_named_although_a_sample_rate_is_given() -> None:
+    with pytest.raises(lissajous.BadInput, match=r"recording: is a SimpleNamespace, no recording; give dict\(table\)"):
+        lissajous.reconstruct(SimpleNamespace(columns=("sense_x",)), sample_rate=1e6)
+    with pytest.raises(lissajous.BadInput, match="sample_rate: is for arrays; a recording has its own rates"):
+        lissajous.reconstruct(small_recording(), sample_rate=1e6)

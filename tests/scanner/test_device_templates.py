@@ -53,6 +53,21 @@ def test_a_resonance_follows_from_the_drive_frequency() -> None:
     assert parametric.axes["x"].resonance == pytest.approx(1000.0, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("kind", "known", "source"),
+    [
+        ("electromagnetic", KnownAxis(drive_frequency=2000.0), "2000 Hz, from the stated drive frequency"),
+        ("electromagnetic", KnownAxis(2010.0, drive_frequency=2000.0), "2010 Hz, as stated"),
+        ("afm", KnownAxis(drive_frequency=1.0), "Hz, typical"),  # driven far below its resonance
+    ],
+)
+def test_a_comment_says_where_the_resonance_is_from(kind: str, known: KnownAxis, source: str) -> None:
+    text = new_device(kind, {"x": known})
+    (line, _) = (line for line in text.splitlines() if "for a resonance of" in line)
+    assert line.endswith(source)
+    assert Device.from_toml(text).axes["x"].tolerance["k"] == (0.02 if "typical" in source else 0.002)
+
+
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "afm"])
 def test_a_resonance_in_kilohertz_is_refused(kind: str) -> None:
     for resonance in (0.7, 5.4, 49.0):

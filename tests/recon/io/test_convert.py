@@ -74,10 +74,12 @@ def test_a_mapping_converts_a_file_to_a_recording(bench: Path) -> None:
         "channels": {
             "sense_x": {
                 "unit": "V", "sample_rate": 1000.0, "start": 0.0, "shape": (5,), "variable": "x", "overruled": {},
+                "stated_unit": "V",
                 "stated_by": {"unit": "mapping", "sample_rate": "mapping", "start": "default: 0"},
             },
             "intensity": {
                 "unit": "nm", "sample_rate": 500.0, "start": 0.25, "shape": (2, 2), "variable": "z", "overruled": {},
+                "stated_unit": "nm",
                 "stated_by": {"unit": "mapping", "sample_rate": "mapping", "start": "mapping"},
             },
         },
@@ -287,6 +289,26 @@ def test_open_any_opens_recordings_and_instruments_files(tmp_path: Path) -> None
         assert recording["sense_x"].raw.dtype == np.int16  # stored with gain and offset
         np.testing.assert_array_equal(recording["sense_x"].read(), [0, 0.5, 1, 1.5, 2])
         assert recording.attrs["source_format"] == "NumPy archive"
+
+
+def test_the_stated_unit_is_named_beside_the_one_it_is_converted_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    np.savez(tmp_path / "a.npz", a=np.arange(5.0))
+    given = [
+        "convert",
+        str(tmp_path / "a.npz"),
+        "--channel",
+        "sense_x=a",
+        "--rate",
+        "5e6",
+        "-o",
+        str(tmp_path / "a.h5"),
+    ]
+    assert main([*given, "--unit", "mV"]) == 0
+    assert "sense_x: a, mV (option) converted to V, 5000000 Hz" in capsys.readouterr().out
+    with Recording.open(tmp_path / "a.h5") as recording:
+        np.testing.assert_allclose(recording["sense_x"].read(), 1e-3 * np.arange(5.0))
 
 
 def test_arguments_replace_a_mapping(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -237,6 +237,8 @@ def test_a_missing_file_and_two_files_are_refused(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "out").exists()
     assert main(["reconstruct", "--follow", str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), *arguments]) == 2
     assert "follows one recording" in capsys.readouterr().err
+    assert main(["reconstruct", str(tmp_path / "a.h5"), *arguments]) == 2
+    assert "--quiet-time: has no effect without --follow" in capsys.readouterr().err
 
 
 def test_the_figure_repeats_after_whole_periods_of_both_axes() -> None:
