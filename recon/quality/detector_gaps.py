@@ -46,6 +46,9 @@ def find_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: 
     choose, and the other half is compared with the rest of the scan. If the longest run of quiet blocks is a gap and
     others are not, it is found by itself.
 
+    A scan that retraces one path in every period of the slower axis, sampled at the same places, shows both halves the
+    same: there, quiet blocks that missed points of light may still be returned.
+
     Args:
         beam, intensity, grid, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
     """
