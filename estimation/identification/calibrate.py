@@ -10,21 +10,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
+from estimation.identification.agreement import IdentifiedValue, combine_values
 from estimation.identification.classification import (
     UNREFERENCED_DECAY,
     UNREFERENCED_DRIVE,
     classify_recording,
     lock_in_only,
 )
+from estimation.identification.combination import (
+    Decay,
+    average_ratios,
+    conflict_notes,
+    mechanics_from_decays,
+    values_of_mode,
+)
 from estimation.identification.decay_without_angle import fit_decay_without_angle
 from estimation.identification.fits import (
     DrivenRecord,
-    IdentifiedValue,
-    combine_values,
     fit_capacitance_profile,
     fit_mechanics,
-    fit_ringdown,
 )
 from estimation.identification.lock_in_decay import fit_lock_in_decay
 from estimation.identification.reference_angle import ReferenceAngle, find_reference_angle, with_angle
@@ -46,9 +50,6 @@ TORQUE_SCALE = (("capacitance", "C0"), ("capacitance", "theta0"), ("drive", "tor
 
 MECHANICS_KEYS = ("J", "b", "k")
 """Constants that the torque scales together."""
-
-Decay = tuple[Array, float, float]
-"""Angle of a free decay [rad], shape (n,), its rate [Hz], and the voltage on the combs [V]."""
 
 
 @dataclass(frozen=True)
@@ -284,6 +285,7 @@ class _AxisIdentification:
                 f"{self.name}: the driven motion does not determine J; record two or more drive frequencies, or a "
                 "sweep through the resonance"
             )
+        self.notes += [f"{self.name}: {note}" for note in conflict_notes([decay, self.values])]
         if several:
             self._average_ratios(decay)
         elif self.open_after_decay is not None:
@@ -320,27 +322,13 @@ class _AxisIdentification:
                 self.by_torque[name] = float(np.hypot(self.by_torque[name], moved))
 
     def _average_ratios(self, decay: Mapping[str, IdentifiedValue]) -> None:
-        """Average the ratios of driven motion with those of free decays; k and b follow from them and the driven J.
-
-        Where the two differ by more than their noise, as by a drift between the recordings or a stiffness that depends
-        on the amplitude, the interval is widened until it contains the difference (Birge ratio).
-        """
-        J = self.values["J"]
-        for key, value in decay.items():
-            driven, name = self.values[key], key[0]
-            mean = combine_values([{key: value}, {key: driven}])[key]
-            distance = abs(value.value - driven.value) / float(np.hypot(value.sd, driven.sd))
-            ratio = self.values[key] = IdentifiedValue(mean.value, mean.sd * max(1.0, distance))
-            self.by_torque[key] *= (mean.sd / driven.sd) ** 2  # the weight of driven motion
-            sd = float(np.hypot(ratio.sd * J.value, ratio.value * J.sd))
-            self.values[name] = IdentifiedValue(ratio.value * J.value, sd)
-            self.by_torque[name] = ratio.value * self.by_torque["J"]
-            if distance > DISCRIMINATION_SIGMA:
-                self.notes.append(
-                    f"{self.name}: free decay and driven motion differ in {name}/J by {distance:.3g} standard "
-                    f"deviations ({value.value / driven.value - 1.0:+.2%}): the device changed between them, or its "
-                    "law is not linear; `lissajous diagnose` of the driven motion names such a law"
-                )
+        """Average the ratios of driven motion with those of free decays; k and b follow from them and the driven J."""
+        values, weights, notes = average_ratios(decay, self.values)
+        self.values |= values
+        self.notes += [f"{self.name}: {note}" for note in notes]
+        for key, weight in weights.items():
+            self.by_torque[key] *= weight
+            self.by_torque[key[0]] = values[key].value * self.by_torque["J"]
 
     def marginal(self) -> dict[str, IdentifiedValue]:
         """The values with their complete uncertainty, that of the torque included."""
@@ -362,24 +350,3 @@ class _AxisIdentification:
                 key: abs(self.values[key].sd / self.values[key].value) for key in keys if self.values[key].value
             }
         return replace(axis, tolerance=tolerance)
-
-
-def values_of_mode(fit: ResponseFit) -> dict[str, IdentifiedValue]:
-    """k/J and b/J from the first mode of a frequency response."""
-    (frequency, quality), (frequency_sd, quality_sd) = fit.modes[0], fit.mode_sd[0]
-    rate, floor = 2.0 * np.pi * float(frequency), np.finfo(float).tiny
-    relative = float(np.hypot(frequency_sd / frequency, quality_sd / quality))
-    return {
-        "k_over_J": IdentifiedValue(rate**2, max(2.0 * rate**2 * float(frequency_sd / frequency), floor)),
-        "b_over_J": IdentifiedValue(rate / float(quality), max(rate / float(quality) * relative, floor)),
-    }
-
-
-def mechanics_from_decays(axis: Axis, decays: Sequence[Decay]) -> dict[str, IdentifiedValue]:
-    """Mechanics from free decays; J is the nominal one where no bias determines it."""
-    found = combine_values([fit_ringdown(angle, rate, axis, volt)[0] for angle, rate, volt in decays])
-    J = found.setdefault("J", IdentifiedValue(axis.require_mechanics().J, 0.0))
-    for key in ("k", "b"):
-        ratio = found[f"{key}_over_J"]
-        found[key] = IdentifiedValue(ratio.value * J.value, float(np.hypot(ratio.sd * J.value, ratio.value * J.sd)))
-    return found

@@ -7,9 +7,19 @@ either readout are eliminated as linear parameters.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S, IdentifiedValue
+from estimation.identification.agreement import (
+    Differences,
+    IdentifiedValue,
+    amplitude_columns,
+    difference_by_extra_columns,
+    widen,
+)
+from estimation.identification.classification import shows_motion
+from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S
 from estimation.reference import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -32,6 +42,9 @@ MAX_SAMPLES_PER_CYCLE = 40
 
 START_AMPLITUDES = (0.15, 0.5, 1.0)
 """Starts of the amplitude behind a capacitive readout, in units of theta0."""
+
+DERIVATIVE_STEP = 1e-4
+"""Step of numerical derivatives by phase [rad] and log amplitude: their error is then below 1e-8."""
 
 MIN_DECAY_SDS = 3.0
 """Rate of decay in standard deviations below which a motion is no decay: its interval then includes a motion without
@@ -100,7 +113,8 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
         solution = least_squares(residual, x, args=(n,), x_scale="jac")
         x = solution.x
     left = solution.fun
-    if left.std() > MAX_RINGDOWN_RESIDUAL_RATIO * y[: max(y.size // 4, windows[0] if windows else 0)].std():
+    signal = y[: max(y.size // 4, windows[0] if windows else 0)]
+    if left.std() > MAX_RINGDOWN_RESIDUAL_RATIO * signal.std() and shows_motion(left):
         what, hint = "does not follow a free decay", "cut the record to the decay alone, without a bias that changes it"
         raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
     variance = float(left @ left) / max(y.size - x.size - basis(x, y.size).shape[1], 1)
@@ -109,13 +123,41 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
         what, hint = "holds a motion that does not decay", "record a free decay, or record the drive beside the motion"
         raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
     rate, decay = w0 * (1.0 + x[0]), float(first_decay * x[1])
+    change = _amplitude_dependence(lambda x: basis(x, y.size)[skip:], x, solution.jac, y[skip:], time[skip:], decay)
     values = {
         "k_over_J": IdentifiedValue(float(rate**2 + decay**2), float(2.0 * rate * w0 * sd[0])),
         "b_over_J": IdentifiedValue(2.0 * decay, float(2.0 * first_decay * sd[1])),
     }
+    for k, (key, scale) in enumerate({"k_over_J": 2.0 * rate * w0, "b_over_J": 2.0 * first_decay}.items()):
+        values[key] = widen(values[key], *(float(scale * each[k]) for each in change))
     if order == 2:
         values["amplitude_over_theta0"] = IdentifiedValue(float(np.exp(x[2])), float(np.exp(x[2]) * sd[2]))
     return values
+
+
+def _amplitude_dependence(
+    basis: Callable[[Array], Array], x: Array, jacobian: Array, y: Array, time: Array, decay: float
+) -> Differences:
+    """Changes of the fitted parameters if frequency and damping may depend on the amplitude.
+
+    Args:
+        basis: signals that gain and offset multiply, shape (n, 2 or 3), for parameters of shape (p,).
+        x: fitted parameters, shape (p,). jacobian: derivative of the residual, shape (n, p).
+        y: signal, time: [s], both of shape (n,). decay: rate of decay of the amplitude [1/s].
+    """
+    columns = basis(x)
+    linear = np.linalg.lstsq(columns, y, rcond=None)[0]
+    if x.size == 2:  # a sensor of the motion: cosine and sine
+        by_phase = linear[1] * columns[:, 0] - linear[0] * columns[:, 1]
+        by_log_amplitude = columns[:, :2] @ linear[:2]
+    else:
+        steps = DERIVATIVE_STEP * np.eye(x.size)[2:]
+        by_log_amplitude, by_phase = (
+            (basis(x + step) - basis(x - step))[:, 0] * (linear[0] / (2.0 * DERIVATIVE_STEP)) for step in steps
+        )
+    extra = amplitude_columns(time, 2.0 * decay, by_phase, by_log_amplitude)
+    change = difference_by_extra_columns(np.column_stack([-jacobian, columns]), extra, y - columns @ linear)
+    return Differences(change.difference[: x.size], change.sd[: x.size])
 
 
 def _line(channel: Channel, near: float) -> float:

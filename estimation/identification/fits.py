@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.identification.agreement import IdentifiedValue, amplitude_columns, difference_by_extra_columns, widen
+from estimation.identification.classification import shows_motion
 from estimation.least_squares import Z_95, fit_linear
 from scanner.arrays import Array
 from scanner.device import Axis
@@ -29,26 +31,14 @@ STEPS_PER_CYCLE = 80
 """Runge-Kutta steps per cycle in the fit of a ringdown: the relative error of its frequency is then 3e-7."""
 
 MAX_RINGDOWN_RESIDUAL_RATIO = 0.3
-"""Standard deviation of a ringdown's residual, relative to the signal, above which the fit is rejected."""
+"""Standard deviation of a ringdown's residual, relative to the signal, above which the fit is rejected, unless
+the residual is white noise."""
 
 MIN_INVERSE_INERTIA = 1e-3
 """Least 1/J of a decay under a bias, relative to the stated one: there the bias has no visible effect."""
 
 SETTLE_TIME_S = 1e-4
 """Time that low-pass sections of usual corner frequencies (40 kHz) need to settle, with a margin."""
-
-
-@dataclass(frozen=True)
-class IdentifiedValue:
-    """An identified value and its standard deviation, in the unit of the device file."""
-
-    value: float
-    sd: float
-
-    @property
-    def ci95(self) -> tuple[float, float]:
-        """95 % confidence interval."""
-        return self.value - Z_95 * self.sd, self.value + Z_95 * self.sd
 
 
 @dataclass(frozen=True)
@@ -121,17 +111,6 @@ def values_from_ratios(ratios: Array, covariance: Array) -> dict[str, Identified
     return {key: IdentifiedValue(float(values[key]), float(np.sqrt(g @ covariance @ g))) for key, g in jacobian.items()}
 
 
-def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, IdentifiedValue]:
-    """Values of several recordings; those of one parameter are averaged with inverse variances as weights."""
-    values: dict[str, IdentifiedValue] = {}
-    for key in dict.fromkeys(key for each in found for key in each):
-        same = [each[key] for each in found if key in each]
-        weights = np.array([1.0 / each.sd**2 for each in same]) if len(same) > 1 else np.ones(1)
-        mean = float(np.average([each.value for each in same], weights=weights))
-        values[key] = IdentifiedValue(mean, float(weights.sum() ** -0.5) if len(same) > 1 else same[0].sd)
-    return values
-
-
 def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, IdentifiedValue], Array]:
     """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, under a bias, ``J`` from a free decay, by fitting its trajectory.
 
@@ -179,7 +158,7 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
             fit = least_squares(lambda x, part=part: trajectory(x)[:part] - used[:part], x, bounds=(lowest, np.inf))
             x = fit.x
     residual = used - trajectory(x)
-    if residual.std() > MAX_RINGDOWN_RESIDUAL_RATIO * used.std():
+    if residual.std() > MAX_RINGDOWN_RESIDUAL_RATIO * used.std() and shows_motion(residual):
         raise BadInput(
             "the free decay does not follow the equation of motion", hint="cut the record to the decay alone"
         )
@@ -187,14 +166,24 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * variance
     sd = scale[:free] * np.sqrt(np.diag(covariance))
     w, loss = start[:2] + scale[:2] * x[:2]
+    theta, omega = start[2:4] + scale[2:4] * x[2:4]
+    by_theta, by_omega = fit.jac[:, 2] / scale[2], fit.jac[:, 3] / scale[3]
+    extra = amplitude_columns(
+        np.arange(used.size) * stride / rate,
+        loss,
+        omega / w * by_theta - w * theta * by_omega,
+        theta * by_theta + omega * by_omega,
+    )
+    change = difference_by_extra_columns(fit.jac / scale[:free], extra, residual)
     values = {
-        "k_over_J": IdentifiedValue(float(w * w), float(2 * w * sd[0])),
-        "b_over_J": IdentifiedValue(float(loss), float(sd[1])),
+        "k_over_J": widen(IdentifiedValue(float(w * w), float(2 * w * sd[0])), *(2 * w * each[0] for each in change)),
+        "b_over_J": widen(IdentifiedValue(float(loss), float(sd[1])), *(each[1] for each in change)),
     }
     inverse = start[4] + scale[4] * x[4:]
     if comb and inverse[0] > Z_95 * sd[4]:
         J = mechanics.J / float(inverse[0])
-        values["J"] = IdentifiedValue(J, J * float(sd[4] / inverse[0]))
+        relative = J / float(inverse[0])
+        values["J"] = widen(IdentifiedValue(J, relative * float(sd[4])), *(relative * each[4] for each in change))
     return values, residual
 
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, IdentifiedValue
+from estimation.identification.agreement import (
+    Differences,
+    IdentifiedValue,
+    amplitude_columns,
+    difference_by_extra_columns,
+    widen,
+)
+from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO
 from estimation.lock_in_channels import lock_in_phasor
 from scanner.arrays import Array, Complex
 from scanner.device import Axis
@@ -51,13 +58,35 @@ def fit_lock_in_decay(recording: Recording, axis: Axis) -> dict[str, IdentifiedV
         hint = "cut the record to the decay alone; `lissajous diagnose` finds a damping that depends on the amplitude"
         raise BadInput("does not follow an exponential decay", file=channel.file, channel=channel.name, hint=hint)
     correlation = float(np.clip(np.sum(left[:, 1:] * left[:, :-1]) / max(np.sum(left**2), 1e-300), 0.0, 0.99))
-    variance = float(np.sum(left**2)) / (left.size - 4) * (1.0 + correlation) / (1.0 - correlation)
+    dependence = (1.0 + correlation) / (1.0 - correlation)
+    variance = float(np.sum(left**2)) / (left.size - 4) * dependence
     sd = np.sqrt(variance * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
     g, w = float(np.exp(fit.x[0])), 2 * np.pi * frequency + float(fit.x[1])
+    change, change_sd = _amplitude_dependence(time, phasor, g, float(fit.x[1]))
+    change_sd = change_sd * np.sqrt(dependence)
     return {
-        "k_over_J": IdentifiedValue(w**2 + g**2, float(2.0 * w * sd[1])),
-        "b_over_J": IdentifiedValue(2.0 * g, float(2.0 * g * sd[0])),
+        "k_over_J": widen(
+            IdentifiedValue(w**2 + g**2, float(2.0 * w * sd[1])), 2.0 * w * change[1], 2.0 * w * change_sd[1]
+        ),
+        "b_over_J": widen(IdentifiedValue(2.0 * g, float(2.0 * g * sd[0])), 2.0 * change[0], 2.0 * change_sd[0]),
     }
+
+
+def _amplitude_dependence(time: Array, phasor: Complex, decay: float, detuning: float) -> Differences:
+    """Changes of decay rate [1/s] and detuning [rad/s] if both may depend on the amplitude.
+
+    Args:
+        time: [s], phasor: both of shape (n,). decay: [1/s], detuning: [rad/s], as fitted.
+    """
+    shape = np.exp((1j * detuning - decay) * time)
+    shape *= np.vdot(shape, phasor) / np.vdot(shape, shape)
+    columns = np.stack([-time * shape, 1j * time * shape, shape, 1j * shape], axis=1)
+    by_log_amplitude, by_phase, residual = (
+        np.concatenate([each.real, each.imag]) for each in (shape, 1j * shape, phasor - shape)
+    )
+    extra = amplitude_columns(np.tile(time, 2), 2.0 * decay, by_phase, by_log_amplitude)
+    change = difference_by_extra_columns(np.concatenate([columns.real, columns.imag]), extra, residual)
+    return Differences(change.difference[:2], change.sd[:2])
 
 
 def _first_guess(time: Array, phasor: Complex, size: Array) -> tuple[float, float]:

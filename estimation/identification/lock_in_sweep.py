@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.identification.fits import IdentifiedValue, drive_torque, values_from_ratios
+from estimation.identification.agreement import IdentifiedValue
+from estimation.identification.fits import drive_torque, values_from_ratios
 from estimation.identification.sweep import MIN_INVERSE_INERTIA_SDS, LockInOutput, SweptRecord
 from scanner.arrays import Array, Complex
 from scanner.device import Axis

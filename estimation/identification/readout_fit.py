@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.identification.fits import SETTLE_TIME_S, DrivenRecord, IdentifiedValue
+from estimation.identification.agreement import IdentifiedValue
+from estimation.identification.fits import SETTLE_TIME_S, DrivenRecord
 from estimation.least_squares import fit_linear
 from scanner.arrays import Array
 from scanner.laws import capacitance

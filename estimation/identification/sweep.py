@@ -14,11 +14,12 @@ balance of power, which holds for any k/J; k/J is its average over the record.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.identification.fits import DrivenRecord, IdentifiedValue, drive_torque, values_from_ratios
+from estimation.identification.agreement import Differences, IdentifiedValue, difference_by_extra_columns
+from estimation.identification.fits import DrivenRecord, drive_torque, values_from_ratios
 from estimation.least_squares import fit_linear
 from estimation.reference import PhaseReference
 from scanner.arrays import Array, Complex, Mask
@@ -92,7 +93,11 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
     stiffness, _, inverse = ratios
     if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
-    return values_from_ratios(ratios, covariance)
+    differences = _amplitude_dependence(equations, ratios, known)
+    excess = change @ differences.excess
+    covariance += np.outer(excess, excess)
+    conflict = float(np.max(differences.conflict))
+    return {key: replace(each, conflict=conflict) for key, each in values_from_ratios(ratios, covariance).items()}
 
 
 @dataclass(frozen=True)
@@ -100,8 +105,9 @@ class _Equations:
     """Equations of motion of one record between windowed averages.
 
     Attributes:
-        motion: columns of k/J, b/J and 1/J, shape (points, 3), and acceleration: the right-hand side, shape (points,),
-            both relative to the direction of Z in a balance of power.
+        motion: columns of k/J, b/J, 1/J and any further unknowns, shape (points, 3 or more), relative to the direction
+            of Z in a balance of power.
+        acceleration: the right-hand side, shape (points,), relative to the same direction.
         windows: of the angle, its velocity and its acceleration, each of shape (window,).
         hop: samples between two points.
         balance: whether only the balance of power is used, the imaginary part.
@@ -146,6 +152,31 @@ def _equations(axis: Axis, record: SweptRecord) -> _Equations:
         motion, acceleration = direction[:, None] * motion, direction * acceleration
         motion[:, 0] = np.abs(z)
     return _Equations(motion, -acceleration, windows, hop, balance)
+
+
+def _amplitude_dependence(equations: Sequence[_Equations], ratios: Array, known: Mask) -> Differences:
+    """Changes of the p ``known`` coefficients if k/J and b/J may depend on the square of the amplitude, shape (p,).
+
+    A cubic stiffness adds 3/4 k3 |Z|^2 Z / J to the equation of motion, a damping by the squared angle a part of
+    |Z|^2 DZ.
+    """
+    largest = max(float(np.max(np.abs(each.motion[:, 0]))) for each in equations)
+    extended = []
+    for each in equations:
+        relative = (np.abs(each.motion[:, :1]) / largest) ** 2
+        extended.append(replace(each, motion=np.column_stack([each.motion, relative * each.motion[:, :2]])))
+    columns, target = (np.concatenate([getattr(each, part) for each in extended]) for part in ("columns", "target"))
+    used = np.asarray(columns.any(axis=0))
+    used[:3] &= known
+    together = np.concatenate([columns.real, columns.imag])[:, used]
+    if np.linalg.matrix_rank(together / np.linalg.norm(together, axis=0)) < used.sum():
+        return Differences(np.zeros(known.sum()), np.zeros(known.sum()))
+    coefficients = np.zeros(5)
+    residual = np.concatenate([target.real, target.imag])
+    coefficients[used], _ = fit_linear(together, residual)
+    spread = _covariance(extended, coefficients, used)[known.sum() :, known.sum() :]
+    residual = residual - together[:, : known.sum()] @ ratios[known]
+    return difference_by_extra_columns(together[:, : known.sum()], together[:, known.sum() :], residual, spread)
 
 
 def _one_frequency(record: SweptRecord) -> bool:

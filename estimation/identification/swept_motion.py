@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.identification.fits import IdentifiedValue, combine_values
+from estimation.identification.agreement import IdentifiedValue, combine_values
 from estimation.identification.lock_in_sweep import fit_lock_in_sweep
 from estimation.identification.sweep import LockInOutput, SweptRecord, fit_swept
 from estimation.lock_in_channels import lock_in_values, reference_turn

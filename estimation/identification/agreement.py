@@ -1,0 +1,120 @@
+"""Identified values, and estimates of one value that should agree: their mean, a widened interval, and a distance.
+
+Every fit of the mechanics assumes a linear law. The test of this assumption is a second estimate from the same record:
+with a stiffness and a damping that depend on the square of the amplitude, to first order. Its values hold at small
+amplitude. Under a linear law both estimates agree within their noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from estimation.least_squares import Z_95, fit_linear
+from scanner.arrays import Array
+
+
+@dataclass(frozen=True)
+class IdentifiedValue:
+    """An identified value and its standard deviation, in the unit of the device file.
+
+    Attributes:
+        conflict: largest difference between two estimates of the value that should agree, in its standard deviations.
+    """
+
+    value: float
+    sd: float
+    conflict: float = 0.0
+
+    @property
+    def ci95(self) -> tuple[float, float]:
+        """95 % confidence interval."""
+        return self.value - Z_95 * self.sd, self.value + Z_95 * self.sd
+
+
+class Differences(NamedTuple):
+    """Differences between two estimates of p values that should agree, and their standard deviations, shape (p,)."""
+
+    difference: Array
+    sd: Array
+
+    @property
+    def conflict(self) -> Array:
+        """Differences in standard deviations, shape (p,); 0 where the difference is not determined."""
+        return np.abs(self.difference) / np.where(self.sd > 0.0, self.sd, np.inf)
+
+    @property
+    def excess(self) -> Array:
+        """Differences without what noise explains, shape (p,): 0 within their 95 % interval.
+
+        It is the standard deviation by which an interval is widened. 5 % of the intervals of values that agree are
+        widened, and an interval contains both estimates where they differ by several standard deviations.
+        """
+        outside = np.maximum(np.abs(self.difference) - Z_95 * self.sd, 0.0)
+        return np.asarray(np.where(self.sd > 0.0, np.sign(self.difference) * outside, 0.0))
+
+
+def widen(value: IdentifiedValue, difference: float, difference_sd: float) -> IdentifiedValue:
+    """The value with an interval that allows for its difference from an estimate that should agree."""
+    found = Differences(np.array([difference]), np.array([difference_sd]))
+    sd = float(np.hypot(value.sd, found.excess[0]))
+    return replace(value, sd=sd, conflict=max(value.conflict, float(found.conflict[0])))
+
+
+def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, IdentifiedValue]:
+    """Values of several recordings; those of one parameter are averaged with inverse variances as weights."""
+    values: dict[str, IdentifiedValue] = {}
+    for key in dict.fromkeys(key for each in found for key in each):
+        same = [each[key] for each in found if key in each]
+        weights = np.array([1.0 / each.sd**2 for each in same]) if len(same) > 1 else np.ones(1)
+        mean = float(np.average([each.value for each in same], weights=weights))
+        sd = float(weights.sum() ** -0.5) if len(same) > 1 else same[0].sd
+        values[key] = IdentifiedValue(mean, sd, max(each.conflict for each in same))
+    return values
+
+
+def scaled_by_inertia(ratio: IdentifiedValue, J: IdentifiedValue) -> IdentifiedValue:
+    """k from k/J, or b from b/J, with independent J."""
+    return IdentifiedValue(ratio.value * J.value, float(np.hypot(ratio.sd * J.value, ratio.value * J.sd)))
+
+
+def difference_by_extra_columns(
+    columns: Array, extra: Array, residual: Array, covariance: Array | None = None
+) -> Differences:
+    """How much the coefficients of a linear fit change if further columns are fitted too.
+
+    Args:
+        columns: of the fit, shape (n, p). extra: further columns, shape (n, q). residual: of the fit, shape (n,).
+        covariance: of the coefficients of ``extra``, shape (q, q); by default that under a white residual.
+
+    Returns:
+        differences, shape (p,); not determined, with a standard deviation of 0, if the columns are linearly dependent.
+    """
+    together = np.column_stack([columns, extra])
+    size = np.sqrt(np.einsum("ni,ni->i", together, together))
+    count = columns.shape[1]
+    undetermined = Differences(np.zeros(count), np.zeros(count))
+    if not np.all(size > 0.0):
+        return undetermined
+    gram = np.einsum("ni,nj->ij", together / size, together / size)
+    if np.linalg.matrix_rank(gram, hermitian=True) < size.size:
+        return undetermined
+    coefficients, white = fit_linear(together, residual)
+    # an omitted column changes the coefficients by its own coefficient times its projection on the columns
+    projection = np.linalg.solve(gram[:count, :count], gram[:count, count:]) * size[count:] / size[:count, None]
+    spread = projection @ (white[count:, count:] if covariance is None else covariance) @ projection.T
+    return Differences(coefficients[:count], np.sqrt(np.maximum(np.diag(spread), 0.0)))
+
+
+def amplitude_columns(time: Array, loss: float, by_phase: Array, by_log_amplitude: Array) -> Array:
+    """Derivatives of a decay by a frequency and a damping that change with the square of its amplitude, shape (n, 2).
+
+    Args:
+        time: from the start [s], shape (n,). loss: b/J [1/s], the decay rate of the squared amplitude.
+        by_phase, by_log_amplitude: derivatives of the signal by a phase and a log amplitude that are added, shape (n,).
+    """
+    growth = -np.expm1(-loss * time) / loss  # integral of the squared amplitude, relative to that at the start
+    return np.stack([growth * by_phase, -growth * by_log_amplitude], axis=1)
