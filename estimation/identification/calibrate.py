@@ -333,7 +333,7 @@ class _AxisIdentification:
     def marginal(self) -> dict[str, IdentifiedValue]:
         """The values with their complete uncertainty, that of the torque included."""
         return {
-            key: IdentifiedValue(value.value, float(np.hypot(value.sd, self.by_torque.get(key, 0.0))))
+            key: replace(value, sd=float(np.hypot(value.sd, self.by_torque.get(key, 0.0))))
             for key, value in self.values.items()
         }
 
