@@ -134,11 +134,10 @@ def _equations(axis: Axis, record: SweptRecord) -> _Equations:
     """The equations of a record at its overlapping windows."""
     rate = record.driven.rate
     hop = max(1, round(WINDOW_CYCLES * rate / record.reference.frequency / HOPS_PER_WINDOW))
-    w = 2.0 * np.pi * _strongest_frequency(record, hop)
+    angle, torque = (values - values.mean() for values in (record.driven.angle, drive_torque(axis, record.driven)))
+    w = 2.0 * np.pi * _strongest_frequency(angle, torque, rate)
     carrier = 2j * np.exp(-1j * w * (record.time - record.time[0]))
-    angle, torque = (
-        (values - values.mean()) * carrier for values in (record.driven.angle, drive_torque(axis, record.driven))
-    )
+    angle, torque = angle * carrier, torque * carrier
     plain, first, second = _windows(hop, rate)
     windows = tuple(
         np.asarray(each, np.complex128)
@@ -194,13 +193,12 @@ def _mean_stiffness(equations: Sequence[_Equations], others: Array) -> tuple[flo
     return float(mean[0] - mean[1:] @ others), -mean[1:]
 
 
-def _strongest_frequency(record: SweptRecord, hop: int) -> float:
-    """Mean frequency of the reference, weighted with the square of the motion's amplitude [Hz]."""
-    psi = record.reference.phase(record.time)
-    window = _windows(hop, record.driven.rate)[0]
-    power = np.abs(_averaged(2j * (record.driven.angle - record.driven.angle.mean()) * np.exp(-1j * psi), window, hop))
-    rate = _averaged(np.gradient(psi) * record.driven.rate / (2.0 * np.pi), window, hop).real
-    return float(np.average(rate, weights=power**2))
+def _strongest_frequency(angle: Array, torque: Array, rate: float) -> float:
+    """Frequency of the strongest motion among those at which a torque acts: mean with the power there [Hz]."""
+    from scipy.fft import rfft
+
+    power = np.abs(rfft(angle) * rfft(torque)) ** 2
+    return float(np.average(np.arange(power.size) * (rate / angle.size), weights=power))
 
 
 def _covariance(equations: Sequence[_Equations], ratios: Array, known: Mask) -> Array:
