@@ -93,20 +93,23 @@ def difference_by_extra_columns(
     Returns:
         differences, shape (p,); not determined, with a standard deviation of 0, if the columns are linearly dependent.
     """
-    together = np.column_stack([columns, extra])
-    size = np.sqrt(np.einsum("ni,ni->i", together, together))
-    count = columns.shape[1]
-    undetermined = Differences(np.zeros(count), np.zeros(count))
-    if not np.all(size > 0.0):
-        return undetermined
-    gram = np.einsum("ni,nj->ij", together / size, together / size)
-    if np.linalg.matrix_rank(gram, hermitian=True) < size.size:
-        return undetermined
+    together, count = np.column_stack([columns, extra]), columns.shape[1]
+    if not linearly_independent(together):
+        return Differences(np.zeros(count), np.zeros(count))
     coefficients, white = fit_linear(together, residual)
     # an omitted column changes the coefficients by its own coefficient times its projection on the columns
-    projection = np.linalg.solve(gram[:count, :count], gram[:count, count:]) * size[count:] / size[:count, None]
+    projection = np.stack([fit_linear(columns, column)[0] for column in extra.T], axis=1)
     spread = projection @ (white[count:, count:] if covariance is None else covariance) @ projection.T
     return Differences(coefficients[:count], np.sqrt(np.maximum(np.diag(spread), 0.0)))
+
+
+def linearly_independent(columns: Array) -> bool:
+    """Whether no column, shape (n, p), is a combination of the others, within the rounding of their inner products."""
+    size = np.sqrt(np.einsum("ni,ni->i", columns, columns))
+    if not np.all(size > 0.0):
+        return False
+    eigenvalues = np.linalg.eigvalsh(np.einsum("ni,nj->ij", columns / size, columns / size))
+    return bool(eigenvalues[0] > len(columns) * np.finfo(float).eps * eigenvalues[-1])
 
 
 def amplitude_columns(time: Array, loss: float, by_phase: Array, by_log_amplitude: Array) -> Array:

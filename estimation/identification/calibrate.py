@@ -64,6 +64,7 @@ class Identification:
         used: axis -> recordings and how each was used.
         notes: parameters that could not be determined, and the recording that would determine them.
         responses: axis -> frequency responses, each with its fit.
+        nonlinear: axes whose motion contradicts the linear law that is fitted.
     """
 
     device: Device
@@ -71,6 +72,7 @@ class Identification:
     used: Mapping[str, Sequence[str]]
     notes: Sequence[str]
     responses: Mapping[str, Sequence[tuple[Response, ResponseFit]]]
+    nonlinear: Sequence[str] = ()
 
     def __repr__(self) -> str:
         lines = [f"Identified {self.device.name!r}"]
@@ -87,6 +89,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
     """
     axes, values, used, notes, responses = dict(device.axes), {}, {}, [], {}
     scaled: list[str] = []  # axes whose torque is uncertain
+    nonlinear: list[str] = []
     if any("sense" in recording for recording in recordings):
         notes.append(
             "sense: the electrode is shared by both axes, so that capacitances and readout are not identified and keep "
@@ -101,6 +104,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         if result.values:
             axes[name], values[name], used[name] = result.device_axis(), result.marginal(), result.used
             responses[name] = result.responses
+            nonlinear += [name] if result.nonlinear else []
             if any(result.by_torque.get(key) for key in MECHANICS_KEYS):
                 scaled.append(name)
             if axis.terms:
@@ -122,7 +126,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         if notes:
             what, hint = "the recordings determine no constant", "; ".join(notes)
         raise BadInput(what, file=recordings[0].path if recordings else None, hint=hint)
-    return Identification(replace(device, axes=axes), values, used, notes, responses)
+    return Identification(replace(device, axes=axes), values, used, notes, responses, nonlinear)
 
 
 class _AxisIdentification:
@@ -139,6 +143,7 @@ class _AxisIdentification:
         self.gain_tolerance = 0.0  # of the reference angle of driven motion
         self.decays: list[Decay] = []
         self.open_after_decay: str | None = None  # beside J, after a free decay without a reference angle
+        self.nonlinear = False
         self.by_torque: dict[str, float] = {}  # standard deviation that the drive's torque adds to a value
 
     def add(self, recording: Recording) -> None:
@@ -285,7 +290,9 @@ class _AxisIdentification:
                 f"{self.name}: the driven motion does not determine J; record two or more drive frequencies, or a "
                 "sweep through the resonance"
             )
-        self.notes += [f"{self.name}: {note}" for note in conflict_notes([decay, self.values])]
+        conflicts = conflict_notes([decay, self.values])
+        self.nonlinear = bool(conflicts)
+        self.notes += [f"{self.name}: {note}" for note in conflicts]
         if several:
             self._average_ratios(decay)
         elif self.open_after_decay is not None:

@@ -27,6 +27,10 @@ BLOCK_CYCLES = 20.0
 """Cycles of the motion per block of a driven record, whose phasors are one equation: harmonics and noise average
 out."""
 
+MAX_AMPLITUDE_CHANGE = 0.02
+"""Relative change of amplitude within a segment above which it is no steady motion and is left out. Segments of steady
+motion whose amplitudes differ by less count as of one amplitude."""
+
 STEPS_PER_CYCLE = 80
 """Runge-Kutta steps per cycle in the fit of a ringdown: the relative error of its frequency is then 3e-7."""
 
@@ -69,7 +73,8 @@ def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, Iden
     """``J``, ``b``, ``k`` and their ratios from driven motion, by chen2020 eq 9 at the motion's frequency.
 
     A block's phasors of angle and torque obey (k/J - w^2 + j w b/J) Θ = T / J, linear in k/J, b/J and 1/J. Phase and
-    amplitude at one drive frequency give two equations, so two frequencies are needed.
+    amplitude at one drive frequency give two equations, so two frequencies are needed. From three frequencies on, a
+    dependence of k and b on the amplitude is tested.
 
     Args:
         axis: its drive and its capacitance set the torque; its mechanics are not used.
@@ -78,11 +83,12 @@ def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, Iden
     Raises:
         BadInput: one frequency only.
     """
-    if len({round(record.frequency, 3) for record in records}) < 2:
+    frequencies = {round(record.frequency, 3) for record in records}
+    if len(frequencies) < 2:
         raise BadInput(
             "driven records at two or more drive frequencies are needed to determine k, b and J", hint="sweep"
         )
-    rows, targets = [], []
+    rows, extra, targets, amplitudes = [], [], [], []
     for record in records:
         w = 2 * np.pi * record.frequency
         block = block_length(record.frequency, record.rate, BLOCK_CYCLES)
@@ -93,13 +99,30 @@ def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, Iden
         unit = np.exp(-1j * np.angle(theta))  # makes the angle real: rows are then in phase and in quadrature
         row = np.stack([np.abs(theta), 1j * w * np.abs(theta), -torque * unit], axis=1)
         rows += [row.real, row.imag]
+        amplitudes.append(float(np.abs(theta).mean()))
+        extra += [amplitudes[-1] ** 2 * part[:, :2] for part in (row.real, row.imag)]
         targets += [w**2 * np.abs(theta), np.zeros(theta.size)]
-    return values_from_ratios(*fit_linear(np.concatenate(rows), np.concatenate(targets)))
+    columns, target = np.concatenate(rows), np.concatenate(targets)
+    ratios, covariance = fit_linear(columns, target)
+    same_amplitude = np.ptp(amplitudes) < MAX_AMPLITUDE_CHANGE * max(amplitudes)
+    if same_amplitude or len(frequencies) < 3:  # five unknowns need three frequencies
+        return values_from_ratios(ratios, covariance)
+    change = difference_by_extra_columns(columns, np.concatenate(extra), target - columns @ ratios)
+    return values_from_ratios(ratios, covariance, change.excess, float(change.conflict.max()))
 
 
-def values_from_ratios(ratios: Array, covariance: Array) -> dict[str, IdentifiedValue]:
-    """``J``, ``b``, ``k``, ``k_over_J`` and ``b_over_J`` from (k/J, b/J, 1/J) and their covariance."""
+def values_from_ratios(
+    ratios: Array, covariance: Array, excess: Array | None = None, conflict: float = 0.0
+) -> dict[str, IdentifiedValue]:
+    """``J``, ``b``, ``k``, ``k_over_J`` and ``b_over_J`` from (k/J, b/J, 1/J) and their covariance.
+
+    Args:
+        excess: difference of the ratios from an estimate that should agree, by which the intervals are widened, shape
+            (3,). conflict: the largest such difference in standard deviations.
+    """
     stiff, loss, inverse = ratios
+    if excess is not None:
+        covariance = covariance + np.outer(excess, excess)
     jacobian = {
         "J": np.array([0.0, 0.0, -1.0 / inverse**2]),
         "b": np.array([0.0, 1.0 / inverse, -loss / inverse**2]),
@@ -108,7 +131,10 @@ def values_from_ratios(ratios: Array, covariance: Array) -> dict[str, Identified
         "b_over_J": np.array([0.0, 1.0, 0.0]),
     }
     values = {"J": 1.0 / inverse, "b": loss / inverse, "k": stiff / inverse, "k_over_J": stiff, "b_over_J": loss}
-    return {key: IdentifiedValue(float(values[key]), float(np.sqrt(g @ covariance @ g))) for key, g in jacobian.items()}
+    return {
+        key: IdentifiedValue(float(values[key]), float(np.sqrt(g @ covariance @ g)), conflict)
+        for key, g in jacobian.items()
+    }
 
 
 def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, IdentifiedValue], Array]:

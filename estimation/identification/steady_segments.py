@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.identification.fits import DrivenRecord
+from estimation.identification.fits import MAX_AMPLITUDE_CHANGE, DrivenRecord
 from scanner.arrays import Array
 from scanner.lock_in import block_length, block_phasors
 
 SEGMENT_CYCLES = 200.0
 """Cycles per segment of a driven recording: a sweep changes little within one, which counts as one frequency."""
-
-MAX_AMPLITUDE_CHANGE = 0.02
-"""Relative change of amplitude within a segment above which it is no steady motion and is left out."""
 
 
 def steady_segments(angle: Array, voltage: Array, frequency: Array, rate: float) -> list[DrivenRecord]:

@@ -18,7 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.identification.agreement import Differences, IdentifiedValue, difference_by_extra_columns
+from estimation.identification.agreement import (
+    Differences,
+    IdentifiedValue,
+    difference_by_extra_columns,
+    linearly_independent,
+)
 from estimation.identification.fits import DrivenRecord, drive_torque, values_from_ratios
 from estimation.least_squares import fit_linear
 from estimation.reference import PhaseReference
@@ -94,10 +99,7 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
     if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
     differences = _amplitude_dependence(equations, ratios, known)
-    excess = change @ differences.excess
-    covariance += np.outer(excess, excess)
-    conflict = float(np.max(differences.conflict))
-    return {key: replace(each, conflict=conflict) for key, each in values_from_ratios(ratios, covariance).items()}
+    return values_from_ratios(ratios, covariance, change @ differences.excess, float(differences.conflict.max()))
 
 
 @dataclass(frozen=True)
@@ -168,14 +170,15 @@ def _amplitude_dependence(equations: Sequence[_Equations], ratios: Array, known:
     used = np.asarray(columns.any(axis=0))
     used[:3] &= known
     together = np.concatenate([columns.real, columns.imag])[:, used]
-    if np.linalg.matrix_rank(together / np.linalg.norm(together, axis=0)) < used.sum():
-        return Differences(np.zeros(known.sum()), np.zeros(known.sum()))
+    count = int(known.sum())
+    if not linearly_independent(together):
+        return Differences(np.zeros(count), np.zeros(count))
     coefficients = np.zeros(5)
     residual = np.concatenate([target.real, target.imag])
     coefficients[used], _ = fit_linear(together, residual)
-    spread = _covariance(extended, coefficients, used)[known.sum() :, known.sum() :]
-    residual = residual - together[:, : known.sum()] @ ratios[known]
-    return difference_by_extra_columns(together[:, : known.sum()], together[:, known.sum() :], residual, spread)
+    spread = _covariance(extended, coefficients, used)[count:, count:]
+    columns, extra = together[:, :count], together[:, count:]
+    return difference_by_extra_columns(columns, extra, residual - columns @ ratios[known], spread)
 
 
 def _one_frequency(record: SweptRecord) -> bool:

@@ -68,6 +68,7 @@ def identify_files(
         "recordings": [str(path) for path in paths],
         "device": nominal.name,
         "axes": _axes_summary(identification),
+        "nonlinear": list(identification.nonlinear),
         "notes": list(identification.notes),
         "output": str(output),
     }

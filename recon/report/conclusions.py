@@ -186,13 +186,19 @@ def conclude_plan(content: Mapping[str, Any]) -> str:
 
 
 def conclude_identification(summary: Mapping[str, Any]) -> str:
-    """How many constants were measured, and the least certain of them."""
+    """How many constants were measured, the least certain of them, and whether a linear law holds."""
     values = {f"{axis}.{name}": v for axis, r in summary["axes"].items() for name, v in r["values"].items()}
     relative = {name: v["sd"] / abs(v["value"]) for name, v in values.items() if v["value"] and v["sd"]}
     text = f"{counted(len(values), 'constant')} of {summary['device']} measured"
     if relative:
         worst = max(relative, key=lambda name: relative[name])
         text += f", the least certain {worst} to {percent(relative[worst])}"
+    if summary["nonlinear"]:
+        axes = " and ".join(summary["nonlinear"])
+        return (
+            f"{text}. They hold for no amplitude exactly, because the law of {axes} is not linear or changed during a "
+            "recording. Run lissajous diagnose to find the law."
+        )
     return text + ". Use device.toml in place of the nominal device."
 
 

@@ -75,6 +75,21 @@ def test_seven_cycles_are_refused_and_so_is_another_motion() -> None:
         fit_decay_without_angle(device.axes["x"], wrong["sense_x"])
 
 
+@pytest.mark.parametrize("channel", ["sense_x", "angle_x"])
+def test_noise_alone_is_no_reason_to_refuse_a_decay(channel: str) -> None:
+    """The noise is a fourth of the amplitude at the start. The record is three times as long as the decay time."""
+    time = np.arange(3000) / 2e5
+    device = decay(SENSORS[0], 10.0, 0)[1]
+    unit, gain = ("V", 10.0) if channel == "sense_x" else ("rad", 1.0)
+    for seed in range(4):
+        noise = 0.025 * np.random.default_rng(seed).standard_normal(time.size)
+        angle = 0.1 * np.exp(-0.5 * W / QUALITY * time) * np.cos(W * time) + noise
+        values = identify([Recording.from_arrays({channel: (gain * angle, unit, 2e5)})], device).values["x"]
+        for key, true in (("k_over_J", W**2), ("b_over_J", W / QUALITY)):
+            assert values[key].value == pytest.approx(true, abs=4.0 * values[key].sd)
+            assert values[key].sd < 0.1 * true
+
+
 def test_no_note_asks_for_the_driven_motion_that_was_recorded() -> None:
     recording, device = decay(SENSORS[0], 100.0, 5)
     axis = replace(device.axes["x"], drive=Drive("linear", torque_per_volt=1e-4))
