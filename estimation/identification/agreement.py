@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
 from estimation.least_squares import Z_95, fit_linear
 from scanner.arrays import Array
 
@@ -41,6 +42,10 @@ class Differences(NamedTuple):
     difference: Array
     sd: Array
 
+    def select(self, chosen: Sequence[int], scale: Sequence[float] | Array) -> Differences:
+        """The differences of some of the values, each times a factor of ``scale``, which changes its unit."""
+        return Differences(self.difference[chosen] * scale, self.sd[chosen] * scale)
+
     @property
     def conflict(self) -> Array:
         """Differences in standard deviations, shape (p,); 0 where the difference is not determined."""
@@ -48,20 +53,28 @@ class Differences(NamedTuple):
 
     @property
     def excess(self) -> Array:
-        """Differences without what noise explains, shape (p,): 0 within their 95 % interval.
+        """Standard deviations by which intervals are widened, with the sign of the difference, shape (p,).
 
-        It is the standard deviation by which an interval is widened. 5 % of the intervals of values that agree are
-        widened, and an interval contains both estimates where they differ by several standard deviations.
+        The differences without what noise explains: 0 within their 95 % intervals. If any of them exceeds
+        ``DISCRIMINATION_SIGMA``, the estimates do not agree, and every interval contains both of them: then the
+        complete differences with their noise.
         """
+        if self.conflict.max() > DISCRIMINATION_SIGMA:
+            return np.asarray(np.copysign(np.hypot(self.difference, self.sd), self.difference))
         outside = np.maximum(np.abs(self.difference) - Z_95 * self.sd, 0.0)
-        return np.asarray(np.where(self.sd > 0.0, np.sign(self.difference) * outside, 0.0))
+        return np.asarray(np.where(self.sd > 0.0, np.copysign(outside, self.difference), 0.0))
 
 
-def widen(value: IdentifiedValue, difference: float, difference_sd: float) -> IdentifiedValue:
-    """The value with an interval that allows for its difference from an estimate that should agree."""
-    found = Differences(np.array([difference]), np.array([difference_sd]))
-    sd = float(np.hypot(value.sd, found.excess[0]))
-    return replace(value, sd=sd, conflict=max(value.conflict, float(found.conflict[0])))
+def widen(values: Sequence[IdentifiedValue], differences: Differences) -> list[IdentifiedValue]:
+    """Values with intervals that allow for their differences from estimates that should agree.
+
+    Args:
+        values: p values. differences: of all of them, in the same units.
+    """
+    return [
+        replace(value, sd=float(np.hypot(value.sd, excess)), conflict=max(value.conflict, float(conflict)))
+        for value, excess, conflict in zip(values, differences.excess, differences.conflict, strict=True)
+    ]
 
 
 def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, IdentifiedValue]:

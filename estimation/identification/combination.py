@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
-from estimation.identification.agreement import IdentifiedValue, combine_values, scaled_by_inertia, widen
+from estimation.identification.agreement import Differences, IdentifiedValue, combine_values, scaled_by_inertia, widen
 from estimation.identification.fits import fit_ringdown
 from estimation.slow.response import ResponseFit
 from scanner.arrays import Array
@@ -53,7 +53,7 @@ def average_ratios(
     for key, free in decay.items():
         mean = combine_values([{key: free}, {key: driven[key]}])[key]
         difference, sd = free.value - driven[key].value, float(np.hypot(free.sd, driven[key].sd))
-        values[key] = widen(mean, difference, sd)
+        values[key] = widen([mean], Differences(np.array([difference]), np.array([sd])))[0]
         values[key[0]] = scaled_by_inertia(values[key], driven["J"])
         weights[key] = (mean.sd / driven[key].sd) ** 2
         if abs(difference) > DISCRIMINATION_SIGMA * sd:

@@ -124,12 +124,13 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
         raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
     rate, decay = w0 * (1.0 + x[0]), float(first_decay * x[1])
     change = _amplitude_dependence(lambda x: basis(x, y.size)[skip:], x, solution.jac, y[skip:], time[skip:], decay)
-    values = {
-        "k_over_J": IdentifiedValue(float(rate**2 + decay**2), float(2.0 * rate * w0 * sd[0])),
-        "b_over_J": IdentifiedValue(2.0 * decay, float(2.0 * first_decay * sd[1])),
-    }
-    for k, (key, scale) in enumerate({"k_over_J": 2.0 * rate * w0, "b_over_J": 2.0 * first_decay}.items()):
-        values[key] = widen(values[key], *(float(scale * each[k]) for each in change))
+    scale = np.array([2.0 * rate * w0, 2.0 * first_decay])
+    stiffness_sd, loss_sd = scale * sd[:2]
+    ratios = [
+        IdentifiedValue(float(rate**2 + decay**2), float(stiffness_sd)),
+        IdentifiedValue(2.0 * decay, float(loss_sd)),
+    ]
+    values = dict(zip(("k_over_J", "b_over_J"), widen(ratios, change.select([0, 1], scale)), strict=True))
     if order == 2:
         values["amplitude_over_theta0"] = IdentifiedValue(float(np.exp(x[2])), float(np.exp(x[2]) * sd[2]))
     return values
@@ -138,7 +139,7 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
 def _amplitude_dependence(
     basis: Callable[[Array], Array], x: Array, jacobian: Array, y: Array, time: Array, decay: float
 ) -> Differences:
-    """Changes of the fitted parameters if frequency and damping may depend on the amplitude.
+    """Changes of the fitted parameters, then of gain and offset, if frequency and damping may depend on the amplitude.
 
     Args:
         basis: signals that gain and offset multiply, shape (n, 2 or 3), for parameters of shape (p,).
@@ -156,8 +157,7 @@ def _amplitude_dependence(
             (basis(x + step) - basis(x - step))[:, 0] * (linear[0] / (2.0 * DERIVATIVE_STEP)) for step in steps
         )
     extra = amplitude_columns(time, 2.0 * decay, by_phase, by_log_amplitude)
-    change = difference_by_extra_columns(np.column_stack([-jacobian, columns]), extra, y - columns @ linear)
-    return Differences(change.difference[: x.size], change.sd[: x.size])
+    return difference_by_extra_columns(np.column_stack([-jacobian, columns]), extra, y - columns @ linear)
 
 
 def _line(channel: Channel, near: float) -> float:

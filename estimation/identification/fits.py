@@ -32,7 +32,8 @@ MAX_AMPLITUDE_CHANGE = 0.02
 motion whose amplitudes differ by less count as of one amplitude."""
 
 STEPS_PER_CYCLE = 80
-"""Runge-Kutta steps per cycle in the fit of a ringdown: the relative error of its frequency is then 3e-7."""
+"""Samples per cycle in the fit of a ringdown, and Runge-Kutta steps under a bias: the relative error of the frequency is
+then 3e-7. Without a bias the trajectory is exact."""
 
 MAX_RINGDOWN_RESIDUAL_RATIO = 0.3
 """Standard deviation of a ringdown's residual, relative to the signal, above which the fit is rejected, unless
@@ -163,12 +164,14 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
     used = angle[::stride]
     step = stride / rate / steps_a_stride
     n = (used.size - 1) * steps_a_stride
-    voltage = np.full((n, 3), bias)
+    voltage, time = np.full((n, 3), bias), np.arange(used.size) * stride / rate
     w0, loss0 = _first_guess(used, rate / stride, mechanics)
     scale = np.array([1e-3 * w0, 0.1 * loss0, 0.01 * np.abs(used).max(), 0.01 * w0 * np.abs(used).max(), 0.1])
 
     def trajectory(x: Array) -> Array:
         w, loss, theta, omega, inverse = start + scale * np.append(x, np.zeros(5 - x.size))
+        if comb is None:
+            return free_decay(time, w, min(max(loss, 1e-6 * loss0), w), theta, omega)
         J = mechanics.J / inverse
         tried = Axis(Mechanics(J, max(loss, 1e-6 * loss0) * J, w * w * J), comb)  # a step of the fit may overshoot
         return integrate(tried, (theta, omega), voltage, step)[0][::steps_a_stride]
@@ -195,22 +198,33 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
     theta, omega = start[2:4] + scale[2:4] * x[2:4]
     by_theta, by_omega = fit.jac[:, 2] / scale[2], fit.jac[:, 3] / scale[3]
     extra = amplitude_columns(
-        np.arange(used.size) * stride / rate,
+        time,
         loss,
         omega / w * by_theta - w * theta * by_omega,
         theta * by_theta + omega * by_omega,
     )
     change = difference_by_extra_columns(fit.jac / scale[:free], extra, residual)
-    values = {
-        "k_over_J": widen(IdentifiedValue(float(w * w), float(2 * w * sd[0])), *(2 * w * each[0] for each in change)),
-        "b_over_J": widen(IdentifiedValue(float(loss), float(sd[1])), *(each[1] for each in change)),
-    }
+    names, chosen, factors = ["k_over_J", "b_over_J"], [0, 1], [2.0 * float(w), 1.0]
+    found = [IdentifiedValue(float(w * w), float(2 * w * sd[0])), IdentifiedValue(float(loss), float(sd[1]))]
     inverse = start[4] + scale[4] * x[4:]
     if comb and inverse[0] > Z_95 * sd[4]:
         J = mechanics.J / float(inverse[0])
-        relative = J / float(inverse[0])
-        values["J"] = widen(IdentifiedValue(J, relative * float(sd[4])), *(relative * each[4] for each in change))
+        names, chosen, factors = [*names, "J"], [*chosen, 4], [*factors, J / float(inverse[0])]
+        found.append(IdentifiedValue(J, factors[-1] * float(sd[4])))
+    values = dict(zip(names, widen(found, change.select(chosen, factors)), strict=True))
     return values, residual
+
+
+def free_decay(time: Array, w: float, loss: float, theta: float, omega: float) -> Array:
+    """Angle of a free decay under a linear law, shape (n,) [rad].
+
+    Args:
+        time: shape (n,) [s]. w: square root of k/J [rad/s]. loss: b/J [1/s], less than 2 w.
+        theta, omega: angle [rad] and velocity [rad/s] at the time 0.
+    """
+    turn = np.sqrt(w**2 - 0.25 * loss**2)
+    phasor = theta - 1j * (omega + 0.5 * loss * theta) / turn
+    return np.asarray((phasor * np.exp((1j * turn - 0.5 * loss) * time)).real)
 
 
 def _first_guess(angle: Array, rate: float, mechanics: Mechanics) -> tuple[float, float]:

@@ -62,21 +62,19 @@ def fit_lock_in_decay(recording: Recording, axis: Axis) -> dict[str, IdentifiedV
     variance = float(np.sum(left**2)) / (left.size - 4) * dependence
     sd = np.sqrt(variance * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
     g, w = float(np.exp(fit.x[0])), 2 * np.pi * frequency + float(fit.x[1])
-    change, change_sd = _amplitude_dependence(time, phasor, g, float(fit.x[1]))
-    change_sd = change_sd * np.sqrt(dependence)
-    return {
-        "k_over_J": widen(
-            IdentifiedValue(w**2 + g**2, float(2.0 * w * sd[1])), 2.0 * w * change[1], 2.0 * w * change_sd[1]
-        ),
-        "b_over_J": widen(IdentifiedValue(2.0 * g, float(2.0 * g * sd[0])), 2.0 * change[0], 2.0 * change_sd[0]),
-    }
+    found = [IdentifiedValue(w**2 + g**2, float(2.0 * w * sd[1])), IdentifiedValue(2.0 * g, float(2.0 * g * sd[0]))]
+    change = _amplitude_dependence(time, phasor, g, float(fit.x[1]), dependence)
+    return dict(zip(("k_over_J", "b_over_J"), widen(found, change.select([1, 0], [2.0 * w, 2.0])), strict=True))
 
 
-def _amplitude_dependence(time: Array, phasor: Complex, decay: float, detuning: float) -> Differences:
+def _amplitude_dependence(
+    time: Array, phasor: Complex, decay: float, detuning: float, dependence: float
+) -> Differences:
     """Changes of decay rate [1/s] and detuning [rad/s] if both may depend on the amplitude.
 
     Args:
         time: [s], phasor: both of shape (n,). decay: [1/s], detuning: [rad/s], as fitted.
+        dependence: factor of the variances by the correlation of neighbouring samples.
     """
     shape = np.exp((1j * detuning - decay) * time)
     shape *= np.vdot(shape, phasor) / np.vdot(shape, shape)
@@ -86,7 +84,7 @@ def _amplitude_dependence(time: Array, phasor: Complex, decay: float, detuning: 
     )
     extra = amplitude_columns(np.tile(time, 2), 2.0 * decay, by_phase, by_log_amplitude)
     change = difference_by_extra_columns(np.concatenate([columns.real, columns.imag]), extra, residual)
-    return Differences(change.difference[:2], change.sd[:2])
+    return Differences(change.difference[:2], change.sd[:2] * np.sqrt(dependence))
 
 
 def _first_guess(time: Array, phasor: Complex, size: Array) -> tuple[float, float]:

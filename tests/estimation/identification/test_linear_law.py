@@ -148,9 +148,13 @@ def test_the_conclusion_names_the_axis_whose_law_is_not_linear(tmp_path: Path) -
 
 def test_an_interval_is_widened_by_what_noise_does_not_explain() -> None:
     value = IdentifiedValue(10.0, 0.1)
-    assert widen(value, 0.3, 0.2) == replace(value, conflict=pytest.approx(1.5))
-    assert widen(value, 0.0, 0.0) == value
-    wide = widen(value, -4.0, 0.2)
+
+    def widened(difference: float, sd: float) -> IdentifiedValue:
+        return widen([value], Differences(np.array([difference]), np.array([sd])))[0]
+
+    assert widened(0.3, 0.2) == replace(value, conflict=pytest.approx(1.5))
+    assert widened(0.0, 0.0) == value
+    wide = widened(-4.0, 0.2)
     assert wide.conflict == pytest.approx(20.0)
     assert wide.ci95[0] < 6.0
     assert combine_values([{"k": wide}, {"k": value}])["k"].conflict == wide.conflict
