@@ -20,6 +20,7 @@ from estimation.identification.classification import (
 from estimation.identification.combination import (
     Decay,
     average_ratios,
+    axis_with_values,
     conflict_notes,
     mechanics_from_decays,
     values_of_mode,
@@ -346,14 +347,4 @@ class _AxisIdentification:
 
     def device_axis(self) -> Axis:
         """The axis with the identified values."""
-        axis, tolerance = self.axis, dict(self.axis.tolerance)
-        for stage in ("mechanics", "capacitance", "readout"):
-            part = getattr(axis, stage)
-            keys = [key for key in self.values if part is not None and hasattr(type(part), "__dataclass_fields__")]
-            keys = [key for key in keys if key in part.__dataclass_fields__] if part is not None else []
-            if keys:
-                axis = replace(axis, **{stage: replace(part, **{key: self.values[key].value for key in keys})})
-            tolerance |= {
-                key: abs(self.values[key].sd / self.values[key].value) for key in keys if self.values[key].value
-            }
-        return replace(axis, tolerance=tolerance)
+        return axis_with_values(self.axis, self.values)

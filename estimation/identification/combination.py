@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -79,3 +80,15 @@ def conflict_notes(found: Sequence[Mapping[str, IdentifiedValue]]) -> list[str]:
         f"damping that depend on the amplitude, the constants differ by {conflict:.3g} standard deviations; their "
         "intervals contain the difference; `lissajous diagnose` names such a law"
     ]
+
+
+def axis_with_values(axis: Axis, values: Mapping[str, IdentifiedValue]) -> Axis:
+    """The axis with the identified values, whose relative standard deviations are its tolerances."""
+    tolerance = dict(axis.tolerance)
+    for stage in ("mechanics", "capacitance", "readout"):
+        part = getattr(axis, stage)
+        keys = [key for key in values if key in getattr(type(part), "__dataclass_fields__", {})]
+        if keys:
+            axis = replace(axis, **{stage: replace(part, **{key: values[key].value for key in keys})})
+        tolerance |= {key: abs(values[key].sd / values[key].value) for key in keys if values[key].value}
+    return replace(axis, tolerance=tolerance)

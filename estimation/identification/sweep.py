@@ -24,7 +24,7 @@ from estimation.identification.agreement import (
     difference_by_extra_columns,
     linearly_independent,
 )
-from estimation.identification.fits import DrivenRecord, drive_torque, values_from_ratios
+from estimation.identification.fits import DrivenRecord, drive_torque, torque_is_linear, values_from_ratios
 from estimation.least_squares import fit_linear
 from estimation.reference import PhaseReference
 from scanner.arrays import Array, Complex, Mask
@@ -98,6 +98,8 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
     stiffness, _, inverse = ratios
     if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
+    if not torque_is_linear(axis):
+        return values_from_ratios(ratios, covariance)
     differences = _amplitude_dependence(equations, ratios, known)
     return values_from_ratios(ratios, covariance, change @ differences.excess, float(differences.conflict.max()))
 

@@ -22,6 +22,7 @@ from scanner.drift import Drift
 from scanner.errors import BadInput
 from scanner.forward_model import sense_signal
 from scanner.recording import Recording
+from scanner.stages import Mechanics
 
 DRIVEN = load("chen2020-driven")
 AXIS = DRIVEN.axis("x")
@@ -326,3 +327,16 @@ def test_ratios_of_a_free_decay_and_of_noisy_driven_motion_are_averaged(softenin
     if not softening:
         assert ratio.sd < 0.5 * alone.values["x"]["k_over_J"].sd
         assert both.values["x"]["k"].value == pytest.approx(ratio.value * both.values["x"]["J"].value)
+
+
+def test_a_quiet_decay_of_a_high_q_has_no_bias() -> None:
+    """Steps of an integration made an error of 6e-7 of k/J, ten standard deviations."""
+    w, quality, rate = 2 * np.pi * 2000.0, 800.0, 1e5
+    axis = Axis(Mechanics(1e-9, 1e-9 * w / 700.0, 1e-9 * w**2), name="x")
+    time, z = np.arange(20_000) / rate, []
+    for seed in range(6):
+        angle = 0.08 * np.exp(-0.5 * w / quality * time) * np.cos(w * np.sqrt(1.0 - 0.25 / quality**2) * time)
+        noisy = angle + 2e-5 * np.random.default_rng(seed).standard_normal(time.size)
+        value = fit_ringdown(noisy, rate, axis)[0]["k_over_J"]
+        z.append((value.value - w**2) / value.sd)
+    assert abs(np.mean(z)) < 1.5
