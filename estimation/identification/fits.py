@@ -130,21 +130,29 @@ def values_from_ratios(
         excess: difference of the ratios from an estimate that should agree, by which the intervals are widened, shape
             (3,). conflict: the largest such difference in standard deviations.
     """
-    stiff, loss, inverse = ratios
-    if excess is not None:
-        covariance = covariance + np.outer(excess, excess)
+    inverse = ratios[2]
+    excess = np.zeros(3) if excess is None else excess
+    values = _values(ratios)
+    other = _values(ratios + excess) if inverse + excess[2] > 0.0 else {}  # else J has no second value: to first order
     jacobian = {
         "J": np.array([0.0, 0.0, -1.0 / inverse**2]),
-        "b": np.array([0.0, 1.0 / inverse, -loss / inverse**2]),
-        "k": np.array([1.0 / inverse, 0.0, -stiff / inverse**2]),
+        "b": np.array([0.0, 1.0 / inverse, -ratios[1] / inverse**2]),
+        "k": np.array([1.0 / inverse, 0.0, -ratios[0] / inverse**2]),
         "k_over_J": np.array([1.0, 0.0, 0.0]),
         "b_over_J": np.array([0.0, 1.0, 0.0]),
     }
-    values = {"J": 1.0 / inverse, "b": loss / inverse, "k": stiff / inverse, "k_over_J": stiff, "b_over_J": loss}
-    return {
-        key: IdentifiedValue(float(values[key]), float(np.sqrt(g @ covariance @ g)), conflict)
-        for key, g in jacobian.items()
-    }
+    found = {}
+    for key, slope in jacobian.items():
+        change = other[key] - values[key] if other else slope @ excess
+        sd = float(np.hypot(np.sqrt(slope @ covariance @ slope), change))
+        found[key] = IdentifiedValue(values[key], sd, conflict)
+    return found
+
+
+def _values(ratios: Array) -> dict[str, float]:
+    """``J``, ``b``, ``k`` and the two ratios from (k/J, b/J, 1/J)."""
+    stiffness, loss, inverse = (float(each) for each in ratios)
+    return {"J": 1.0 / inverse, "b": loss / inverse, "k": stiffness / inverse, "k_over_J": stiffness, "b_over_J": loss}
 
 
 def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, IdentifiedValue], Array]:
