@@ -159,13 +159,25 @@ def settled_state(axis: Axis, plan: Plan) -> InitialState:
     Raises:
         BadInput: the drive does not sustain a motion.
     """
-    chunks = max(1, int(np.ceil(plan.settle / CHUNK_S)))
-    edges = -plan.settle + plan.settle * np.arange(chunks + 1) / chunks
-    pieces = simulate_motion({axis.name: axis}, plan, {axis.name: InitialState(START_ANGLE_RAD, 0.0)}, edges.tolist())
+    samples = max(1, round(plan.settle * plan.sample_rate))
+    edges = _piece_edges(samples, plan.sample_rate, -samples / plan.sample_rate)
+    pieces = simulate_motion({axis.name: axis}, plan, {axis.name: InitialState(START_ANGLE_RAD, 0.0)}, edges)
     (paths,) = deque(pieces, maxlen=1)  # earlier pieces are dropped, as the settling may be long
     path = paths[axis.name]
     _require_motion(axis.name, path.angle, plan)
     return InitialState(float(path.angle[-1]), float(path.rate[-1]))
+
+
+def _piece_edges(samples: int, sample_rate: float, start: float = 0.0) -> list[float]:
+    """Ends of the pieces of a simulation [s]: at whole samples, so that the motion continues where it stopped.
+
+    Args:
+        samples: of the whole simulation.
+        sample_rate: [Hz].
+        start: of the first piece [s].
+    """
+    length = max(1, round(CHUNK_S * sample_rate))
+    return [start + index / sample_rate for index in (*range(0, samples, length), samples)]
 
 
 def _require_motion(axis: str, angle: Array, plan: Plan) -> None:
@@ -210,15 +222,15 @@ def _motion_pieces(
     """
     axes = {name: device.sensed_axis(name) for name in device.axes}
     if not any(axis.terms for axis in axes.values()):
-        edges = [*np.arange(0.0, plan.duration, CHUNK_S).tolist(), plan.duration]
+        edges = _piece_edges(round(plan.duration * plan.sample_rate), plan.sample_rate)
         yield from simulate_motion(
             axes, plan, start or {name: settled_state(axis, plan) for name, axis in axes.items()}, edges
         )
         return
-    before = 0.0 if start else plan.settle
+    settling = 0 if start else round(plan.settle * plan.sample_rate)
     state = start or dict.fromkeys(axes, InitialState(START_ANGLE_RAD, 0.0))
-    (paths,) = simulate_motion(axes, plan, state, (-before, plan.duration))
-    first = round(before * plan.sample_rate) * plan.substeps
+    (paths,) = simulate_motion(axes, plan, state, (-settling / plan.sample_rate, plan.duration))
+    first = settling * plan.substeps
     if first:
         for name, path in paths.items():
             _require_motion(name, path.angle[max(0, first - round(CHUNK_S / path.drive.step)) : first], plan)
