@@ -115,7 +115,10 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
     left = solution.fun
     signal = y[: max(y.size // 4, windows[0] if windows else 0)]
     if left.std() > MAX_RINGDOWN_RESIDUAL_RATIO * signal.std() and shows_motion(left):
-        what, hint = "does not follow a free decay", "cut the record to the decay alone, without a bias that changes it"
+        what = "does not follow a free decay of a linear resonator"
+        hint = (
+            "cut the record to the decay alone, without a bias that changes it; `lissajous diagnose` finds other laws"
+        )
         raise BadInput(what, file=channel.file, channel=channel.name, hint=hint)
     variance = float(left @ left) / max(y.size - x.size - basis(x, y.size).shape[1], 1)
     sd = np.sqrt(variance * np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))

@@ -206,7 +206,8 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
     residual = used - trajectory(x)
     if residual.std() > MAX_RINGDOWN_RESIDUAL_RATIO * used.std() and shows_motion(residual):
         raise BadInput(
-            "the free decay does not follow the equation of motion", hint="cut the record to the decay alone"
+            "the free decay does not follow the linear equation of motion",
+            hint="cut the record to the decay alone; `lissajous diagnose` finds other laws",
         )
     variance = float(residual @ residual) / (used.size - free)
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * variance

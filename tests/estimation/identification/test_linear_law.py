@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.identify_references import lock_in
+from benchmarks.measured import ROWS
 from benchmarks.papers.sine import linear_axis
 from estimation.identification.agreement import (
     Differences,
@@ -176,3 +177,12 @@ def test_the_change_by_further_columns_has_its_stated_deviation() -> None:
     assert isinstance(undetermined, Differences)
     assert not undetermined.conflict.any()
     assert not undetermined.excess.any()
+
+
+@pytest.mark.parametrize("row", ["silverbox", "pendulum-45", "membrane-3716", "membrane-505"])
+def test_measured_devices_contradict_the_linear_law(row: str, measured_data: Path) -> None:
+    """A circuit with a cubic spring, a pendulum, and membranes with a damping that depends on the amplitude."""
+    recordings, _, device = ROWS[row](measured_data)
+    found = identify(recordings, device)
+    assert found.nonlinear == ["x"]
+    assert any("is not linear" in note for note in found.notes)
