@@ -94,13 +94,15 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
     change = np.eye(3)[:, known]  # of all coefficients with the known ones
     if not known[0]:
         ratios[0], change[0] = _mean_stiffness(equations, ratios[1:])
+    fitted = ratios
+    ratios = fitted - change @ _noise_bias(equations, fitted, known)
     covariance = change @ _covariance(equations, ratios, known) @ change.T
     stiffness, _, inverse = ratios
     if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
     if not torque_is_linear(axis):
         return values_from_ratios(ratios, covariance)
-    differences = _amplitude_dependence(equations, ratios, known)
+    differences = _amplitude_dependence(equations, fitted, known)
     return values_from_ratios(ratios, covariance, change @ differences.excess, float(differences.conflict.max()))
 
 
@@ -214,39 +216,68 @@ def _covariance(equations: Sequence[_Equations], ratios: Array, known: Mask) -> 
     windows' band; then the filter determines the correlation of the residuals, and only the noise's variance, one for
     each record, is estimated from them.
     """
-    used = [each.columns[:, known] for each in equations]
-    size = np.sqrt(np.mean(np.abs(np.concatenate(used)) ** 2, axis=0))
-    scaled = [columns / size for columns in used]
+    scaled, size, inverse = _scaled_columns(equations, known)
     spread = np.zeros((size.size, size.size))
-    inverse = np.linalg.inv(sum(((columns.conj().T @ columns).real for columns in scaled), spread))
     for each, columns in zip(equations, scaled, strict=True):
-        correlation = _residual_correlation(each, ratios)
-        correlated = _smoothed(columns, correlation, "same")
-        between = 0.5 * (columns.conj().T @ correlated).real  # half the power of complex noise is in the real part
-        spread += between * _residual_variance(each, ratios, columns, correlation, inverse, between)
+        spread += _between(each, ratios, columns) * _residual_variance(each, ratios, columns, inverse)
     return np.asarray(inverse @ spread @ inverse / np.outer(size, size))
 
 
-def _residual_variance(
-    equations: _Equations, ratios: Array, columns: Complex, correlation: Complex, inverse: Array, between: Array
-) -> float:
+def _noise_bias(equations: Sequence[_Equations], ratios: Array, known: Mask) -> Array:
+    """Bias of the p ``known`` coefficients by the noise in their columns, to first order, shape (p,).
+
+    The noise of the angle is in the columns and in the residual. Their covariance is that of the windows under white
+    noise of the variance that the residual shows. In a balance of power it also turns the direction of Z, and with it
+    the torque. With a Q of 8 and noise of an eighth of the signal, b/J of a motion in steps was 18 % too small.
+    """
+    scaled, size, inverse = _scaled_columns(equations, known)
+    bias = np.zeros(size.size)
+    for each, columns in zip(equations, scaled, strict=True):
+        angle, velocity, _ = each.windows
+        response = _response(each, ratios)
+        common = np.array([np.vdot(window, response).real for window in (angle, velocity)])
+        common *= _residual_variance(each, ratios, columns, inverse) / np.vdot(response, response).real
+        moments = np.array([*(common * len(columns)), 0.0])
+        if each.balance:  # half the power of complex noise is in the imaginary part
+            turned = np.sum(each.motion[:, 2].real / each.motion[:, 0].real)
+            moments = 0.5 * np.array([0.0, moments[1], -common[0] * turned])
+        bias -= inverse @ (moments[known] / size)
+    return np.asarray(bias / size)
+
+
+def _scaled_columns(equations: Sequence[_Equations], known: Mask) -> tuple[list[Complex], Array, Array]:
+    """The ``known`` columns of every record with an rms of 1, their rms, and the inverse of the normal matrix."""
+    used = [each.columns[:, known] for each in equations]
+    size = np.sqrt(np.mean(np.abs(np.concatenate(used)) ** 2, axis=0))
+    scaled = [columns / size for columns in used]
+    normal = sum(((columns.conj().T @ columns).real for columns in scaled), np.zeros((size.size, size.size)))
+    return scaled, size, np.linalg.inv(normal)
+
+
+def _between(equations: _Equations, ratios: Array, columns: Complex) -> Array:
+    """Covariance of the moments of the columns of one record with a residual of variance 1, shape (p, p)."""
+    correlated = _smoothed(columns, _residual_correlation(equations, ratios), "same")
+    return np.asarray(0.5 * (columns.conj().T @ correlated).real)  # half the power of complex noise is in the real part
+
+
+def _residual_variance(equations: _Equations, ratios: Array, columns: Complex, inverse: Array) -> float:
     """Variance of the residual of one record, from its part near the resonance.
 
     The residual is averaged under one more window, because most of its power is at the edges of the windows' band,
     where the noise may have another level. The expected share that the fit absorbs is allowed for.
 
     Args:
-        columns: scaled. correlation: of the residual. inverse: of the normal matrix. between: covariance of the
-            moments of the columns with a residual of variance 1.
+        columns: scaled. inverse: of the normal matrix.
     """
     weights = np.hanning(HOPS_PER_WINDOW + 2)[1:-1]
     residual = _smoothed((equations.target - equations.columns @ ratios)[:, None], weights, "valid")
     parts = 0.5 if equations.balance else 1.0  # of the power of complex noise
     narrow = _smoothed(columns, weights, "valid")
+    correlation = _residual_correlation(equations, ratios)
     correlated = _smoothed(_smoothed(columns, correlation, "same"), weights, "valid")
     power = float(np.sum(np.convolve(weights, weights) * correlation[1:-1]).real)
     absorbed = np.trace(inverse @ (correlated.conj().T @ narrow).real)
-    absorbed -= np.trace(inverse @ (narrow.conj().T @ narrow).real @ inverse @ between)
+    absorbed -= np.trace(inverse @ (narrow.conj().T @ narrow).real @ inverse @ _between(equations, ratios, columns))
     return float(np.sum(np.abs(residual) ** 2) / (parts * len(residual) * power - absorbed))
 
 
@@ -261,10 +292,15 @@ def _residual_correlation(equations: _Equations, ratios: Array) -> Complex:
     """Autocorrelation of the residual of white noise at the lags from -HOPS_PER_WINDOW to HOPS_PER_WINDOW points."""
     from scipy.signal import fftconvolve
 
-    angle, velocity, acceleration = equations.windows
-    response = acceleration + ratios[1] * velocity + ratios[0] * angle
+    response = _response(equations, ratios)
     correlation = fftconvolve(response, response.conj()[::-1])[:: equations.hop]
     return np.asarray(correlation / correlation[HOPS_PER_WINDOW].real, np.complex128)
+
+
+def _response(equations: _Equations, ratios: Array) -> Complex:
+    """Weights of the noise of the angle in the residual of one window, shape (window,)."""
+    angle, velocity, acceleration = equations.windows
+    return acceleration + ratios[1] * velocity + ratios[0] * angle
 
 
 def _windows(hop: int, rate: float) -> tuple[Array, Array, Array]:
