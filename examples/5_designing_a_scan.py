@@ -34,7 +34,7 @@ rate = 5e6
 grid = lissajous.Grid(200, 200, device.scan.half_angle_x, device.scan.half_angle_y)
 figure, panels = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
 for panel, phase in zip(panels, ("best", "worst"), strict=False):
-    x, y = best.figure.angles(rate, best.phases[phase])
+    x, y = best.figure.angles(rate, *best.starts[phase])
     counts = np.linspace(0, x.size, 21, dtype=int)[1:]
     coverage = [lissajous.map_samples(x[:n], y[:n], x[:n], grid).coverage for n in counts]
     panel.imshow(coverage[-1] > 0, cmap="gray")
