@@ -19,7 +19,7 @@ from estimation.identification.agreement import (
     widen,
 )
 from estimation.identification.classification import shows_motion
-from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S
+from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SECTION_SAMPLES_PER_CYCLE, SETTLE_TIME_S
 from estimation.reference import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -33,9 +33,6 @@ MIN_CYCLES = 8.0
 
 LINE_CYCLES = 40.0
 """Cycles from the start in whose spectrum the frequency is first found."""
-
-SECTION_SAMPLES_PER_CYCLE = 400
-"""Samples a cycle at which low-pass sections are stepped: their input is taken as linear between samples."""
 
 MAX_SAMPLES_PER_CYCLE = 40
 """Samples a cycle that are fitted: the harmonics of a comb are resolved up to the eighth."""
@@ -110,7 +107,9 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
     windows = [round(per_cycle * c) for c in (6.0, 25.0, 100.0, 400.0, 1600.0, 6400.0) if c < 0.7 * cycles]
     x = min(starts, key=lambda x: float(np.sum(residual(x, windows[0] if windows else y.size) ** 2)))
     for n in (*windows, y.size):
-        solution = least_squares(residual, x, args=(n,), x_scale="jac")
+        tried = [x] if order == 1 else [np.array([*x[:2], np.log(a), x[3]]) for a in START_AMPLITUDES]
+        solutions = [least_squares(residual, each, args=(n,), x_scale="jac") for each in tried]
+        solution = min(solutions, key=lambda each: float(each.cost))
         x = solution.x
     left = solution.fun
     signal = y[: max(y.size // 4, windows[0] if windows else 0)]
