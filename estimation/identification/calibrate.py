@@ -34,7 +34,7 @@ from estimation.identification.fits import (
 from estimation.identification.lock_in_decay import fit_lock_in_decay
 from estimation.identification.reference_angle import ReferenceAngle, find_reference_angle, with_angle
 from estimation.identification.steady_segments import steady_segments
-from estimation.identification.sweep import SweptRecord
+from estimation.identification.sweep import SweptRecord, has_one_frequency
 from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
 from estimation.reference import drive_reference
 from estimation.slow.response import Response, ResponseFit, frequency_responses
@@ -277,7 +277,12 @@ class _AxisIdentification:
         if self.decays:
             self._take(axis, lambda axis: mechanics_from_decays(axis, self.decays))
         decay = {key: value for key, value in self.values.items() if key in ("k_over_J", "b_over_J")}
-        several = len({round(record.frequency) for record in self.driven}) > 1
+        # in a slow sweep at a high Q, segments of steady amplitude are no steady motion: the decay time is longer
+        frequencies = (
+            {round(record.frequency) for record in self.driven},
+            {round(record.driven.frequency) for record in self.swept},
+        )
+        several = min(map(len, frequencies)) > 1 and all(has_one_frequency(record) for record in self.swept)
         if several:
             self._take(axis, lambda axis: fit_mechanics(axis, self.driven))
         elif self.swept:

@@ -151,7 +151,7 @@ def _equations(axis: Axis, record: SweptRecord) -> _Equations:
     )
     z, velocity, acceleration = (_averaged(angle, window, hop) for window in windows)
     motion = np.stack([z, velocity, -_averaged(torque, plain, hop)], axis=1)
-    balance = _one_frequency(record)
+    balance = has_one_frequency(record)
     if balance:
         direction = z.conj() / np.maximum(np.abs(z), np.finfo(float).tiny)
         motion, acceleration = direction[:, None] * motion, direction * acceleration
@@ -185,7 +185,7 @@ def _amplitude_dependence(equations: Sequence[_Equations], ratios: Array, known:
     return difference_by_extra_columns(columns, extra, residual - columns @ ratios[known], spread)
 
 
-def _one_frequency(record: SweptRecord) -> bool:
+def has_one_frequency(record: SweptRecord) -> bool:
     """Whether the phase of the reference stays within half a turn of that of a constant frequency."""
     psi = record.reference.phase(record.time)
     return bool(np.ptp(psi - np.linspace(psi[0], psi[-1], psi.size)) < np.pi)
