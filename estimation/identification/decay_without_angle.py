@@ -25,7 +25,7 @@ from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Axis
 from scanner.errors import BadInput
-from scanner.lowpass import run_section, section_coefficients
+from scanner.lowpass import apply_lowpass
 from scanner.stages import Amdm, MotionSensor, Transimpedance
 
 MIN_CYCLES = 8.0
@@ -43,6 +43,10 @@ START_AMPLITUDES = (0.15, 0.5, 1.0)
 DERIVATIVE_STEP = 1e-4
 """Step of numerical derivatives by phase [rad] and log amplitude: their error is then below 1e-8."""
 
+SMALL_LOG_AMPLITUDE, MIN_AMPLITUDE_SDS = np.log(1e-2), 3.0
+"""An amplitude in units of theta0 at which the comb's law is its series to 1e-4, and the distance from it in standard
+deviations from which the amplitude is reported: below, its interval includes zero."""
+
 MIN_DECAY_SDS = 3.0
 """Rate of decay in standard deviations below which a motion is no decay: its interval then includes a motion without
 end."""
@@ -50,6 +54,8 @@ end."""
 
 def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, IdentifiedValue]:
     """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, behind a capacitive readout, ``amplitude_over_theta0``.
+
+    The amplitude is left out where a small one fits as well: then the signal has the shape of the comb's law near zero.
 
     Raises:
         BadInput: fewer than ``MIN_CYCLES`` cycles, or the signal does not follow a free decay.
@@ -91,7 +97,7 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
             speed = np.exp(x[2]) * envelope * (rate * np.cos(turn + x[3]) - decay * np.sin(turn + x[3])) / w0
             shape = -2.0 * u * shape * speed
         for cutoff in sections:
-            run_section(shape, *section_coefficients(cutoff, time[1] / finer), shape[0], shape[0])
+            shape = apply_lowpass(shape, cutoff, time[1] / finer)
         return np.stack([shape[::finer], np.ones(n)], axis=1)
 
     def residual(x: Array, n: int) -> Array:
@@ -133,7 +139,11 @@ def fit_decay_without_angle(axis: Axis, channel: Channel) -> dict[str, Identifie
         IdentifiedValue(2.0 * decay, float(loss_sd)),
     ]
     values = dict(zip(("k_over_J", "b_over_J"), widen(ratios, change.select([0, 1], scale)), strict=True))
-    if order == 2:
+    if order == 1:
+        return values
+    rest = np.delete(x, 2)
+    small = least_squares(lambda rest: residual(np.insert(rest, 2, SMALL_LOG_AMPLITUDE), y.size), rest, x_scale="jac")
+    if 2.0 * (small.cost - solution.cost) > MIN_AMPLITUDE_SDS**2 * variance:
         values["amplitude_over_theta0"] = IdentifiedValue(float(np.exp(x[2])), float(np.exp(x[2]) * sd[2]))
     return values
 
