@@ -375,7 +375,7 @@ def covariance_by_blocks(columns: Array, residual: Array, block: float) -> Array
     no more than 2 p blocks the residual is taken as white.
 
     Args:
-        columns: shape (n, p). residual: shape (n,). block: samples, much longer than the correlation.
+        columns: shape (n, p). residual: shape (n,). block: samples, longer than the correlation.
     """
     size = np.sqrt(np.einsum("ni,ni->i", columns, columns))
     scaled = columns / size
