@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.identification.agreement import IdentifiedValue, combine_values
+from estimation.identification.capacitance_profile import fit_capacitance_profile
 from estimation.identification.classification import (
     UNREFERENCED_DECAY,
     UNREFERENCED_DRIVE,
@@ -28,7 +29,6 @@ from estimation.identification.combination import (
 from estimation.identification.decay_without_angle import fit_decay_without_angle
 from estimation.identification.fits import (
     DrivenRecord,
-    fit_capacitance_profile,
     fit_mechanics,
 )
 from estimation.identification.lock_in_decay import fit_lock_in_decay

@@ -18,8 +18,9 @@ from estimation.identification.agreement import (
     difference_by_extra_columns,
     widen,
 )
+from estimation.identification.capacitance_profile import SECTION_SAMPLES_PER_CYCLE
 from estimation.identification.classification import shows_motion
-from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SECTION_SAMPLES_PER_CYCLE, SETTLE_TIME_S
+from estimation.identification.fits import MAX_RINGDOWN_RESIDUAL_RATIO, SETTLE_TIME_S
 from estimation.reference import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from scanner.arrays import Array
 from scanner.channel import Channel

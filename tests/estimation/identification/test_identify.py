@@ -11,8 +11,9 @@ import pytest
 from benchmarks.papers.sine import driven, linear_axis
 from benchmarks.papers.threshold import sensing_axis
 from estimation.identification.calibrate import identify
+from estimation.identification.capacitance_profile import fit_capacitance_profile
 from estimation.identification.classification import classify_recording
-from estimation.identification.fits import DrivenRecord, fit_capacitance_profile, fit_mechanics, fit_ringdown
+from estimation.identification.fits import DrivenRecord, fit_mechanics, fit_ringdown
 from phantoms.forward import InitialState, Plan, settled_state, simulate, simulate_trajectory
 from phantoms.waveforms import Constant, Sine, Sweep
 from recon.cli import main
