@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from errno import ENOSPC
 from itertools import chain
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +56,9 @@ def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
         BadInput: as :func:`check_folder`, or a new file has the place of an input.
     """
     check_folder(folder)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
+    temporary = folder.parent / f".{folder.name}.{uuid4().hex}.part"
     try:
+        temporary.mkdir(mode=0o700)
         yield temporary
         for path in temporary.iterdir():
             check_no_input(folder / path.name, *(Path(each) for each in inputs if isinstance(each, str | Path)))

@@ -258,3 +258,19 @@ def test_an_interrupt_waits_while_finished_output_takes_its_place(
     with pytest.raises(KeyboardInterrupt), handle_interrupts(), replaced(tmp_path / "other"):
         os.kill(os.getpid(), signal.SIGINT)
     assert not (tmp_path / "other").exists()
+
+
+def test_an_interrupt_as_soon_as_the_temporary_folder_exists_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = os.mkdir
+
+    def interrupted(*args: object, **options: object) -> None:
+        make(*args, **options)  # type: ignore[arg-type]
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(os, "mkdir", interrupted)
+    with pytest.raises(KeyboardInterrupt), handle_interrupts(), replacing_folder(tmp_path / "out"):
+        pytest.fail("the interrupt did not come")
+    monkeypatch.undo()
+    assert not list(tmp_path.iterdir())
