@@ -12,10 +12,10 @@ import numpy as np
 
 from benchmarks.papers.figures import Results, entry, figure
 from benchmarks.papers.threshold import sensing_axis
+from estimation.identification.agreement import IdentifiedValue
 from estimation.identification.capacitance_profile import fit_capacitance_profile
 from estimation.identification.fits import (
     DrivenRecord,
-    IdentifiedValue,
     fit_mechanics,
     fit_ringdown,
 )

@@ -11,7 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.identification.agreement import IdentifiedValue, amplitude_columns, difference_by_extra_columns, widen
+from estimation.identification.agreement import (
+    Differences,
+    IdentifiedValue,
+    amplitude_columns,
+    difference_by_extra_columns,
+    widen,
+)
 from estimation.identification.classification import shows_motion
 from estimation.least_squares import Z_95, fit_linear
 from scanner.arrays import Array
@@ -212,15 +218,7 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * variance
     sd = scale[:free] * np.sqrt(np.diag(covariance))
     w, loss = start[:2] + scale[:2] * x[:2]
-    theta, omega = start[2:4] + scale[2:4] * x[2:4]
-    by_theta, by_omega = fit.jac[:, 2] / scale[2], fit.jac[:, 3] / scale[3]
-    extra = amplitude_columns(
-        time,
-        loss,
-        omega / w * by_theta - w * theta * by_omega,
-        theta * by_theta + omega * by_omega,
-    )
-    change = difference_by_extra_columns(fit.jac / scale[:free], extra, residual)
+    change = _amplitude_dependence(fit.jac / scale[:free], residual, time, (w, loss), start[2:4] + scale[2:4] * x[2:4])
     names, chosen, factors = ["k_over_J", "b_over_J"], [0, 1], [2.0 * float(w), 1.0]
     found = [IdentifiedValue(float(w * w), float(2 * w * sd[0])), IdentifiedValue(float(loss), float(sd[1]))]
     inverse = start[4] + scale[4] * x[4:]
@@ -230,6 +228,25 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
         found.append(IdentifiedValue(J, factors[-1] * float(sd[4])))
     values = dict(zip(names, widen(found, change.select(chosen, factors)), strict=True))
     return values, residual
+
+
+def _amplitude_dependence(
+    columns: Array, residual: Array, time: Array, rates: tuple[float, float], state: Array
+) -> Differences:
+    """Changes of the parameters of a decay if its frequency and damping may depend on the amplitude, shape (p,).
+
+    Args:
+        columns: derivatives of the angle by square root of k/J, b/J, angle and velocity at the start, and any further
+            parameters, shape (n, p).
+        residual: of the fit [rad], time: [s], both of shape (n,).
+        rates: square root of k/J [rad/s], and b/J [1/s].
+        state: angle [rad] and velocity [rad/s] at the start, shape (2,).
+    """
+    (w, loss), (theta, omega) = rates, state
+    by_theta, by_omega = columns[:, 2], columns[:, 3]
+    by_phase = omega / w * by_theta - w * theta * by_omega
+    extra = amplitude_columns(time, loss, by_phase, theta * by_theta + omega * by_omega)
+    return difference_by_extra_columns(columns, extra, residual)
 
 
 def free_decay(time: Array, w: float, loss: float, theta: float, omega: float) -> Array:
