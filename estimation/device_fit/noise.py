@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -102,8 +103,14 @@ def flat_psd(data: Array, bins: int) -> Array:
 
 def periodogram(residual: Array) -> Array:
     """Hann-windowed power of every bin, scaled so that white noise of variance 1 has ``residual.size`` in each."""
-    window = np.hanning(residual.size)
+    window = _hann(residual.size)
     return np.abs(np.fft.rfft(residual * window)) ** 2 * (residual.size / np.sum(window**2))
+
+
+@lru_cache(maxsize=4)
+def _hann(samples: int) -> Array:
+    """Hann window; it takes as long as the transform, and the channels of a recording have few lengths."""
+    return np.hanning(samples)
 
 
 def noise_psd(

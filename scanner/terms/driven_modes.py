@@ -36,13 +36,16 @@ SOURCE = "Ewins, Modal Testing, Research Studies Press (2000), section 4.3: resi
 CHANNELS = {"sense": None, "angle": 0, "velocity": 1, "acceleration": 2}
 """Channels that contain the modes, and the time derivative that each holds; the sense signal has its readout's."""
 
+MAX_KEPT_SAMPLES = 1_000_000
+"""Length of a recording up to which the last sums of modes are kept: 16 MB each at this length. A diagnosis fits fewer
+samples, and evaluates them thousands of times."""
+
 
 @lru_cache(maxsize=256)
-def _transition(frequency: float, quality: float, step: float) -> tuple[Array, Array, Array]:
-    """Exact step of (q, q') of a mode under a voltage that is linear in between.
+def _transition(frequency: float, quality: float, step: float) -> Array:
+    """Exact step of (q, q') of a mode under a voltage that is linear in between, shape (2, 4).
 
-    Returns:
-        matrix of the state, shape (2, 2), and the effect of the voltage at the start and at the end, shape (2,) each.
+    Its columns are the effect of q, of q', of the voltage at the start and of that at the end.
     """
     from scipy.linalg import expm
 
@@ -51,41 +54,50 @@ def _transition(frequency: float, quality: float, step: float) -> tuple[Array, A
     system[0, 1], system[1, 0], system[1, 1], system[1, 2] = step, -(rate**2) * step, -rate / quality * step, step
     system[2, 3] = 1.0
     whole = expm(system)
-    return np.ascontiguousarray(whole[:2, :2]), whole[:2, 2] - whole[:2, 3], np.ascontiguousarray(whole[:2, 3])
+    return np.column_stack([whole[:2, :2], whole[:2, 2] - whole[:2, 3], whole[:2, 3]])
 
 
 @register_jitable(forceinline=True)
-def _advance(q, rate, before, after, matrix, first, last):  # type: ignore[no-untyped-def]
+def _advance(q, rate, before, after, step):  # type: ignore[no-untyped-def]
     return (
-        matrix[0, 0] * q + matrix[0, 1] * rate + first[0] * before + last[0] * after,
-        matrix[1, 0] * q + matrix[1, 1] * rate + first[1] * before + last[1] * after,
+        step[0, 0] * q + step[0, 1] * rate + step[0, 2] * before + step[0, 3] * after,
+        step[1, 0] * q + step[1, 1] * rate + step[1, 2] * before + step[1, 3] * after,
     )
 
 
 @njit(cache=True, nogil=True)
-def _run(voltage, matrix, first, last, q, rate):  # type: ignore[no-untyped-def]
+def _run(voltage, step, q, rate):  # type: ignore[no-untyped-def]
     out = np.empty((2, voltage.size))
     for i in range(voltage.size):
         if i:
-            q, rate = _advance(q, rate, voltage[i - 1], voltage[i], matrix, first, last)
+            q, rate = _advance(q, rate, voltage[i - 1], voltage[i], step)
         out[0, i], out[1, i] = q, rate
     return out
 
 
 @njit(cache=True, nogil=True)
-def _add_mode(total, voltage, slope, matrix, first, last, square, damping, gain, gain_rate, order):  # type: ignore[no-untyped-def]
-    """Add a mode in the time derivative ``order``, and ``gain_rate`` times the next one, without arrays in between."""
-    q, rate = voltage[0] / square, 0.0
+def _sum_of_modes(voltage, slope, steps, squares, dampings, gains, gain_rates, order):  # type: ignore[no-untyped-def]
+    """Sum of the time derivatives ``order`` of all modes times their gains, and of the next ones times ``gain_rates``.
+
+    The modes advance together: the steps of one wait for each other, those of different modes do not.
+    """
+    total = np.zeros(voltage.size)
+    q, rate = voltage[0] / squares, np.zeros(squares.size)
     for i in range(voltage.size):
-        if i:
-            q, rate = _advance(q, rate, voltage[i - 1], voltage[i], matrix, first, last)
-        acceleration = voltage[i] - damping * rate - square * q
-        if order == 0:
-            total[i] += gain * q + gain_rate * rate
-        elif order == 1:
-            total[i] += gain * rate + gain_rate * acceleration
-        else:
-            total[i] += gain * acceleration + gain_rate * (slope[i] - damping * acceleration - square * rate)
+        value = 0.0
+        for m in range(squares.size):
+            if i:
+                q[m], rate[m] = _advance(q[m], rate[m], voltage[i - 1], voltage[i], steps[m])
+            acceleration = voltage[i] - dampings[m] * rate[m] - squares[m] * q[m]
+            if order == 0:
+                value += gains[m] * q[m] + gain_rates[m] * rate[m]
+            elif order == 1:
+                value += gains[m] * rate[m] + gain_rates[m] * acceleration
+            else:
+                jerk = slope[i] - dampings[m] * acceleration - squares[m] * rate[m]
+                value += gains[m] * acceleration + gain_rates[m] * jerk
+        total[i] = value
+    return total
 
 
 def mode_response(voltage: Array, frequency: float, quality: float, step: float) -> Array:
@@ -97,7 +109,7 @@ def mode_response(voltage: Array, frequency: float, quality: float, step: float)
         step: between samples [s].
     """
     rate = 2.0 * np.pi * frequency
-    q, velocity = _run(np.ascontiguousarray(voltage), *_transition(frequency, quality, step), voltage[0] / rate**2, 0.0)
+    q, velocity = _run(np.ascontiguousarray(voltage), _transition(frequency, quality, step), voltage[0] / rate**2, 0.0)
     acceleration = voltage - rate / quality * velocity - rate**2 * q
     return np.stack(
         [q, velocity, acceleration, np.gradient(voltage, step) - rate / quality * acceleration - rate**2 * velocity]
@@ -106,13 +118,22 @@ def mode_response(voltage: Array, frequency: float, quality: float, step: float)
 
 def _motion(values: Sequence[float], context: SignalContext, order: int) -> Array:
     """Sum of all modes, in the time derivative ``order``, shape (n,)."""
-    voltage, step = np.ascontiguousarray(context.voltage), context.step
-    total, slope = np.zeros_like(voltage), np.gradient(voltage, step)
-    for i in range(int(values[0])):
-        frequency, quality, gain, gain_rate = values[2 + 4 * i : 6 + 4 * i]
-        rate, transition = 2.0 * np.pi * frequency, _transition(frequency, quality, step)
-        _add_mode(total, voltage, slope, *transition, rate**2, rate / quality, gain, gain_rate / rate, order)
-    return total
+    voltage = np.ascontiguousarray(context.voltage, float)
+    sum_of = _last_sums if voltage.size <= MAX_KEPT_SAMPLES else _last_sums.__wrapped__
+    return np.asarray(sum_of(voltage.tobytes(), context.step, order, tuple(values)))
+
+
+@lru_cache(maxsize=4)
+def _last_sums(voltage: bytes, step: float, order: int, values: Sequence[float]) -> Array:
+    """The sum of all modes under a voltage. A fit of other parts of the device needs the same one at every step."""
+    volts = np.frombuffer(voltage)
+    frequency, quality, gain, gain_rate = np.reshape(values[2:], (int(values[0]), 4)).T
+    rate, slope = 2.0 * np.pi * frequency, np.gradient(volts, step)
+    steps = np.array([_transition(f, q, step) for f, q in zip(frequency, quality, strict=True)])
+    steps = steps.reshape(-1, 2, 4)
+    total = _sum_of_modes(volts, slope, steps, rate**2, rate / quality, gain, gain_rate / rate, order)
+    total.flags.writeable = False
+    return np.asarray(total)
 
 
 def _sense(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
