@@ -1,6 +1,6 @@
 """Costs of a reconstruction by the length of the recording, by the pixels of the picture and by the number of axes.
 
-python -m benchmarks.scale [disk|disk_long|live|length|pixels|axes|longest ...]
+python -m benchmarks.scale [disk|disk_long|disk_sensors|live|length|pixels|axes|longest ...]
 
 A scan without drift repeats every 0.1 s, so that one simulated period makes a recording of any length. Its noise
 repeats too, which does not change the cost of the tracker. Each case runs in a separate process, whose peak memory is
@@ -33,6 +33,7 @@ from phantoms.experiment import Experiment, simulate_experiment
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
 from recon.steps.reconstruction import Options
+from scanner.channel import make_channel
 from scanner.device import Device
 from scanner.recording import Recording
 from scanner.stages import Amdm
@@ -100,6 +101,16 @@ def simulate_period(device: Device | None = None) -> Recording:
     experiment = Experiment(duration=0.2, drift={})
     recording, _ = simulate_experiment(experiment if device is None else replace(experiment, device=device), seed=1)
     return recording.slice(0.1, 0.2)
+
+
+def simulate_sensors() -> Recording:
+    """0.1 s of the demo's scan with two angle channels in place of drives and sense signal."""
+    recording, truth = simulate_experiment(Experiment(duration=0.2, drift={}), seed=1)
+    channels = {"intensity": recording["intensity"]}
+    for name in ("angle_x", "angle_y"):
+        values, _ = truth[name]  # type: ignore[misc]
+        channels[name] = make_channel(name, values, unit="rad", sample_rate=SAMPLE_RATE_HZ)
+    return replace(recording, channels=MappingProxyType(channels)).slice(0.1, 0.2)
 
 
 def with_separate_readouts(device: Device) -> Device:
@@ -194,20 +205,26 @@ def measure_axes(folder: Path) -> Results:
 
 def measure_disk(folder: Path) -> Results:
     """Costs of the command on 10 s of two axes from the disk. A run on 1 s before it compiles."""
-    reconstruct_from_disk(folder, 1.0)
-    return add_prefix("disk", reconstruct_from_disk(folder, 10.0))
+    reconstruct_from_disk(simulate_period(), folder, 1.0)
+    return add_prefix("disk", reconstruct_from_disk(simulate_period(), folder, 10.0))
 
 
 def measure_long_disk(folder: Path) -> Results:
     """Costs of the command on 100 s: 4 GB of samples, and 4 GB of angles that the command writes."""
-    return add_prefix("disk_long", reconstruct_from_disk(folder, 100.0))
+    return add_prefix("disk_long", reconstruct_from_disk(simulate_period(), folder, 100.0))
 
 
-def reconstruct_from_disk(folder: Path, seconds: float) -> Results:
-    """Costs of the command ``reconstruct`` on a file of ``seconds`` of the scan."""
+def measure_sensors(folder: Path) -> Results:
+    """Costs of the command on 10 s of two position sensors from the disk. A run on 1 s before it compiles."""
+    reconstruct_from_disk(simulate_sensors(), folder, 1.0)
+    return add_prefix("disk_sensors", reconstruct_from_disk(simulate_sensors(), folder, 10.0))
+
+
+def reconstruct_from_disk(period: Recording, folder: Path, seconds: float) -> Results:
+    """Costs of the command ``reconstruct`` on a file of ``seconds`` of the scan, whose period is given."""
     path = folder / "recording.h5"
-    with Recording.open(write_period(simulate_period(), folder)) as period:
-        repeat_period(period, round(seconds * SAMPLE_RATE_HZ)).write(path)
+    with Recording.open(write_period(period, folder)) as stored:
+        repeat_period(stored, round(seconds * SAMPLE_RATE_HZ)).write(path)
     return time_command("reconstruct", str(path), "-o", str(folder / "out"))
 
 
@@ -276,6 +293,7 @@ def write_period(recording: Recording, folder: Path) -> Path:
 PARTS: dict[str, Callable[[Path], Results]] = {
     "disk": measure_disk,
     "disk_long": measure_long_disk,
+    "disk_sensors": measure_sensors,
     "live": measure_live,
     "length": measure_lengths,
     "pixels": measure_pixels,

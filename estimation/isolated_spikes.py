@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from estimation.signals import robust_sd
 from scanner.arrays import Array, Index
+from scanner.channel import READ_CHUNK_SAMPLES, Channel
 
 MIN_SPIKE_SDS = 8.0
 """Distance of a spike from the cubic through its neighbours, in robust standard deviations of that distance: noise
@@ -25,62 +29,86 @@ NEIGHBOURS = {-2: FAR_WEIGHT, -1: NEAR_WEIGHT, 1: NEAR_WEIGHT, 2: FAR_WEIGHT}
 REACH = 2
 
 
-def find_spikes(values: Array) -> Index:
-    """Samples that are isolated spikes, increasing.
+class Spikes(NamedTuple):
+    """Isolated spikes of a signal.
+
+    Attributes:
+        at: numbers of the samples, increasing, shape (m,).
+        values: of the cubics through the neighbours there, shape (m,).
+    """
+
+    at: Index
+    values: Array
+
+
+def find_spikes(channel: Channel) -> Spikes:
+    """Samples that are isolated spikes.
 
     Without a spike the neighbours on one side at least fit those around them. Those of a step or of the flyback of a
     raster do not. Spikes that are one or two samples apart are not found. A corner of a clipped signal is no spike.
 
     Args:
-        values: shape (n,).
+        channel: of shape (n,).
     """
-    if values.size <= 4 * REACH:
-        return np.zeros(0, np.int64)
-    distance = _distance(values)
-    found = _find_far(distance, np.isfinite(distance))
-    if not found.size:
-        return found
-    near_rail = _near_rail(values, found)
-    if not near_rail.any():
-        return found
-    found = _find_far(distance, np.isfinite(distance) & ~near_rail)  # clipped samples have no noise
-    return found[~near_rail[found]]
+    spikes = _find_far(channel, ())
+    rails = _rails(channel, spikes.at) if spikes.at.size else []
+    return _find_far(channel, rails) if rails else spikes  # clipped samples have no noise
 
 
-def _find_far(distance: Array, typical: NDArray[np.bool_]) -> Index:
-    """Samples far from the cubic whose neighbours fit, in the noise of the ``typical`` samples; all of shape (n,)."""
-    each = slice(None, None, max(1, distance.size // MAX_NOISE_SAMPLES))
-    limit = MIN_SPIKE_SDS * robust_sd(distance[each][typical[each]]) if typical[each].any() else 0.0
-    if not limit > 0.0:
-        return np.zeros(0, np.int64)
-    inner = distance[2 * REACH : -2 * REACH]
-    found = 2 * REACH + np.flatnonzero((inner > limit) | (inner < -limit))
-    fits = {
-        step: np.abs(distance[found + step] + weight * distance[found]) <= limit for step, weight in NEIGHBOURS.items()
-    }
-    return found[(fits[-2] & fits[-1]) | (fits[1] & fits[2])]
+def _pieces(channel: Channel) -> Iterator[tuple[int, Array]]:
+    """Successive parts of a channel: number of the first sample, and the samples with 2 REACH more on either side."""
+    last = channel.size - 2 * REACH
+    for first in range(2 * REACH, last, READ_CHUNK_SAMPLES):
+        yield first, channel.read(first - 2 * REACH, min(first + READ_CHUNK_SAMPLES, last) + 2 * REACH)
 
 
-def _near_rail(values: Array, found: Index) -> NDArray[np.bool_]:
-    """Samples within reach of one at a rail, shape (n,): the cubic through it leaves the range of the converter.
+def _find_far(channel: Channel, rails: Sequence[float]) -> Spikes:
+    """Samples far from the cubic whose neighbours fit, in the noise of all samples; none near one of the ``rails``."""
+    inner, step = slice(2 * REACH, -2 * REACH), max(1, channel.size // MAX_NOISE_SAMPLES)
+    typical = [np.zeros(0)]
+    for first, values in _pieces(channel):
+        distance = np.where(_near(values, rails), np.nan, _distance(values))[inner][-first % step :: step]
+        typical.append(distance[np.isfinite(distance)])
+    noise = np.concatenate(typical)
+    limit = MIN_SPIKE_SDS * robust_sd(noise) if noise.size else 0.0
+    index, repaired = [np.zeros(0, np.int64)], [np.zeros(0)]
+    for first, values in _pieces(channel) if limit > 0.0 else ():
+        distance = _distance(values)
+        far = 2 * REACH + np.flatnonzero((distance[inner] > limit) | (distance[inner] < -limit))
+        fits = {
+            each: np.abs(distance[far + each] + weight * distance[far]) <= limit for each, weight in NEIGHBOURS.items()
+        }
+        far = far[((fits[-2] & fits[-1]) | (fits[1] & fits[2])) & ~_near(values, rails)[far]]
+        index.append(first - 2 * REACH + far)
+        repaired.append(values[far] - distance[far])
+    return Spikes(np.concatenate(index), np.concatenate(repaired))
 
-    A rail is the largest or the smallest value of all samples that are not ``found``, if successive ones stand at it.
-    """
-    others, near = np.delete(values, found), np.zeros(values.size, np.bool_)
-    for extreme in (np.nanmin(others), np.nanmax(others)):
-        at_extreme = values == extreme
-        if (at_extreme[:-1] & at_extreme[1:]).any():
-            near |= np.convolve(at_extreme, np.ones(2 * REACH + 1), "same") > 0.5
+
+def _rails(channel: Channel, spikes: Index) -> list[float]:
+    """The largest and the smallest value of all samples that are no spike, if successive ones stand at it."""
+    pieces = [(np.nanmin(others), np.nanmax(others)) for others in _others(channel, spikes)]
+    extremes = [float(min(low for low, _ in pieces)), float(max(high for _, high in pieces))]
+    return [
+        extreme
+        for extreme in extremes
+        if any(np.any((values[:-1] == extreme) & (values[1:] == extreme)) for _, values in _pieces(channel))
+    ]
+
+
+def _others(channel: Channel, spikes: Index) -> Iterator[Array]:
+    """Successive parts of a channel without its spikes."""
+    for first, values in _pieces(channel):
+        begin = first - 2 * REACH
+        low, high = np.searchsorted(spikes, [begin, begin + values.size])
+        yield np.delete(values, spikes[low:high] - begin)
+
+
+def _near(values: Array, rails: Sequence[float]) -> NDArray[np.bool_]:
+    """Samples within reach of one at a rail, shape (n,): the cubic through it leaves the range of the converter."""
+    near = np.zeros(values.size, np.bool_)
+    for rail in rails:
+        near |= np.convolve(values == rail, np.ones(2 * REACH + 1), "same") > 0.5
     return near
-
-
-def without_spikes(values: Array, spikes: Index) -> Array:
-    """The values, shape (n,), with each isolated spike on the cubic through its neighbours."""
-    if not spikes.size:
-        return values
-    repaired = values.copy()
-    repaired[spikes] -= _distance(values)[spikes]
-    return repaired
 
 
 @njit(cache=True)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scanner.arrays import Array, Index
+from scanner.channel import READ_CHUNK_SAMPLES, Channel
 
 MAX_FILLED_GAP_PERIODS = 1.0 / 16.0
 """Length of a gap over the period of the motion up to which it is interpolated: the polynomial is then off by less than
@@ -27,43 +28,49 @@ shorter: other gaps nearby do not make it wider than the longest gap alone would
 
 
 class Filled(NamedTuple):
-    """A signal without missing samples.
+    """What stands in the place of missing samples.
 
     Attributes:
-        values: interpolated in short gaps, on a straight line in long ones, shape (n,).
+        at: numbers of the missing samples, increasing, shape (m,).
+        values: interpolated in short gaps, on a straight line in long ones, shape (m,).
         filled: number of samples that were interpolated.
         left_out: long gaps, and short ones without enough samples around: increasing ranges (first, stop).
     """
 
+    at: Index
     values: Array
     filled: int
     left_out: list[tuple[int, int]]
 
 
-def fill_missing(values: Array, longest: int) -> Filled:
+def fill_missing(channel: Channel, longest: int) -> Filled:
     """Fill the samples that are not finite.
 
     Args:
-        values: shape (n,), at least one of them finite.
+        channel: of shape (n,), at least one sample of it finite.
         longest: gap that is interpolated [samples]; 0 for none.
     """
-    known = np.isfinite(values)
-    if known.all():
-        return Filled(values, 0, [])
-    at = np.arange(values.size)
-    usable = at[known]
-    out = np.interp(at, usable, values[known])
+    pieces = (
+        (first, channel.stored(first, first + READ_CHUNK_SAMPLES))
+        for first in range(0, channel.size, READ_CHUNK_SAMPLES)
+    )
+    missing = np.concatenate([first + np.flatnonzero(~np.isfinite(piece)) for first, piece in pieces])
+    if not missing.size:
+        return Filled(missing, np.zeros(0), 0, [])
+    values = channel.read()
+    usable = np.delete(np.arange(values.size), missing)
+    values[missing] = np.interp(missing, usable, values[usable])
     filled, left_out = 0, list[tuple[int, int]]()
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], known, [True]])))
-    for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for gap in np.split(missing, 1 + np.flatnonzero(np.diff(missing) > 1)):
+        first, stop = int(gap[0]), int(gap[-1]) + 1
         reach = MAX_SPAN_GAPS * max(longest, DEGREE)
         around = None if stop - first > longest else _samples_around(usable, first, stop, reach)
         if around is None:
             left_out.append((first, stop))
             continue
-        out[first:stop] = _weights(tuple((around - first).tolist()), stop - first) @ values[around]
+        values[first:stop] = _weights(tuple((around - first).tolist()), stop - first) @ values[around]
         filled += stop - first
-    return Filled(out, filled, left_out)
+    return Filled(missing, values[missing], filled, left_out)
 
 
 def _samples_around(usable: Index, first: int, stop: int, reach: int) -> Index | None:

@@ -86,7 +86,7 @@ def spiral_picture(recording: Recording, device: Device) -> tuple[Picture, Array
     """Height [nm] over the field of the device, and the path of the samples, shape (2, n) [um]."""
     scan = device.require_scan()
     axes = estimate(recording, device).axes
-    path = np.array([axes[name].angle.values for name in ("x", "y")])
+    path = np.array([axes[name].angle.read() for name in ("x", "y")])
     grid = Grid(PIXELS, PIXELS, scan.half_angle_x, scan.half_angle_y)
     return map_samples(*path, recording["intensity"].read(), grid), path
 

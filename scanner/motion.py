@@ -9,15 +9,12 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.angle_tracks import AdvancedAngle
 from scanner.arrays import Array, Complex
-from scanner.interpolation import interpolate_cubic
 
 if TYPE_CHECKING:
     import xarray
 
-
-SAMPLES_AT_ONCE = 1 << 18
-"""Samples of an angle that are interpolated together, so that intermediate results need little memory."""
 
 UNKNOWN_PHASE_SD_RAD = float(np.pi / np.sqrt(3.0))
 """Standard deviation of a phase of which nothing is known: the largest that an estimator states."""
@@ -26,8 +23,9 @@ UNKNOWN_PHASE_SD_RAD = float(np.pi / np.sqrt(3.0))
 class AngleTrack(Protocol):
     """Mechanical angle of one axis on a uniform clock.
 
-    Every angle in a :class:`Motion` has these attributes and methods. Implementations: :class:`SampledAngle` (stored
-    samples), ``estimation.tracker.angle_synthesis.PhasorAngle`` (synthesised from slow phase and amplitude) and
+    Every angle in a :class:`Motion` has these attributes and methods. Implementations: :class:`SampledAngle` (an
+    array), ``scanner.angle_tracks.ChannelAngle`` (samples of a position signal) and ``AdvancedAngle`` (another track,
+    interpolated), ``estimation.tracker.angle_synthesis.PhasorAngle`` (synthesised from slow phase and amplitude) and
     ``estimation.optics.correction.BeamAngle`` (a track after the device's optics terms).
     """
 
@@ -122,14 +120,9 @@ class SampledAngle:
         """Return the same motion with the opposite sign."""
         return replace(self, values=-self.values)
 
-    def advanced(self, time: Array, phase: Array, frequency: Array) -> SampledAngle:
+    def advanced(self, time: Array, phase: Array, frequency: Array) -> AdvancedAngle:
         """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``AngleTrack``)."""
-        lead, values = phase / (2.0 * np.pi * frequency), np.empty(self.size)
-        for first in range(0, self.size, SAMPLES_AT_ONCE):
-            index = np.arange(first, min(first + SAMPLES_AT_ONCE, self.size))
-            shift = np.interp(self.start + index / self.sample_rate, time, lead) * self.sample_rate
-            values[index] = interpolate_cubic(self.values, index + shift)
-        return replace(self, values=values)
+        return AdvancedAngle(self, time, phase / (2.0 * np.pi * frequency))
 
     def phasors(self) -> None:
         """Return None: samples are not synthesised from phasors."""

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimation.filters.to_motion import BLOCK_CYCLES, resample_to_clock
+from estimation.filters.measured_motion import MIN_BLOCKS, axis_motion_from_angle
+from estimation.filters.to_motion import BLOCK_CYCLES
 from estimation.held_samples import find_held_runs
 from estimation.initial import fit_initial_motion
-from estimation.isolated_spikes import find_spikes, without_spikes
+from estimation.isolated_spikes import find_spikes
 from estimation.lock_in_channels import lock_in_angle
 from estimation.missing_samples import MAX_FILLED_GAP_PERIODS, Filled, fill_missing
 from estimation.reference import (
@@ -25,34 +26,21 @@ from estimation.reference import (
 )
 from estimation.short_tone import fit_short_tone
 from estimation.signals import (
-    NOISE_SAMPLES,
     intensity_clock,
     is_capacitive,
     phase_reference,
     sense_channels,
-    white_noise_sd,
 )
-from scanner.arrays import Array, Index
+from scanner.arrays import Index
 from scanner.channel import Channel, check_signal, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
-from scanner.lock_in import block_phasors, phasor_noise, slow_clock_block
-from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion, SampledAngle
 from scanner.recording import Recording
+from scanner.replaced_samples import with_replaced
 from scanner.stages import Position
 from scanner.wording import counted, percent
-
-MIN_NOISE_SAMPLES_PER_PERIOD = 20.0
-"""Samples per period from which the sixth differences of a signal show its noise: those of the motion itself are then
-below 3e-5 of its amplitude."""
-
-MIN_NOISE_EXCESS = 1.5
-"""White noise in a position signal over ``noise_sd`` of its readout from which the measured noise is used, and a note
-says so. Data sheets state noise to some ten percent."""
-
-MIN_BLOCKS = 2
-"""Blocks that a motion's slow clock has at least."""
 
 CONSTANT_POINTS = 200
 """Points of the slow clock of a constant motion: only a chirped drive's frequency changes along it."""
@@ -105,32 +93,33 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     measured = any(f"{kind}_{name}" in recording for kind in ("sense", "angle"))
     if f"amplitude_{name}" in recording and "intensity" in recording and not measured:
         light = recording["intensity"]
-        angle = lock_in_angle(recording, device.axis(name), light.time())
-        channel = make_channel(f"phase_{name}", angle, unit="rad", sample_rate=light.sample_rate, start=light.start)
-        reference = reference_of_any_waveform(recording, device, name, channel)
-        return axis_motion_from_angle(angle, channel, reference, None, intensity_clock(recording, channel)), []
+        values = lock_in_angle(recording, device.axis(name), light.time())
+        angle = make_channel(f"phase_{name}", values, unit="rad", sample_rate=light.sample_rate, start=light.start)
+        reference = reference_of_any_waveform(recording, device, name, angle)
+        return axis_motion_from_angle(angle, reference, None, intensity_clock(recording, angle)), []
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel, gaps_ok=True)
-    values = channel.read()
-    whole = _with_samples(channel, fill_missing(values, 0).values)
+    channel = replace(channel, raw=channel.stored(), first=0, stop=channel.size)  # the file may be closed later
+    straight = fill_missing(channel, 0)
+    whole = with_replaced(channel, straight.at, straight.values)
     reference = reference_of_any_waveform(recording, device, name, whole)
-    longest = 1 if reference.kind == "blocks" else MAX_FILLED_GAP_PERIODS * channel.sample_rate / reference.frequency
-    repaired = fill_missing(values, int(longest))
-    angle = (repaired.values - zero) / scale
-    spikes = find_spikes(angle)
-    angle = without_spikes(angle, spikes)
     if reference.kind in ("drive", "half-drive") and channel.sample_rate < MIN_SAMPLES_PER_PERIOD * reference.frequency:
         raise sampled_too_slowly(channel, "a motion", reference.frequency)
+    longest = 1 if reference.kind == "blocks" else MAX_FILLED_GAP_PERIODS * channel.sample_rate / reference.frequency
+    filled = fill_missing(channel, int(longest))
+    repaired = with_replaced(channel, filled.at, filled.values)
+    spikes = find_spikes(repaired)
+    repaired = with_replaced(repaired, spikes.at, spikes.values)
+    angle = replace(repaired, unit="rad", gain=repaired.gain / scale, offset=(repaired.offset - zero) / scale)
     held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
-    clock, unknown = intensity_clock(recording, channel), sorted([*held, *repaired.left_out])
-    motion = axis_motion_from_angle(angle, channel, reference, noise_sd, clock, unknown)
-    notes = [*_describe_held(channel, held), *_describe_missing(channel, repaired), *_describe_spikes(channel, spikes)]
+    clock, unknown = intensity_clock(recording, channel), sorted([*held, *filled.left_out])
+    motion = axis_motion_from_angle(angle, reference, noise_sd, clock, unknown)
+    notes = [
+        *_describe_held(channel, held),
+        *_describe_missing(channel, filled),
+        *_describe_spikes(channel, spikes.at),
+    ]
     return motion, [*notes, *_describe_noise(channel, abs(scale), noise_sd, motion.angle_noise_sd)]
-
-
-def _with_samples(channel: Channel, values: Array) -> Channel:
-    """The channel with other samples, shape (n,), in its unit."""
-    return replace(channel, raw=values, first=0, stop=channel.size, gain=1.0, offset=0.0)
 
 
 def _describe_noise(channel: Channel, gain: float, stated: float | None, found: float) -> list[str]:
@@ -237,77 +226,3 @@ def reference_of_any_waveform(recording: Recording, device: Device, name: str, c
                 return found
     lowest = MIN_BLOCKS * (BLOCK_CYCLES + 1.0) * channel.sample_rate / channel.size
     return block_reference(lowest, channel.start, channel.end)
-
-
-def axis_motion_from_angle(
-    angle: Array,
-    channel: Channel,
-    reference: PhaseReference,
-    noise_sd: float | None,
-    clock: tuple[float, float, int],
-    held: Sequence[tuple[int, int]] = (),
-) -> AxisMotion:
-    """The motion of one axis from its measured angle.
-
-    Args:
-        angle: at the samples of ``channel``, shape (n,) [rad].
-        noise_sd: white noise of the sensor, per sample [rad], as stated; measured where None, and where an oversampled
-            motion shows ``MIN_NOISE_EXCESS`` times as much.
-        clock: sample rate [Hz], start [s] and number of samples of the angle in the result.
-        held: ranges of samples that are missing or at which the sensor was stopped. The angle in the result is not
-            known there (NaN). Phase and amplitude are interpolated through them, and the phase has the standard
-            deviation of an unknown one.
-
-    Raises:
-        BadInput: the channel is shorter than two blocks, or is missing or was stopped in all but one.
-    """
-    rate = channel.sample_rate
-    block = slow_clock_block(reference.frequency, rate, BLOCK_CYCLES, channel.size)
-    stopped = np.zeros(angle.size, bool)
-    for first, stop in held:
-        stopped[first:stop] = True
-    time, phasors = block_phasors(angle, rate, channel.start, reference.frequency, block)
-    if time.size < MIN_BLOCKS:
-        raise BadInput(
-            f"is too short to determine its phase: {2 * block} samples are needed",
-            file=channel.file,
-            channel=channel.name,
-            hint="record for longer",
-        )
-    by_block = stopped[: time.size * block].reshape(-1, block)
-    known = ~(by_block.all(axis=1) if reference.kind == "blocks" else by_block.any(axis=1))
-    if known.sum() < MIN_BLOCKS:
-        raise BadInput(
-            "stands at one value, or lacks samples, in nearly all of the recording, as a sensor that was stopped",
-            file=channel.file,
-            channel=channel.name,
-            hint="check the sensor and its cable, or cut the recording",
-        )
-    amplitude = np.interp(time, time[known], np.abs(phasors[known]))
-    if reference.kind == "blocks":  # the part at a frequency that is no line says nothing of the range
-        amplitude = np.full(time.size, 0.5 * float(np.ptp(angle[~stopped])))
-    is_noise_known = noise_sd is not None or rate >= MIN_NOISE_SAMPLES_PER_PERIOD * reference.frequency
-    if noise_sd is None or rate >= MIN_NOISE_SAMPLES_PER_PERIOD * reference.frequency:
-        measured = white_noise_sd(angle[:NOISE_SAMPLES][~stopped[:NOISE_SAMPLES]])
-        if noise_sd is None or measured > MIN_NOISE_EXCESS * noise_sd:
-            noise_sd = measured
-    phase = np.interp(time, time[known], reference.relative_phase(time[known], phasors[known]))
-    phase_sd = noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block)
-    phase_sd[by_block.mean(axis=1) >= 0.5] = UNKNOWN_PHASE_SD_RAD
-    resampled = resample_to_clock(angle, channel, clock)
-    if held:
-        resampled = resampled.copy()
-    for first, stop in held:
-        begin, end = (round((channel.start + at / rate - clock[1]) * clock[0]) for at in (first, stop))
-        resampled[max(begin, 0) : max(end, 0)] = np.nan
-    return AxisMotion(
-        time=time,
-        phase=phase,
-        amplitude=amplitude,
-        frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
-        phase_sd=np.minimum(phase_sd, UNKNOWN_PHASE_SD_RAD),
-        angle=SampledAngle(resampled, clock[0], clock[1]),
-        reference=reference.kind,
-        sign=f"known: {channel.name}",
-        angle_noise_sd=noise_sd if is_noise_known else 0.0,
-    )

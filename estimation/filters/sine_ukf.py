@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from estimation.filters.baselines import axis_motion_from_angle, find_position_signal, reference_from_drive_or_signal
+from estimation.filters.baselines import find_position_signal, reference_from_drive_or_signal
+from estimation.filters.measured_motion import axis_motion_from_angle
 from estimation.signals import intensity_clock
 from scanner.arrays import Array
 from scanner.channel import check_signal
@@ -17,6 +18,7 @@ from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.replaced_samples import with_samples
 from scanner.stages import Position
 
 SIGMA_POINT_SPREAD = 3.0
@@ -128,6 +130,7 @@ def estimate_sine_ukf(recording: Recording, device: Device) -> Motion:
         noise, wander = measure_noise_and_phase_walk(angle - fitted[2], turn, amplitude, cycle)
         phase = track_sine_phase(angle - fitted[2], turn, amplitude, noise, wander)
         clock = intensity_clock(recording, channel)
-        axes[name] = axis_motion_from_angle(amplitude * np.sin(phase) + fitted[2], channel, reference, noise, clock)
+        filtered = with_samples(channel, amplitude * np.sin(phase) + fitted[2])
+        axes[name] = axis_motion_from_angle(filtered, reference, noise, clock)
         info[name] = {"amplitude": amplitude, "offset": float(fitted[2]), "phase_wander_a_sample": wander}
     return Motion(axes, "sine-ukf", info)

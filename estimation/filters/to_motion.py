@@ -131,20 +131,6 @@ def synthesize_angle(
     return SampledAngle(angle, rate, start)
 
 
-def resample_to_clock(values: Array, channel: Channel, clock: Clock) -> Array:
-    """Values at the samples of ``channel``, shape (n,), resampled to a clock by cubic splines; NaN outside."""
-    rate, start, n = clock
-    first = (start - channel.start) * channel.sample_rate
-    if rate == channel.sample_rate and abs(first - round(first)) < 1e-6 and 0 <= round(first) <= values.size - n:
-        return values[round(first) : round(first) + n]
-    from scipy.interpolate import CubicSpline
-
-    time = start + np.arange(n) / rate
-    resampled = CubicSpline(channel.time(), values)(time)
-    resampled[(time < channel.start) | (time > channel.end)] = np.nan
-    return resampled
-
-
 def _extrapolate(time: Array, knots: Array, values: Array) -> Array:
     """Linear interpolation, continued with the end's slope beyond the knots."""
     first, last = ((values[i + 1] - values[i]) / (knots[i + 1] - knots[i]) for i in (0, -2))

@@ -112,16 +112,15 @@ def axis_motion_from_edges(
         lag = np.zeros(found.time.size)
     phase = found.phase + lag
     spline = CubicHermiteSpline(found.time, phase, 2 * np.pi * found.frequency)
-    time = start + np.arange(n) / rate
-    angle = np.empty(n)
+    beyond, angle = MAX_BEYOND_PERIODS / float(np.median(found.frequency)), np.empty(n)
     for first in range(0, n, CHUNK_SAMPLES):
-        part = slice(first, first + CHUNK_SAMPLES)
-        u = spline(time[part])
-        relative = 0.0 if harmonics is None else harmonics.at(knots, time[part]).deviation(u)
-        angle[part] = np.interp(time[part], found.time, amplitude) * (np.sin(u) + relative)
-    beyond = MAX_BEYOND_PERIODS / float(np.median(found.frequency))
-    is_known = np.interp(time, found.time, found.phase_sd) < UNKNOWN_PHASE_SD_RAD
-    angle[~is_known | (time < found.time[0] - beyond) | (time > found.time[-1] + beyond)] = np.nan
+        time = start + np.arange(first, min(first + CHUNK_SAMPLES, n)) / rate
+        u = spline(time)
+        relative = 0.0 if harmonics is None else harmonics.at(knots, time).deviation(u)
+        values = np.interp(time, found.time, amplitude) * (np.sin(u) + relative)
+        is_known = np.interp(time, found.time, found.phase_sd) < UNKNOWN_PHASE_SD_RAD
+        values[~is_known | (time < found.time[0] - beyond) | (time > found.time[-1] + beyond)] = np.nan
+        angle[first : first + CHUNK_SAMPLES] = values
     motion = AxisMotion(
         time=knots,
         phase=phase[::step] - reference.phase(knots),

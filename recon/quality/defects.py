@@ -14,7 +14,7 @@ from estimation.held_samples import find_held_runs, slowest_motions
 from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true, subtract_ranges, to_sample_ranges
 from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, READ_CHUNK_SAMPLES, Channel
 from scanner.device import Device
-from scanner.motion import Motion, SampledAngle
+from scanner.motion import AngleTrack, Motion
 from scanner.recording import Recording
 from scanner.wording import percent
 
@@ -137,9 +137,15 @@ def unlocated_samples(motion: Motion, beam: Motion, defects: Sequence[Defect], i
         intensity: of the recording.
     """
     unknown = to_sample_ranges(unrecoverable_intervals(motion, defects), intensity)
-    stored = [axis.angle.values for axis in beam.axes.values() if isinstance(axis.angle, SampledAngle)]
-    unknown += [each for values in stored for each in runs_of_true(np.isnan(values))]
+    unknown += [each for axis in beam.axes.values() for each in _unknown_angles(axis.angle)]
     return [(first, stop) for first, stop in merge_ranges(sorted(unknown), 0)]
+
+
+def _unknown_angles(track: AngleTrack) -> Iterator[tuple[int, int]]:
+    """Yield ranges of samples at which a track holds no angle; synthesised ones hold one everywhere."""
+    for first in range(0, track.size, READ_CHUNK_SAMPLES) if track.phasors() is None else ():
+        unknown = np.isnan(track.read(first, first + READ_CHUNK_SAMPLES))
+        yield from ((first + low, first + high) for low, high in runs_of_true(unknown))
 
 
 def describe_defects(defects: Sequence[Defect]) -> Iterator[str]:

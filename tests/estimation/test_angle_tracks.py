@@ -10,6 +10,9 @@ import pytest
 from estimation.optics.correction import BeamAngle
 from estimation.reference import absolute_reference
 from estimation.tracker.angle_synthesis import PhasorAngle, PhasorMotion
+from scanner import angle_tracks
+from scanner.angle_tracks import ChannelAngle
+from scanner.channel import make_channel
 from scanner.device import Device
 from scanner.motion import AngleTrack, AxisMotion, SampledAngle
 
@@ -32,6 +35,16 @@ def synthesised() -> AngleTrack:
     return PhasorAngle(motion, RATE, START, SIZE)
 
 
+def of_a_channel() -> AngleTrack:
+    time = START + np.arange(SIZE) / RATE
+    raw = 5.0 * AMPLITUDE * np.sin(2 * np.pi * FREQUENCY * time) - 1.0
+    return ChannelAngle(make_channel("angle_x", raw, unit="rad", sample_rate=RATE, start=START, gain=0.2, offset=0.2))
+
+
+def not_advanced() -> AngleTrack:
+    return sampled().advanced(np.array([0.0, 1.0]), np.zeros(2), np.full(2, FREQUENCY))
+
+
 def beam_of_samples() -> AngleTrack:
     return BeamAngle(sampled(), BENT, "x", START)
 
@@ -40,7 +53,7 @@ def beam_of_phasors() -> AngleTrack:
     return BeamAngle(synthesised(), BENT, "x", START)
 
 
-TRACKS = [sampled, synthesised, beam_of_samples, beam_of_phasors]
+TRACKS = [sampled, of_a_channel, not_advanced, synthesised, beam_of_samples, beam_of_phasors]
 
 
 def expected(make: Callable[[], AngleTrack], time: np.ndarray) -> np.ndarray:
@@ -97,3 +110,22 @@ def test_an_advanced_track_reads_the_motion_later(make: Callable[[], AngleTrack]
     time = START + np.arange(SIZE) / RATE
     later = time + (0.1 + 2.0 * time) / (2.0 * np.pi * FREQUENCY)
     np.testing.assert_allclose(advanced.read()[5:-500], expected(make, later)[5:-500], atol=1e-5 * AMPLITUDE)
+    twice = make().advanced(knots, 0.5 * lead, np.full(knots.size, FREQUENCY))
+    again = twice.advanced(knots, 0.5 * lead, np.full(knots.size, FREQUENCY))
+    np.testing.assert_allclose(again.read()[5:-500], advanced.read()[5:-500], atol=1e-4 * AMPLITUDE)
+    np.testing.assert_allclose(again.negated().read(), -again.read(), atol=1e-9)
+
+
+@pytest.mark.parametrize("lead_samples", [-3.7, -1.0, 0.0, 0.4, 2.0])
+def test_an_advanced_track_is_read_in_parts(lead_samples: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    turn = np.full(2, lead_samples / RATE * 2 * np.pi * FREQUENCY)
+    track = sampled().advanced(np.array([0.0, 1.0]), turn, np.full(2, FREQUENCY))
+    whole = track.read()
+    inner = slice(5, -5)  # beyond the ends there are no samples to interpolate
+    time = START + (np.arange(SIZE) + lead_samples) / RATE
+    np.testing.assert_allclose(whole[inner], expected(sampled, time)[inner], atol=1e-4 * AMPLITUDE)
+    monkeypatch.setattr(angle_tracks, "SAMPLES_AT_ONCE", 777)
+    np.testing.assert_allclose(track.read(), whole, atol=1e-12)
+    np.testing.assert_allclose(track.read(1, 3), whole[1:3], atol=1e-12)
+    np.testing.assert_allclose(track.read(SIZE - 1), whole[-1:], atol=1e-12)
+    assert track.read(7, 7).size == 0

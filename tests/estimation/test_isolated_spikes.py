@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from estimation.filters.baselines import estimate_from_sensor
-from estimation.isolated_spikes import find_spikes, without_spikes
+from estimation.isolated_spikes import find_spikes
+from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
 from scanner.device import Axis, Device
 from scanner.recording import Recording
 from scanner.stages import Position
@@ -22,12 +23,25 @@ def with_spikes(values: np.ndarray) -> np.ndarray:
     return spiked
 
 
+def channel(values: np.ndarray) -> Channel:
+    return make_channel("sense_x", values, unit="V", sample_rate=RATE_HZ)
+
+
 def test_spikes_are_found_and_replaced_to_the_noise() -> None:
-    values = SINE + 1e-3 * NOISE
-    spiked = with_spikes(values)
-    spikes = find_spikes(spiked)
-    np.testing.assert_array_equal(spikes, AT)
-    assert np.abs(without_spikes(spiked, spikes) - SINE).max() < 6e-3
+    spikes = find_spikes(channel(with_spikes(SINE + 1e-3 * NOISE)))
+    np.testing.assert_array_equal(spikes.at, AT)
+    assert np.abs(spikes.values - SINE[AT]).max() < 6e-3
+
+
+def test_spikes_are_found_where_two_parts_of_a_long_signal_meet() -> None:
+    at = READ_CHUNK_SAMPLES + np.array([-8, 0, 4, 9, 20])
+    time = np.arange(READ_CHUNK_SAMPLES + 40) / RATE_HZ
+    sine = np.sin(2.0 * np.pi * FREQUENCY_HZ * time)
+    values = sine + 1e-3 * np.random.default_rng(2).standard_normal(time.size)
+    values[at] = 3.0
+    spikes = find_spikes(channel(values))
+    np.testing.assert_array_equal(spikes.at, at)
+    assert np.abs(spikes.values - sine[at]).max() < 6e-3
 
 
 @pytest.mark.parametrize(
@@ -64,7 +78,7 @@ def test_spikes_are_found_and_replaced_to_the_noise() -> None:
     ],
 )
 def test_other_signals_have_no_spikes(values: np.ndarray) -> None:
-    assert not find_spikes(values).size
+    assert not find_spikes(channel(values)).at.size
 
 
 def test_spikes_of_a_clipped_signal_are_found() -> None:
@@ -73,7 +87,7 @@ def test_spikes_of_a_clipped_signal_are_found() -> None:
     spiked = clipped.copy()
     at = 250 + 500 * np.arange(60)  # at zero crossings
     spiked[at] = 3.0
-    np.testing.assert_array_equal(find_spikes(spiked), at)
+    np.testing.assert_array_equal(find_spikes(channel(spiked)).at, at)
 
 
 def test_the_sensor_is_as_accurate_as_it_states_in_spite_of_spikes() -> None:

@@ -5,6 +5,7 @@ import pytest
 
 from estimation.filters.baselines import estimate_from_sensor
 from estimation.missing_samples import MAX_FILLED_GAP_PERIODS, fill_missing
+from scanner.channel import make_channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
@@ -36,9 +37,9 @@ def test_the_polynomial_is_as_accurate_as_its_docstring_says(samples_a_period: i
         sine = np.sin(2 * np.pi * np.arange(200) / samples_a_period + phase)
         values = sine.copy()
         values[100 : 100 + gap] = np.nan
-        filled = fill_missing(values, gap)
-        assert (filled.filled, filled.left_out) == (gap, [])
-        assert np.abs(filled.values - sine).max() < 5e-5
+        filled = fill_missing(make_channel("sense_x", values, unit="V", sample_rate=RATE_HZ), gap)
+        assert (filled.filled, filled.left_out, filled.at.tolist()) == (gap, [], list(range(100, 100 + gap)))
+        assert np.abs(filled.values - sine[filled.at]).max() < 5e-5
 
 
 def test_scattered_missing_samples_change_the_motion_by_less_than_the_noise() -> None:

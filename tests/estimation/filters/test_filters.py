@@ -271,22 +271,22 @@ def test_sign_follows_from_flip_option_and_angle_channel() -> None:
     plain = estimate(recording, None, "ekf")
     flipped = estimate(recording, None, "ekf", {"x": True})
     assert flipped.axes["x"].sign == "known: --flip-x"
-    assert np.allclose(flipped.axes["x"].angle.values, -plain.axes["x"].angle.values)
-    assert np.allclose(flipped.axes["y"].angle.values, plain.axes["y"].angle.values)
+    assert np.allclose(flipped.axes["x"].angle.read(), -plain.axes["x"].angle.read())
+    assert np.allclose(flipped.axes["y"].angle.read(), plain.axes["y"].angle.read())
     channels = {n: (c.read(), c.unit, c.sample_rate, c.start) for n, c in recording.channels.items()}
     for name in "xy":
         channels[f"angle_{name}"] = (truth[f"angle_{name}"][0], "rad", 5e6, 0.0)
     known = estimate(Recording.from_arrays(channels, recording.device), None, "ekf")
     for name in "xy":
         assert known.axes[name].sign == f"known: angle_{name}"
-        assert np.corrcoef(known.axes[name].angle.values, truth[f"angle_{name}"][0])[0, 1] > 0.99
+        assert np.corrcoef(known.axes[name].angle.read(), truth[f"angle_{name}"][0])[0, 1] > 0.99
 
 
 def test_sensor_estimator_uses_position_readouts() -> None:
     recording, device = position_scan()
     axis = estimate(recording, device).axes["x"]
     assert axis.sign == "known: sense_x"
-    assert np.allclose(axis.angle.values, recording["sense_x"].read() / 10.0)
+    assert np.allclose(axis.angle.read(), recording["sense_x"].read() / 10.0)
     assert abs(axis.phase[0]) <= np.pi
 
 

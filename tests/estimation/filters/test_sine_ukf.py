@@ -76,7 +76,7 @@ def test_estimator_is_available_by_name():
     axis = sine.linear_axis(F, 300.0)
     values = {"angle_x": (noisy(0.01) + 0.002, "rad", RATE, 0.0)}
     motion = estimate(Recording.from_arrays(values, Device("m", {"x": axis})), None, "sine-ukf")
-    error = motion.axes["x"].angle.values - 0.087 * np.sin(TURN + 0.7) - 0.002
+    error = motion.axes["x"].angle.read() - 0.087 * np.sin(TURN + 0.7) - 0.002
     assert np.std(error) < 1e-3
     assert motion.info["x"]["offset"] == pytest.approx(0.002, abs=2e-4)
 
