@@ -98,12 +98,12 @@ class SampledAngle:
     """An angle track that is stored sample by sample.
 
     Attributes:
-        values: angle, shape (n,) [rad].
+        values: angle, shape (n,) [rad]; single precision is 1e-5 pixels and halves the memory.
         sample_rate: [Hz].
         start: time of the first sample on the recording's clock [s].
     """
 
-    values: Array
+    values: NDArray[np.floating]
     sample_rate: float
     start: float = 0.0
 
@@ -114,7 +114,7 @@ class SampledAngle:
 
     def read(self, first: int = 0, stop: int | None = None) -> Array:
         """Return the angles of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
-        return self.values[first:stop]
+        return np.asarray(self.values[first:stop], np.float64)
 
     def negated(self) -> SampledAngle:
         """Return the same motion with the opposite sign."""

@@ -27,8 +27,8 @@ MIN_NOISE_EXCESS = 1.5
 says so. Data sheets state noise to some ten percent."""
 
 SPLINE_MARGIN_SAMPLES = 64
-"""Samples beyond a part on either side that its spline includes: their effect falls by a factor of 3.7 a sample, so that
-the parts are those of one spline to the precision of the numbers."""
+"""Samples beyond a part on either side that its spline includes. Their effect falls by a factor of 3.7 a sample, so
+that the parts are those of one spline to the precision of the numbers."""
 
 MIN_BLOCKS = 2
 """Blocks that a motion's slow clock has at least."""

@@ -112,7 +112,7 @@ def axis_motion_from_edges(
         lag = np.zeros(found.time.size)
     phase = found.phase + lag
     spline = CubicHermiteSpline(found.time, phase, 2 * np.pi * found.frequency)
-    beyond, angle = MAX_BEYOND_PERIODS / float(np.median(found.frequency)), np.empty(n)
+    beyond, angle = MAX_BEYOND_PERIODS / float(np.median(found.frequency)), np.empty(n, np.float32)
     for first in range(0, n, CHUNK_SAMPLES):
         time = start + np.arange(first, min(first + CHUNK_SAMPLES, n)) / rate
         u = spline(time)
