@@ -134,6 +134,51 @@ def tune_process_noise(
     return q[:-1].reshape(axes, -1), float(q[-1])
 
 
+def tune_between_motion_and_offset(
+    observations: BlockObservations, start: StateEstimate, parts: list[TuningPart], densities: Array
+) -> tuple[Array, float]:
+    """As ``tune_process_noise``, from two densities of the offset: the more probable result.
+
+    A change of the signal's mean is explained by the offset, or by an amplitude whose change the gain hides in the
+    harmonics. The tuning keeps the explanation that its start favours. It therefore starts from the observations' own
+    density of the offset, which leaves a steady drift of the mean to the motion, and from ``whole_mean_density``.
+    """
+    starts = [observations.signal.offset_density]
+    whole = max(whole_mean_density(part.signal) for part in parts)
+    if whole > starts[0]:
+        starts.append(whole)
+    found = []
+    for density in starts:
+        begun = observations.with_offset_density(density)
+        result = tune_process_noise(begun, start, with_offset_density(parts, density), densities)
+        found.append((_log_posterior(observations, start, parts, *result), result))
+    return max(found, key=lambda each: each[0])[1]
+
+
+def whole_mean_density(signal: BlockSignal) -> float:
+    """Density of the offset's walk that explains every change of the signal's mean from block to block [V^2/s]."""
+    used = np.isfinite(signal.noise_var)
+    means = np.einsum("kj,kj->k", signal.solvers[signal.geometry[used], 0], signal.whitened[used])
+    if means.size < 2:
+        return MIN_OFFSET_DENSITY_V2_PER_S
+    return max(float(np.mean(np.diff(means) ** 2)) / signal.step, MIN_OFFSET_DENSITY_V2_PER_S)
+
+
+def _log_posterior(
+    observations: BlockObservations,
+    start: StateEstimate,
+    parts: list[TuningPart],
+    densities: Array,
+    offset_density: float,
+) -> float:
+    """Logarithm of likelihood times prior of the densities' logarithms, see ``tune_process_noise``."""
+    parts = with_offset_density(parts, offset_density)
+    likelihood = sum(filter_blocks(observations, *part, start, densities).log_likelihood for part in parts)
+    ratio = offset_density / MIN_OFFSET_DENSITY_V2_PER_S
+    prior = 0.5 * float(np.sum(np.log(densities) * PRIOR_DOF))
+    return likelihood + prior - 0.5 * OFFSET_PRIOR_DOF * (np.log(ratio) + 1.0 / ratio)
+
+
 def with_offset_density(parts: list[TuningPart], density: float) -> list[TuningPart]:
     """The parts with another spectral density of the readout's offset [V^2/s]."""
     return [part._replace(signal=part.signal._replace(offset_density=float(density))) for part in parts]

@@ -24,6 +24,7 @@ from estimation.tracker.process_noise import (
     INITIAL_DENSITIES,
     mean_nis,
     noise_posterior,
+    tune_between_motion_and_offset,
     tune_process_noise,
     tuning_parts,
     with_offset_density,
@@ -236,10 +237,11 @@ def tune_section(
         observations = observations.with_offset_density(known_offset_density)
     start, signs = resolve_signs(observations, initial_estimate(observations, device))
     residual_var, scale = observations.signal.noise_var, 1.0
-    for _ in range(MAX_NOISE_ROUNDS):
+    for noise_round in range(MAX_NOISE_ROUNDS):
         observations = expand_clipped_blocks(observations, prior or start, densities, causal)
         parts = tuning_parts(observations.signal)
-        densities, offset_density = tune_process_noise(observations, start, parts, densities)
+        tune = tune_process_noise if noise_round else tune_between_motion_and_offset
+        densities, offset_density = tune(observations, start, parts, densities)
         observations = observations.with_offset_density(offset_density)
         parts = with_offset_density(parts, offset_density)
         found = max(1.0, scale * mean_nis(observations, start, parts, densities))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from estimation.tracker import track
 from estimation.tracker.block_signal import MIN_OFFSET_DENSITY_V2_PER_S
@@ -51,6 +52,15 @@ def test_hum_is_not_attributed_to_the_amplitude() -> None:
     for name in "xy":
         scatter = np.std(np.log(changed.axes[name].amplitude / clean.axes[name].amplitude))
         assert scatter < 3e-4
+
+
+@pytest.mark.parametrize("shape", ["ramp", "step"])
+def test_an_offset_that_drifts_is_not_attributed_to_the_amplitude(shape: str) -> None:
+    fraction = np.arange(noisy(3)["sense"].size) / noisy(3)["sense"].size
+    clean, changed = tracked_with(0.1 * (fraction if shape == "ramp" else fraction > 0.45))  # 7 % of the signal
+    for name in "xy":
+        difference = np.log(changed.axes[name].amplitude / clean.axes[name].amplitude)
+        assert np.abs(difference).max() < 2e-3  # tuned from the increments about their median alone: 0.05
 
 
 def test_noise_of_low_frequency_is_not_attributed_to_the_motion() -> None:
