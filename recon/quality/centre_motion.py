@@ -22,8 +22,9 @@ MIN_CENTRES = 8
 
 
 MIN_BEATS = 10.0
-"""Beats of the frequencies of both axes in a block in which crosstalk is measured: the side lobes of a Hann window are
-then below 1e-3 and differ in sign from block to block, so that the own motion does not count as the other one's."""
+"""Beats of the frequencies of both axes, and periods of the other axis, in a block in which crosstalk is measured: the
+side lobes of a Hann window are then below 1e-3 and differ in sign from block to block, so that neither the own motion
+nor a constant counts as the other one's."""
 
 
 def describe_centre_motion(
@@ -87,12 +88,12 @@ def _angles(motion: Motion, name: str) -> Array:
 
 def _crosstalk(motion: Motion, name: str) -> float:
     """Factor by which the measured angle of an axis follows the other one at the frequency of that; 0 where the
-    frequencies are too close to separate.
+    recording is too short to separate this frequency from the own one, or from a constant.
 
     The factor is the in-phase part of the ratio of both phasors, in blocks within which the frequencies hardly drift.
     """
     frequencies = [float(np.median(motion.axes[each].frequency)) for each in (name, _other(name))]
-    rate, beat = motion.axes[name].angle.sample_rate, abs(frequencies[0] - frequencies[1])
+    rate, beat = motion.axes[name].angle.sample_rate, min(abs(frequencies[0] - frequencies[1]), frequencies[1])
     values = np.stack([_angles(motion, name), _angles(motion, _other(name))])
     size = values.shape[1]
     if beat * size < MIN_BEATS * rate:

@@ -93,3 +93,15 @@ def test_crosstalk_and_hum_are_stated_both() -> None:
 @pytest.mark.parametrize("change", [{}, {"slow_drive": 0.3}, {"noise_rad": 5e-3}])
 def test_a_start_from_rest_a_slow_drive_and_noise_are_no_error_of_the_sensor(change: dict[str, float]) -> None:
     assert not any("centre" in line or "follows" in line for line in scan(**change))
+
+
+def test_a_slow_axis_beside_a_resonant_one_is_no_crosstalk() -> None:
+    rng, scans = np.random.default_rng(6), {"x": (8000.0, 1.0), "y": (40.0, 0.95)}
+    assert DEVICE.scan is not None
+    half, time = DEVICE.scan.half_angle_x, np.arange(200_000) / 2e6
+    angles = {name: share * half * np.sin(2 * np.pi * f * time) for name, (f, share) in scans.items()}
+    channels = {f"angle_{n}": (a + rng.normal(0.0, 1e-4, time.size), "rad", 2e6) for n, a in angles.items()}
+    light = 1.0 + 0.5 * np.sin(9.0 * angles["x"] / half + 2.0) * np.cos(7.0 * angles["y"] / half)
+    recording = Recording.from_arrays({**channels, "intensity": (rng.poisson(500 * light) / 500, "V", 2e6)}, DEVICE)
+    limits = reconstruct(recording, Options(estimator="sensor", pixels=(80, 80)), quiet=True).limits
+    assert not any("follows" in line or "centre" in line for line in limits)
