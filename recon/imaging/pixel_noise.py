@@ -144,7 +144,8 @@ def measure_noise(
 def pixel_sd(picture: Picture, noise: Sequence[SampleNoise | None]) -> NDArray[np.float32]:
     """Standard deviation of each pixel's mean, of the shape of the picture and in its unit.
 
-    NaN where a pixel was never visited, and for a detector without a measured noise.
+    The photon noise is that of the expected level of the pixel: the mean of few photons is often 0 by chance. NaN where
+    a pixel was never visited, and for a detector without a measured noise.
 
     Args:
         picture: of means.
@@ -156,6 +157,28 @@ def pixel_sd(picture: Picture, noise: Sequence[SampleNoise | None]) -> NDArray[n
     visited = counts > 0
     for detector, sample in enumerate(noise):
         if sample is not None:
-            variance = sample.variance(means[..., detector].astype(np.float64))
+            variance = sample.variance(_expected_levels(means[..., detector].astype(np.float64), counts, sample))
             np.sqrt(np.divide(variance, counts, where=visited, out=variance), where=visited, out=sd[..., detector])
     return sd.reshape(picture.image.shape)
+
+
+def _expected_levels(means: Array, counts: NDArray[np.float32], noise: SampleNoise) -> Array:
+    """Expected level of each pixel, given its mean and the distribution of all pixels, of the shape of ``means``.
+
+    It is the best linear estimate: the mean of all samples, and the pixel's deviation from it in the ratio of the
+    variance of the scene to that of scene and noise.
+
+    Args:
+        means: of the samples of each pixel, not finite where there is none. counts: of these samples.
+    """
+    known = (counts > 0) & np.isfinite(means)
+    number = counts[known].astype(np.float64)
+    if not number.size:
+        return means
+    level = float(np.average(means[known], weights=number))
+    of_noise = float(noise.variance(np.array(level)))
+    spread = float(np.sum(number * (means[known] - level) ** 2))
+    of_scene = max(spread - (number.size - 1) * of_noise, 0.0) / float(number.sum())
+    of_both = of_scene + of_noise / np.maximum(counts, 1.0)
+    share = np.divide(of_scene, of_both, where=of_both > 0.0, out=np.ones_like(means))
+    return np.asarray(np.where(known, level + share * (means - level), means))

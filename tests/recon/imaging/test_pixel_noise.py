@@ -30,7 +30,7 @@ def scan(photons: float, read_sd: float) -> tuple[Motion, Recording, np.ndarray]
     return Motion(axes, "sensor"), recording, photons * scene
 
 
-@pytest.mark.parametrize(("photons", "read_sd"), [(200.0, 0.0), (20.0, 3.0), (2.0, 0.5)])
+@pytest.mark.parametrize(("photons", "read_sd"), [(200.0, 0.0), (20.0, 3.0), (2.0, 0.5), (0.1, 0.0)])
 def test_intervals_of_pixels_hold_the_scene(photons: float, read_sd: float) -> None:
     motion, recording, scene = scan(photons, read_sd)
     channel = recording["intensity"]
