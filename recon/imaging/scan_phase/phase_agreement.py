@@ -203,7 +203,10 @@ def _describe(found: Contradiction, moved: AxisMotion) -> str:
             "sin(2π reference t + phase)"
         )
     if abs(typical) > pi / 2 - SEARCH_REACH_RAD:
-        return line + f"check kind in [{name}.readout], as velocity and position differ by 90°, or start of channels"
+        return line + (
+            f"check kind in [{name}.readout], as velocity and position differ by 90°, the sign of a capacitive signal, "
+            "as half of its inverted phase is 90°, or start of channels"
+        )
     late = 1e6 * typical / (2 * pi * frequency)
     line += f"check start of the channels and the sensor's delay, which would be {late:.3g} µs plus any half-periods"
     if moved.sign == f"known: sync_{name}":

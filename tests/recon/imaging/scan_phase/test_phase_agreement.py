@@ -8,9 +8,12 @@ import pytest
 from phantoms.optics import sample_scene
 from phantoms.targets import make_target
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions, find_contradictions
+from recon.pipeline import reconstruct
+from recon.steps.reconstruction import Options
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.motion import AxisMotion, Motion, SampledAngle
+from tests.support.simulated import imaging, with_sense
 
 RATE = 1e6
 FREQUENCY = {"x": 4137.0, "y": 911.0}
@@ -64,6 +67,12 @@ def test_a_velocity_in_place_of_a_position_is_named_on_its_axis() -> None:
     (line,) = describe_contradictions(motion(np.cos(a), np.sin(b)), channel(light(np.sin(a), np.sin(b))))
     assert line.startswith("x: forward and backward half-periods disagree")
     assert "check kind in [x.readout]" in line
+
+
+def test_the_sign_of_an_inverted_capacitive_signal_is_named() -> None:
+    inverted = with_sense(imaging()[0], np.negative)
+    limits = reconstruct(inverted, Options(pixels=(100, 100)), quiet=True).limits
+    assert any("the sign of a capacitive signal" in line for line in limits)
 
 
 def test_half_of_the_frequency_is_named() -> None:
