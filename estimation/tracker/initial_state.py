@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,11 @@ RELATIVE_STIFFNESS_SD = 0.003
 RELATIVE_DAMPING_SD = 0.05
 """Change of damping since the calibration, in addition to its tolerance: air damping varies with temperature and
 pressure."""
+
+UNRECORDED_DRIVE_SD = 1.0
+"""Force of a drive that was not recorded, over that of the damping, in phase with the rate and with the angle. One that
+keeps the amplitude replaces all of the damping. Beside the resonance, one as large adds 1 / Q to the relative
+stiffness. With the constants of a free decay, the angles of the first millisecond would be those of one."""
 
 STIFFNESS_RATE_SD_PER_S = 0.3
 """Rate of the relative stiffness at the beginning [1/s]: 0.3 % within 10 ms, a fast warming-up."""
@@ -54,12 +60,16 @@ def initial_estimate(observations: BlockObservations, device: Device) -> StateEs
         else:
             factor = "a_cir" if isinstance(readout, Amdm) else "R_s"
             gain = np.hypot(device.tolerance(name, factor), device.tolerance(name, "C0"))
+        law, unknown = observations.parameters[a], 0.0
+        if observations.references[name].kind == "absolute":
+            unknown = UNRECORDED_DRIVE_SD
+        unknown_stiffness = unknown * law.b / math.sqrt(law.k * law.J)
         variance[at : at + AXIS_STATES] = np.square([
             REACQUIRE_SD[0],
             REACQUIRE_SD[1],
-            np.hypot(device.tolerance(name, "k"), RELATIVE_STIFFNESS_SD),
+            math.hypot(device.tolerance(name, "k"), RELATIVE_STIFFNESS_SD, unknown_stiffness),
             STIFFNESS_RATE_SD_PER_S,
-            np.hypot(device.tolerance(name, "b"), RELATIVE_DAMPING_SD),
+            math.hypot(device.tolerance(name, "b"), RELATIVE_DAMPING_SD, unknown),
             gain,
         ])  # fmt: skip
     x[-1] = readout.b_cir if isinstance(readout, Amdm) else readout.offset if isinstance(readout, MotionSensor) else 0.0

@@ -207,6 +207,17 @@ def test_axes_on_separate_electrodes() -> None:
         assert np.rad2deg(np.sqrt(np.mean(phase**2))) < 0.03
 
 
+def test_the_first_angles_are_right_where_no_drive_was_recorded() -> None:
+    recording, truth = separate_electrodes()
+    senses = {n: (c.read(), c.unit, c.sample_rate, c.start) for n, c in recording.channels.items() if "sense" in n}
+    motion = track(Recording.from_arrays(senses, own_electrodes()), own_electrodes())
+    for name, axis in motion.axes.items():
+        true = truth[f"angle_{name}"][0]
+        error = np.minimum(np.abs(axis.angle.read() - true), np.abs(axis.angle.read() + true))
+        first = error[: round(5e-4 * RATE)]
+        assert first.max() < 0.01 * np.abs(true).max()  # with the constants of a free decay: 0.09
+
+
 def test_sign_follows_from_combs_that_are_off_centre() -> None:
     device = devices.load("imaging")
     axes = {n: replace(a, capacitance=replace(a.require_capacitance(), theta_th=0.004)) for n, a in device.axes.items()}
