@@ -180,15 +180,16 @@ def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[C
     if f"sense_{name}" in recording and isinstance(axis.readout, Position):
         readout = axis.readout
         return recording[f"sense_{name}"], readout.gain, readout.offset, readout.noise_sd / abs(readout.gain)
-    sense = f"sense_{name}"
+    sense, advice = f"sense_{name}", f"choose another estimator, record it, or state frequency in [{name}.drive]"
+    if f"drive_{name}" in recording and "intensity" in recording:
+        advice = "record it, or use --estimator picture, which needs the drives and the intensity alone"
     raise ChannelMissing(
         f"is not in the recording, and neither is {sense}"
         if sense not in recording
         else f"is not in the recording and {sense} is no position readout",
         file=recording.path,
         channel=f"angle_{name}",
-        hint=f"choose another estimator, record it, or state frequency in [{name}.drive]; "
-        f"it holds {list_names(recording.channels)}",
+        hint=f"{advice}; it holds {list_names(recording.channels)}",
     )
 
 
