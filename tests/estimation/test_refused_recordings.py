@@ -86,7 +86,7 @@ def test_a_drive_that_starts_later_is_refused_by_filters_with_the_time_to_cut_ou
         estimate(recording.with_channel(channel), method="ukf")
 
 
-def test_an_axis_with_a_drive_and_no_sensor_is_told_of_the_picture() -> None:
+def test_an_axis_with_a_drive_and_no_sensor_names_the_estimator_picture() -> None:
     channels = {"drive_x": (np.sin(2 * np.pi * 100.0 * TIME), "V", 1e4), "intensity": (DECAY, "V", 1e4)}
     with pytest.raises(BadInput, match="neither is sense_x; record it, or use --estimator picture"):
         estimate(Recording.from_arrays(channels, device(100.0, driven=True)), method="sensor")
