@@ -65,6 +65,15 @@ def test_samples_that_show_no_gain_leave_it_at_one(case: str) -> None:
     assert not describe_slow_gain([GainPart(0, 1, gain)])
 
 
+def test_a_scan_that_visits_every_place_once_determines_no_gain() -> None:
+    rng = np.random.default_rng(0)
+    place = np.linspace(0.0, 400.0, 40_000)  # the radius of a spiral that opens, in cells
+    light = 1.0 + 0.8 * np.sin(place / 3.0) + NOISE_SD * rng.standard_normal(place.size)
+    gain = estimate_slow_gain(place.astype(np.int64), np.linspace(0.0, SLICES, place.size), light, SLICES)
+    assert not describe_slow_gain([GainPart(0, 1, gain)])
+    np.testing.assert_array_equal(gain.log_gain, 0.0)
+
+
 def test_a_change_within_its_error_is_not_reported() -> None:
     uncertain = SlowGain(np.array([0.0, -0.1]), PRIOR_SD**2 * np.eye(2))
     certain = uncertain._replace(covariance=1e-6 * np.eye(2))
