@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -88,13 +88,17 @@ def axis_motion_from_angle(
     phase = np.interp(time, time[known], reference.relative_phase(time[known], phasors[known]))
     phase_sd = noise_sd / np.maximum(amplitude, 1e-300) * phasor_noise(rate, reference.frequency, block)
     phase_sd[by_block.mean(axis=1) >= 0.5] = UNKNOWN_PHASE_SD_RAD
+
+    def oscillation(at: Array) -> Array:
+        return np.asarray(np.interp(at, time, amplitude) * np.sin(reference.phase(at) + np.interp(at, time, phase)))
+
     return AxisMotion(
         time=time,
         phase=phase,
         amplitude=amplitude,
         frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
         phase_sd=np.minimum(phase_sd, UNKNOWN_PHASE_SD_RAD),
-        angle=_on_clock(angle, clock, held),
+        angle=_on_clock(angle, clock, held, np.zeros_like if reference.kind == "blocks" else oscillation),
         reference=reference.kind,
         sign=f"known: {angle.name}",
         angle_noise_sd=noise_sd if is_noise_known else 0.0,
@@ -114,11 +118,14 @@ def _phasors(angle: Channel, frequency: float, block: int) -> tuple[Array, Compl
     return np.concatenate(time), np.concatenate(phasors)
 
 
-def _on_clock(angle: Channel, clock: Clock, unknown: Sequence[tuple[int, int]]) -> ChannelAngle:
-    """The samples of a channel on a clock, by cubic splines where that has other samples; NaN at unknown ones.
+def _on_clock(
+    angle: Channel, clock: Clock, unknown: Sequence[tuple[int, int]], oscillation: Callable[[Array], Array]
+) -> ChannelAngle:
+    """The samples of a channel on a clock, interpolated where that has other samples; NaN at unknown ones.
 
     Args:
         unknown: ranges of samples of the channel (first, stop).
+        oscillation: as for :func:`_resampled`.
     """
     rate, start, n = clock
     first = (start - angle.start) * angle.sample_rate
@@ -126,13 +133,20 @@ def _on_clock(angle: Channel, clock: Clock, unknown: Sequence[tuple[int, int]]) 
         begin = angle.first + round(first)
         resampled = replace(angle, start=start, first=begin, stop=begin + n)
     else:
-        resampled = with_samples(replace(angle, sample_rate=rate, start=start), _resampled(angle, clock))
+        resampled = with_samples(replace(angle, sample_rate=rate, start=start), _resampled(angle, clock, oscillation))
     ranges = [[round((angle.start + at / angle.sample_rate - start) * rate) for at in each] for each in unknown]
     return ChannelAngle(resampled, [(max(low, 0), max(high, 0)) for low, high in ranges])
 
 
-def _resampled(angle: Channel, clock: Clock) -> Array:
-    """Samples of a channel on another clock by cubic splines, part by part; NaN outside, shape (n,)."""
+def _resampled(angle: Channel, clock: Clock, oscillation: Callable[[Array], Array]) -> Array:
+    """Samples of a channel on another clock, part by part; NaN outside, shape (n,) [rad].
+
+    A cubic spline interpolates what the oscillation leaves: one through a sine of 6 samples a period is off by 1 % of
+    its amplitude, of 2.7 by 17 %. Less than a sample after the last one the rest is held.
+
+    Args:
+        oscillation: main part of the angle by time, shape (m,) -> (m,).
+    """
     from scipy.interpolate import CubicSpline
 
     rate, start, n = clock
@@ -142,6 +156,9 @@ def _resampled(angle: Channel, clock: Clock) -> Array:
         begin, end = (time[[0, -1]] - angle.start) * angle.sample_rate
         low = int(np.clip(begin - SPLINE_MARGIN_SAMPLES, 0, max(angle.size - 2 * SPLINE_MARGIN_SAMPLES, 0)))
         high = int(np.clip(end + SPLINE_MARGIN_SAMPLES, low + 2 * SPLINE_MARGIN_SAMPLES, None))
-        values[first : first + time.size] = CubicSpline(angle.time(low, high), angle.read(low, high))(time)
-        values[first : first + time.size][(time < angle.start) | (time > angle.end)] = np.nan
+        at = angle.time(low, high)
+        rest = CubicSpline(at, angle.read(low, high) - oscillation(at))
+        part = rest(np.clip(time, at[0], at[-1])) + oscillation(time)
+        part[(time < angle.start) | (time > angle.end)] = np.nan
+        values[first : first + time.size] = part
     return values
