@@ -20,7 +20,7 @@ from scanner.motion import Motion
 
 UNDETERMINED = (
     "no drift was removed, because the samples do not determine one; that needs samples with noise in pixels that were "
-    "visited several times and are not dark"
+    "visited at times far apart and are not dark"
 )
 """Note where :func:`measure_intensity_drift` returns None."""
 

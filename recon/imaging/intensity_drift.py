@@ -25,6 +25,7 @@ from recon.imaging.intensity_drift_equations import (
     solve_window,
     sum_blocks,
 )
+from recon.imaging.revisits import is_revisited
 from scanner.arrays import Array
 
 SampleReader = Callable[[int, int], tuple[NDArray[np.int32], Array]]
@@ -96,6 +97,9 @@ def estimate_intensity_drift(
     for first in range(0, size, window):
         pixel, intensity = _fill_blocks(*read(first, min(first + window, size)), pixels, block)
         if model is None:
+            used = pixel < pixels
+            if not is_revisited(pixel[used], np.flatnonzero(used).astype(np.float64)):
+                return None
             model = fit_drift_model(pixel, intensity, nothing, sample_rate / block, block, kind)
             if model is not None and model.drifts:
                 model = refit_drift_model(pixel, intensity, nothing, model)

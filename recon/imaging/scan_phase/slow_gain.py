@@ -22,16 +22,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.imaging.revisits import is_revisited
 from scanner.arrays import Array
 
 PRIOR_SD = 0.5
 """Standard deviation of the logarithm of the gain at the end of a slice: bleaching to 60 %. Samples that determine no
 gain leave it at 1."""
-
-MIN_TIME_SHARE = 0.1
-"""Share of the variance of time that lies within the cells, from which on the gain is estimated. It is 0.3 to 0.7 for
-Lissajous figures and rasters, and below 0.03 for spirals that visit every place once: the detail within their cells
-showed gains that rise by 120 % or fall by 70 %, where there was none."""
 
 ROUNDS = 3
 """Steps of Gauss-Newton: each squares the relative error of the step before, which is a tenth for a fall to a half."""
@@ -91,8 +87,7 @@ def estimate_slow_gain(cell: NDArray[np.int64], time: Array, intensity: Array, s
     knots, left = slices + 1, np.minimum(time.astype(np.int64), slices - 1)
     weights = (1.0 - (time - left), time - left)
     number = np.maximum(np.bincount(cell), 1).astype(float)
-    visited = np.bincount(cell, time) / number
-    if np.var(time - visited[cell]) < MIN_TIME_SHARE * np.var(time):
+    if not is_revisited(cell, time):
         return SlowGain(np.zeros(knots), PRIOR_SD**2 * np.eye(knots))
 
     def sum_by_knot(values: Array) -> Array:
