@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -70,18 +70,14 @@ class ChannelAngle:
 
 
 @dataclass(frozen=True)
-class AdvancedAngle:
-    """The angle of another track a little later or earlier, by the cubic through its samples.
+class DerivedAngle:
+    """Base of the angle tracks that are computed from another one when they are read.
 
     Attributes:
         track: the other one.
-        time: increasing, shape (n,) [s].
-        lead: time by which this track is ahead, linear between ``time``, shape (n,) [s].
     """
 
     track: AngleTrack
-    time: Array
-    lead: Array
 
     @property
     def sample_rate(self) -> float:
@@ -98,6 +94,26 @@ class AdvancedAngle:
         """Number of samples."""
         return self.track.size
 
+    def negated(self) -> Self:
+        """Return the same motion with the opposite sign."""
+        return replace(self, track=self.track.negated())
+
+    def phasors(self) -> None:
+        """Return None: the samples are changed one by one."""
+
+
+@dataclass(frozen=True)
+class AdvancedAngle(DerivedAngle):
+    """The angle of another track a little later or earlier, by the cubic through its samples.
+
+    Attributes:
+        time: increasing, shape (n,) [s].
+        lead: time by which this track is ahead, linear between ``time``, shape (n,) [s].
+    """
+
+    time: Array
+    lead: Array
+
     def read(self, first: int = 0, stop: int | None = None) -> Array:
         """Return the angles of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
         begin, end, _ = slice(first, stop).indices(self.size)
@@ -110,19 +126,15 @@ class AdvancedAngle:
     def _interpolated(self, index: Array) -> Array:
         """The angles of samples, shape (n,)."""
         position = index + np.interp(self.start + index / self.sample_rate, self.time, self.lead) * self.sample_rate
-        low = max(min(int(np.floor(position.min())) - 1, self.size - CUBIC_SAMPLES), 0)
-        high = min(max(int(np.floor(position.max())) + 3, low + CUBIC_SAMPLES), self.size)
+        known = np.floor(position[np.isfinite(position)])  # at a frequency of 0 it may be not
+        if not known.size:
+            return np.full(index.size, np.nan)
+        low = max(min(int(known.min()) - 1, self.size - CUBIC_SAMPLES), 0)
+        high = min(max(int(known.max()) + 3, low + CUBIC_SAMPLES), self.size)
         return interpolate_cubic(self.track.read(low, high), position - low)
-
-    def negated(self) -> AdvancedAngle:
-        """Return the same motion with the opposite sign."""
-        return replace(self, track=self.track.negated())
 
     def advanced(self, time: Array, phase: Array, frequency: Array) -> AdvancedAngle:
         """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``scanner.motion.AngleTrack``)."""
         knots = np.union1d(self.time, time)
         lead = np.interp(knots, time, phase / (2.0 * np.pi * frequency))
         return replace(self, time=knots, lead=lead + np.interp(knots + lead, self.time, self.lead))
-
-    def phasors(self) -> None:
-        """Return None: interpolated samples are not synthesised from phasors."""

@@ -14,10 +14,11 @@ from estimation.optics.detector_inverse import (
     measure_regularisation,
     undo_low_pass,
 )
+from scanner.angle_tracks import DerivedAngle
 from scanner.arrays import Array
 from scanner.channel import LazySamples
 from scanner.device import Device
-from scanner.motion import AngleTrack, Motion
+from scanner.motion import Motion
 from scanner.optics import beam_position, intensity_delay, intensity_gain, terms_on_channel
 from scanner.recording import Recording
 
@@ -66,35 +67,20 @@ def correct_intensity(recording: Recording, device: Device, undo_lag: bool = Fal
 
 
 @dataclass(frozen=True)
-class BeamAngle:
-    """Position of the beam on the sample, as the mirror angle that would put it there, computed when it is read.
+class BeamAngle(DerivedAngle):
+    """Position of the beam on the sample, as the mirror angle that would put it there.
+
+    The track is that of the mirror.
 
     Attributes:
-        track: of the mirror.
         device: holds the optics terms.
         axis: name of the axis.
         origin: start of the recording, which is the time origin of the terms [s].
     """
 
-    track: AngleTrack
     device: Device
     axis: str
     origin: float
-
-    @property
-    def sample_rate(self) -> float:
-        """Sample rate [Hz]."""
-        return self.track.sample_rate
-
-    @property
-    def start(self) -> float:
-        """Time of the first sample on the recording's clock [s]."""
-        return self.track.start
-
-    @property
-    def size(self) -> int:
-        """Number of samples."""
-        return self.track.size
 
     def read(self, first: int = 0, stop: int | None = None) -> Array:
         """Return the positions of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
@@ -102,16 +88,9 @@ class BeamAngle:
         time = self.start + index / self.sample_rate - self.origin
         return beam_position(self.device, self.axis, self.track.read(first, stop), time)
 
-    def negated(self) -> BeamAngle:
-        """Return the positions for the motion of the mirror with the opposite sign."""
-        return replace(self, track=self.track.negated())
-
     def advanced(self, time: Array, phase: Array, frequency: Array) -> BeamAngle:
         """Return the positions for the motion of the mirror that is ahead (see ``scanner.motion.AngleTrack``)."""
         return replace(self, track=self.track.advanced(time, phase, frequency))
-
-    def phasors(self) -> None:
-        """Return None: positions have no phasors, because the optics terms act on every sample."""
 
 
 def beam_motion(motion: Motion, device: Device, origin: float) -> Motion:

@@ -129,3 +129,13 @@ def test_an_advanced_track_is_read_in_parts(lead_samples: float, monkeypatch: py
     np.testing.assert_allclose(track.read(1, 3), whole[1:3], atol=1e-12)
     np.testing.assert_allclose(track.read(SIZE - 1), whole[-1:], atol=1e-12)
     assert track.read(7, 7).size == 0
+
+
+def test_an_advanced_track_is_read_where_its_frequency_is_zero() -> None:
+    knots = np.array([START, START + 0.02, START + 0.03, START + 0.05])
+    lead, frequency = np.full(4, 0.1), np.array([FREQUENCY, FREQUENCY, 0.0, 0.0])
+    with np.errstate(divide="ignore"):
+        angle = sampled().advanced(knots, lead, frequency).read()
+    later = START + np.arange(SIZE) / RATE + 0.1 / (2.0 * np.pi * FREQUENCY)
+    np.testing.assert_allclose(angle[5:2000], expected(sampled, later)[5:2000], atol=1e-5 * AMPLITUDE)
+    assert np.nanmax(np.abs(angle)) < 2.0 * AMPLITUDE

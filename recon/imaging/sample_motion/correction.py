@@ -13,10 +13,11 @@ from recon.imaging.sample_motion.block_equations import ScanSamples
 from recon.imaging.sample_motion.rigid_motion import SampleMotion, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.sample_ranges import SampleRanges
+from scanner.angle_tracks import DerivedAngle
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel
 from scanner.device import AXES
-from scanner.motion import AngleTrack, Motion
+from scanner.motion import Motion
 
 MAX_CELLS_ACROSS = 512
 """Cells across the field at most: pictures and sums of all folds then take 150 MB."""
@@ -29,33 +30,18 @@ MAX_USEFUL_SD_PX = 3.0
 
 
 @dataclass(frozen=True)
-class SampleAngle:
-    """Position of the beam relative to a sample that moves, computed when it is read.
+class SampleAngle(DerivedAngle):
+    """Position of the beam relative to a sample that moves.
+
+    The track is that of the beam.
 
     Attributes:
-        track: of the beam.
         sample: increasing sample numbers, shape (n,).
         shift: displacement of the sample there, shape (n,) [rad]; linear between them, constant before and after.
     """
 
-    track: AngleTrack
     sample: Array
     shift: Array
-
-    @property
-    def sample_rate(self) -> float:
-        """Sample rate [Hz]."""
-        return self.track.sample_rate
-
-    @property
-    def start(self) -> float:
-        """Time of the first sample on the recording's clock [s]."""
-        return self.track.start
-
-    @property
-    def size(self) -> int:
-        """Number of samples."""
-        return self.track.size
 
     def read(self, first: int = 0, stop: int | None = None) -> Array:
         """Return the positions of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
@@ -69,9 +55,6 @@ class SampleAngle:
     def advanced(self, time: Array, phase: Array, frequency: Array) -> SampleAngle:
         """Return the positions for the motion of the mirror that is ahead (see ``scanner.motion.AngleTrack``)."""
         return replace(self, track=self.track.advanced(time, phase, frequency))
-
-    def phasors(self) -> None:
-        """Return None: the sample's motion acts on every position."""
 
 
 def measure_sample_motion(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> SampleMotion | None:
