@@ -49,6 +49,13 @@ OFFSET_PRIOR_DOF = 1.0
 """Degrees of freedom of the prior of the offset's density, about the thermal drift MIN_OFFSET_DENSITY_V2_PER_S: as many
 as the prior of the stiffness rate has. Without it, noise would be attributed to an offset that is at rest."""
 
+MIN_CHANGE_SDS = 3.0
+"""Difference of the signal's mean between two halves of the blocks, in standard deviations by the scatter from block to
+block, from which on the mean changes: 0.3 % of noise exceeds it."""
+
+MIN_BLOCKS_OF_CHANGE = 6
+"""Blocks from which on their scatter is known to a third."""
+
 MAX_DENSITY_GROWTH = 10.0
 """Largest factor by which a density grows in a round; keeps the fixed-point iteration stable."""
 
@@ -156,12 +163,19 @@ def tune_between_motion_and_offset(
 
 
 def whole_mean_density(signal: BlockSignal) -> float:
-    """Density of the offset's walk that explains every change of the signal's mean from block to block [V^2/s]."""
+    """Density of the offset's walk that explains every change of the signal's mean from block to block [V^2/s].
+
+    The least one where the means of both halves of the blocks differ by no more than their scatter: the mean is steady.
+    """
     used = np.isfinite(signal.noise_var)
     means = np.einsum("kj,kj->k", signal.solvers[signal.geometry[used], 0], signal.whitened[used])
-    if means.size < 2:
+    if means.size < MIN_BLOCKS_OF_CHANGE:
         return MIN_OFFSET_DENSITY_V2_PER_S
-    return max(float(np.mean(np.diff(means) ** 2)) / signal.step, MIN_OFFSET_DENSITY_V2_PER_S)
+    increments, (first, last) = np.diff(means), np.array_split(means, 2)
+    error = np.sqrt(0.5 * np.var(increments) * (1.0 / first.size + 1.0 / last.size))
+    if abs(last.mean() - first.mean()) < MIN_CHANGE_SDS * error:
+        return MIN_OFFSET_DENSITY_V2_PER_S
+    return max(float(np.mean(increments**2)) / signal.step, MIN_OFFSET_DENSITY_V2_PER_S)
 
 
 def _log_posterior(
