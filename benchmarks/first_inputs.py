@@ -21,9 +21,10 @@ from phantoms.sync import SyncDetector, sync_edges
 from recon.evaluation import evaluate_axis
 from recon.imaging.raster.line_phase import column_places, lag_at
 from scanner import devices
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.geometry import Geometry
-from scanner.motion import AxisMotion, SampledAngle
+from scanner.motion import AxisMotion
 
 RATE_HZ = 1e6
 DRIVES: dict[str, Any] = {"drive_x": (2000.0, 13.5, 0.0), "drive_y": (835.0, 9.5, 0.0)}

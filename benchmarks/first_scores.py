@@ -14,8 +14,9 @@ from recon.evaluation import AxisEvaluation, evaluate_axis
 from recon.imaging.blur import compare_with_scene
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
-from scanner.motion import AxisMotion, SampledAngle
+from scanner.motion import AxisMotion
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,12 @@ from estimation.term_absorption import (
     without_visible_clipping,
 )
 from scanner.active_terms import ActiveTerm, stated_terms
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
 from scanner.forward_model import AxisTrajectory, beside_each_other, reference_signal, sense_signal
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 NominalEstimator = Callable[[Recording, Device], Motion]

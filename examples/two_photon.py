@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from estimation.optics.fit import fit_optics
 from estimation.optics.samples import MIN_CELLS, NOMINAL, measure_cell_variances, project_samples, read_scan
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.motion import SampledAngle
 
 Law = Callable[[Array, Array], Array]
 

@@ -1,25 +1,131 @@
-"""Angles that are computed when they are read, so that a long recording needs little memory."""
+"""Angles of an axis at the samples of the intensity, stored or computed when they are read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import Protocol, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scanner.arrays import Array
+from scanner.arrays import Array, Complex
 from scanner.channel import Channel
 from scanner.interpolation import interpolate_cubic
-
-if TYPE_CHECKING:
-    from scanner.motion import AngleTrack
 
 SAMPLES_AT_ONCE = 1 << 18
 """Samples of an angle that are interpolated together, so that intermediate results need little memory."""
 
 CUBIC_SAMPLES = 4
 """Samples that the cubic through a position needs: one before the last one at or before it, that one, two after it."""
+
+
+class AngleTrack(Protocol):
+    """Mechanical angle of one axis on a uniform clock.
+
+    Every angle in a :class:`Motion` has these attributes and methods. Implementations: :class:`SampledAngle` (an
+    array), :class:`ChannelAngle` (samples of a position signal) and :class:`AdvancedAngle` (another track,
+    interpolated), ``estimation.tracker.angle_synthesis.PhasorAngle`` (synthesised from slow phase and amplitude) and
+    ``estimation.optics.correction.BeamAngle`` (a track after the device's optics terms).
+    """
+
+    @property
+    def sample_rate(self) -> float:
+        """Sample rate [Hz]."""
+
+    @property
+    def start(self) -> float:
+        """Time of the first sample on the recording's clock [s]."""
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+
+    def read(self, first: int = 0, stop: int | None = None) -> Array:
+        """Return the angles of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
+
+    def negated(self) -> AngleTrack:
+        """Return the same motion with the opposite sign."""
+
+    def advanced(self, time: Array, phase: Array, frequency: Array) -> AngleTrack:
+        """Return the motion whose phase is ahead of this one.
+
+        Args:
+            time: increasing, shape (n,) [s].
+            phase: lead at these times, interpolated between them, shape (n,) [rad].
+            frequency: of the motion, shape (n,) [Hz].
+        """
+
+    def phasors(self) -> PhasorTrack | None:
+        """Return the phasors that the angles are synthesised from; None for a track that is not made from any."""
+
+
+class PhasorTrack(Protocol):
+    """Phasors from which angles are synthesised. Kernels that take them need no sine for each sample."""
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+
+    def cut_segments(self, first: int, stop: int) -> PhasorSegments:
+        """Return segments that begin with sample ``first`` and cover the samples up to ``stop``."""
+
+    def phase(self, time: Array) -> Array:
+        """Return the phase u of the motion at ``time`` (n,) [s], also outside the track, shape (n,) [rad]."""
+
+    def delayed(self, delay: float) -> AngleTrack:
+        """Return the track that starts ``delay`` [s] earlier: its sample i is the angle ``delay`` before this one's."""
+
+
+@dataclass(frozen=True)
+class PhasorSegments:
+    """Phasors of a run of samples, segment by segment: the input of the compiled kernels.
+
+    Attributes:
+        first_phasor: exp(i u) at each segment's first sample, shape (segments,).
+        step_phasor: exp(i du) from one sample to the next, shape (segments,).
+        harmonics, harmonic_steps: c_n at the first sample and its change a sample, shape (segments, harmonics) [rad].
+    """
+
+    first_phasor: Complex
+    step_phasor: Complex
+    harmonics: Complex
+    harmonic_steps: Complex
+
+
+@dataclass(frozen=True)
+class SampledAngle:
+    """An angle track that is stored sample by sample.
+
+    Attributes:
+        values: angle, shape (n,) [rad]; single precision is 1e-5 pixels and halves the memory.
+        sample_rate: [Hz].
+        start: time of the first sample on the recording's clock [s].
+    """
+
+    values: NDArray[np.floating]
+    sample_rate: float
+    start: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return self.values.size
+
+    def read(self, first: int = 0, stop: int | None = None) -> Array:
+        """Return the angles of samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) [rad]."""
+        return np.asarray(self.values[first:stop], np.float64)
+
+    def negated(self) -> SampledAngle:
+        """Return the same motion with the opposite sign."""
+        return replace(self, values=-self.values)
+
+    def advanced(self, time: Array, phase: Array, frequency: Array) -> AdvancedAngle:
+        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``AngleTrack``)."""
+        return AdvancedAngle(self, time, phase / (2.0 * np.pi * frequency))
+
+    def phasors(self) -> None:
+        """Return None: samples are not synthesised from phasors."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +168,7 @@ class ChannelAngle:
         return replace(self, channel=replace(self.channel, gain=-self.channel.gain, offset=-self.channel.offset))
 
     def advanced(self, time: Array, phase: Array, frequency: Array) -> AdvancedAngle:
-        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``scanner.motion.AngleTrack``)."""
+        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``AngleTrack``)."""
         return AdvancedAngle(self, time, phase / (2.0 * np.pi * frequency))
 
     def phasors(self) -> None:
@@ -134,7 +240,7 @@ class AdvancedAngle(DerivedAngle):
         return interpolate_cubic(self.track.read(low, high), position - low)
 
     def advanced(self, time: Array, phase: Array, frequency: Array) -> AdvancedAngle:
-        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``scanner.motion.AngleTrack``)."""
+        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``AngleTrack``)."""
         knots = np.union1d(self.time, time)
         lead = np.interp(knots, time, phase / (2.0 * np.pi * frequency))
         return replace(self, time=knots, lead=lead + np.interp(knots + lead, self.time, self.lead))

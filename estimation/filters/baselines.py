@@ -31,12 +31,13 @@ from estimation.signals import (
     phase_reference,
     sense_channels,
 )
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Index
 from scanner.channel import Channel, check_signal, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from scanner.replaced_samples import with_replaced
 from scanner.stages import Position

@@ -12,11 +12,12 @@ import numpy as np
 
 from estimation.filters.inputs import FilterInput
 from estimation.reference import PhaseReference
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block
-from scanner.motion import AxisMotion, SampledAngle
+from scanner.motion import AxisMotion
 
 BLOCK_CYCLES = 4.0
 """Cycles of the motion per point of the slow clock: short against the ring-down of a resonator, long enough that the

@@ -89,7 +89,7 @@ class BeamAngle(DerivedAngle):
         return beam_position(self.device, self.axis, self.track.read(first, stop), time)
 
     def advanced(self, time: Array, phase: Array, frequency: Array) -> BeamAngle:
-        """Return the positions for the motion of the mirror that is ahead (see ``scanner.motion.AngleTrack``)."""
+        """Return the positions for the motion of the mirror that is ahead (see ``scanner.angle_tracks.AngleTrack``)."""
         return replace(self, track=self.track.advanced(time, phase, frequency))
 
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.optics.scene import CellVariances, SamplingGeometry
+from scanner.angle_tracks import AngleTrack
 from scanner.arrays import Array, Mask
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.interpolation import shift_samples
-from scanner.motion import AngleTrack
 
 OpticsParameters = Mapping[str, float]
 """Values by name, see ``PARAMETER_NAMES``."""

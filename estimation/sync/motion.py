@@ -12,11 +12,12 @@ from estimation.sync.checks import check_frequency, check_one_direction
 from estimation.sync.edge_phase import NOMINAL_PHASE, EdgePhase, amplitude_from_edges, phase_from_edges
 from estimation.sync.harmonics import MotionHarmonics, motion_harmonics
 from estimation.sync.numbering import MIN_EDGES
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.device import AXES, Device
 from scanner.edges import Edges
 from scanner.errors import BadInput
-from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion, SampledAngle
+from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion
 from scanner.recording import Recording
 
 KNOT_PERIODS = 4.0

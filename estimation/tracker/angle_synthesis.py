@@ -16,8 +16,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from estimation.reference import PhaseReference
+from scanner.angle_tracks import PhasorSegments
 from scanner.arrays import Array, Complex
-from scanner.motion import PhasorSegments
 
 Harmonics = NDArray[np.complexfloating[Any, Any]]
 
@@ -236,7 +236,7 @@ class PhasorAngle:
         return replace(self, motion=replace(self.motion, phase=self.motion.phase + np.pi, harmonics=harmonics))
 
     def advanced(self, time: Array, phase: Array, frequency: Array) -> PhasorAngle:
-        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``scanner.motion.AngleTrack``)."""
+        """Return the motion whose phase is ahead by ``phase`` at ``time`` (see ``scanner.angle_tracks.AngleTrack``)."""
         knots = self.motion.time
         lead, lead_rate = np.interp(knots, time, phase), np.interp(knots, time, np.gradient(phase, time))
         phase, phase_rate = self.motion.phase + lead, self.motion.phase_rate + lead_rate

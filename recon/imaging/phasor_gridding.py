@@ -21,8 +21,8 @@ from estimation.tracker.angle_synthesis import (
 )
 from recon.imaging.gridding import OUTSIDE_INDEX, accumulate_in_parts, add_to_pixels, find_pixels
 from recon.imaging.picture import Grid
+from scanner.angle_tracks import PhasorTrack
 from scanner.errors import BadInput
-from scanner.motion import PhasorTrack
 
 POSITION_BITS = 23
 """Bits of a position across the field: all bits of a single-precision mantissa."""

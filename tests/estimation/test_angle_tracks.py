@@ -11,10 +11,10 @@ from estimation.optics.correction import BeamAngle
 from estimation.reference import absolute_reference
 from estimation.tracker.angle_synthesis import PhasorAngle, PhasorMotion
 from scanner import angle_tracks
-from scanner.angle_tracks import ChannelAngle
+from scanner.angle_tracks import AngleTrack, ChannelAngle, SampledAngle
 from scanner.channel import make_channel
 from scanner.device import Device
-from scanner.motion import AngleTrack, AxisMotion, SampledAngle
+from scanner.motion import AxisMotion
 
 RATE, START, SIZE = 1e5, 0.01, 5000
 FREQUENCY, AMPLITUDE = 700.0, 0.1

@@ -8,10 +8,11 @@ import pytest
 from estimation.harmonic_amplitude import AmplitudeCheck, check_amplitudes
 from recon.quality.amplitude_check import compare_with_signal, describe_contradictions
 from scanner import devices
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.harmonics import capacitance_harmonics, readout_response
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 IMAGING = devices.load("imaging")

@@ -53,7 +53,7 @@ class SampleAngle(DerivedAngle):
         return replace(self, track=self.track.negated(), shift=-self.shift)
 
     def advanced(self, time: Array, phase: Array, frequency: Array) -> SampleAngle:
-        """Return the positions for the motion of the mirror that is ahead (see ``scanner.motion.AngleTrack``)."""
+        """Return the positions for the motion of the mirror that is ahead (see ``scanner.angle_tracks.AngleTrack``)."""
         return replace(self, track=self.track.advanced(time, phase, frequency))
 
 

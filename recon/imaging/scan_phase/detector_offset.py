@@ -22,10 +22,11 @@ from recon.imaging.scan_phase.phase_search import (
     MIN_FOUND_FRACTION,
 )
 from recon.imaging.scan_phase.slice_search import SEARCH_ROUNDING_SD_RAD, search_slices, searched_slices
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 
 MIN_SLICES = 4
 """Slices from which a change is estimated: a line and the scatter about it."""

@@ -18,9 +18,9 @@ from phantoms.targets import make_target
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from recon.report.diagnosis import diagnosis_report
+from scanner.angle_tracks import SampledAngle
 from scanner.device import Device
 from scanner.errors import BadInput
-from scanner.motion import SampledAngle
 from scanner.optics import beam_position, intensity_delay, intensity_gain
 from scanner.recording import Recording
 from scanner.terms.term import Parameter, Term

@@ -8,7 +8,8 @@ import pytest
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from recon.imaging.pixel_noise import measure_noise, measure_sample_noise, pixel_sd
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.angle_tracks import SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 RATE_HZ = 1e6

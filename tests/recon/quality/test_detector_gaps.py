@@ -7,8 +7,9 @@ import pytest
 
 from recon.imaging.picture import Grid
 from recon.quality.detector_gaps import describe_detector_gaps, find_detector_gaps
+from scanner.angle_tracks import SampledAngle
 from scanner.channel import Channel
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 
 HALF_ANGLE, PIXELS, STRAY_LIGHT = 0.08, 100, 0.02
 RATES_HZ = {"x": 2003.0, "y": 837.0}

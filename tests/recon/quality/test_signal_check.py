@@ -9,10 +9,11 @@ from estimation.estimate import check_finite, estimate
 from recon.pipeline import reconstruct
 from recon.steps.preparation import prepare
 from recon.steps.reconstruction import Options
+from scanner.angle_tracks import SampledAngle
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.errors import BadInput
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from tests.support.simulated import imaging, with_sense
 

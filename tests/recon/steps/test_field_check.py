@@ -13,9 +13,10 @@ from recon.pipeline import reconstruct
 from recon.report.figures import UNVISITED
 from recon.steps.field_check import check_field
 from recon.steps.reconstruction import Options, Reconstruction
+from scanner.angle_tracks import SampledAngle
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from scanner.stages import Scan
 from tests.support.simulated import imaging

@@ -14,9 +14,10 @@ from recon.steps.notes import (
     describe_running_sums,
     describe_saturation,
 )
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 
 
 def detector(values: Array) -> Channel:

@@ -10,10 +10,11 @@ from skimage import data
 from skimage.transform import resize
 
 from recon.steps.sign_after_rest import find_rests, follow_signs
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from tests.support.two_axis_scan import EDGES
 
 RATE, DURATION, REST = 1e6, 0.04, 0.017

@@ -15,9 +15,10 @@ from recon.imaging.picture_kinds.picture_estimate import PICTURE_KINDS, Estimate
 from recon.imaging.picture_kinds.posterior_sd import draw_noise
 from recon.imaging.picture_kinds.posterior_solver import LANES, build_stencil, multiply, solve
 from recon.imaging.pixel_noise import measure_noise
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.errors import BadInput
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 
 RATE_HZ = 1e6

@@ -10,9 +10,10 @@ from phantoms.targets import make_target
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions, find_contradictions
 from recon.pipeline import reconstruct
 from recon.steps.reconstruction import Options
+from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.motion import AxisMotion, Motion
 from tests.support.simulated import imaging, with_sense
 
 RATE = 1e6

@@ -11,7 +11,8 @@ from recon.pipeline import reconstruct
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
 from recon.steps.reconstruction import Options
-from scanner.motion import AxisMotion, Motion, SampledAngle
+from scanner.angle_tracks import SampledAngle
+from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from tests.support.simulated import imaging
 
