@@ -251,7 +251,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_contradictions(amplitude_checks),
             *describe_motion(motion, intensity),
             *describe_defects(prepared.defects),
-            *describe_intensity(intensity),
+            *describe_intensity(beam, intensity, estimated.grid),
             *describe_coarse_sampling(beam, intensity, estimated.grid),
             *estimate.notes,
             *describe_long_frames(options.frame_time, intensity),

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from scipy.special import pdtrc
 
 from scanner.arrays import Array
 
@@ -18,6 +20,14 @@ TAIL_QUANTILE = 0.01
 LIMIT_IN_TAILS = 10.0
 """Distance of a wild sample from the median, over that of the tail. An exponential distribution of intensities exceeds
 it with a probability of 1e-17."""
+
+NEARBY_PX = 5
+"""Side of the square around a sample in which further ones of the same bright point are expected, odd [px]. A point
+whose spot has a standard deviation of 1 pixel has a seventh of its peak at 2 pixels from it."""
+
+MAX_CHANCE = 0.01
+"""Probability that as many far samples as a place shows meet there by chance, up to which they are a point of the
+scene: so many of the electric pulses, at most, count as points."""
 
 
 class WildLimits(NamedTuple):
@@ -65,6 +75,37 @@ def find_wild_samples(values: Array, limits: WildLimits) -> NDArray[np.bool_]:
         for sign, limit in ((-1.0, limits.low), (1.0, limits.high))
     )
     return (below | above) & np.isfinite(columns)
+
+
+def find_repeated(
+    values: Array, limits: WildLimits, pixel: NDArray[np.int32], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Whether more samples near the place of each are far from the median than chance brings there, (n, detectors).
+
+    Electric pulses come at any time, and thus at any place. A bright point smaller than the step of the beam between
+    two samples is far in single samples, too, but in several passes of the beam over the same pixels.
+
+    Args:
+        values, limits: as for :func:`find_wild_samples`.
+        pixel: number of the pixel of each sample, row by row, negative outside the field, shape (n,).
+        shape: height and width of the picture.
+    """
+    columns = values.reshape(len(values), -1).astype(float)
+    inside = pixel >= 0
+    repeated = np.zeros(columns.shape, bool)
+    number = _count_nearby(pixel[inside], shape)[pixel[inside]] - 1.0
+    for column, low, high, out in zip(columns.T, limits.low, limits.high, repeated.T, strict=True):
+        far = (column < low) | (column > high)
+        others = _count_nearby(pixel[inside & far], shape)[pixel[inside]] - far[inside]
+        chance = np.where(others > 0.0, pdtrc(others - 1.0, number * far.mean()), 1.0)
+        out[inside] = chance < MAX_CHANCE
+    return repeated
+
+
+def _count_nearby(pixel: NDArray[np.int32], shape: tuple[int, int]) -> Array:
+    """Number of samples within the square of ``NEARBY_PX`` around each pixel, shape (height * width,)."""
+    counts = np.bincount(pixel, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
+    return np.asarray(np.rint(NEARBY_PX**2 * uniform_filter(counts, NEARBY_PX, mode="constant"))).ravel()
 
 
 def _find_far(distance: Array, limit: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

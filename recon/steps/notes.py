@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from estimation.rail import upper_rail
+from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.picture import Grid, detector_names
 from recon.imaging.saturation import COUNT_UNITS, detector_rails
 from recon.imaging.scan_phase.doubled_frequency import describe_doubled_axes
 from recon.imaging.scan_phase.phase_agreement import describe_contradictions
-from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_wild_samples, wild_limits
+from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_repeated, find_wild_samples, wild_limits
 from recon.quality.clock_jumps import longest_segment, separate_jump
 from recon.quality.defects import Defect, describe_clipped_positions, describe_held_signals
 from recon.quality.detector_gaps import describe_blanked_directions, describe_detector_gaps
@@ -168,11 +169,17 @@ def _detector_names(intensity: Channel) -> list[str]:
     return detector_names(intensity.detectors, intensity.shape[1] if len(intensity.shape) == 2 else 1)
 
 
-def describe_intensity(intensity: Channel) -> list[str]:
-    """Lines on the values of an intensity that are doubtful."""
+def describe_intensity(beam: Motion, intensity: Channel, grid: Grid) -> list[str]:
+    """Lines on the values of an intensity that are doubtful.
+
+    Args:
+        beam: motion whose angles are on the intensity's clock.
+        intensity: shape (n,) or (n, detectors).
+        grid: the pixels.
+    """
     return [
         *describe_infinite(intensity),
-        *describe_wild_samples(intensity),
+        *describe_wild_samples(intensity, beam, grid),
         *describe_negative_counts(intensity),
         *describe_polarity(intensity),
         *describe_logarithms(intensity),
@@ -190,10 +197,20 @@ def describe_infinite(intensity: Channel) -> list[str]:
     ]
 
 
-def describe_wild_samples(intensity: Channel) -> list[str]:
-    """A line for each detector with single samples far from all others."""
+def describe_wild_samples(intensity: Channel, beam: Motion | None = None, grid: Grid | None = None) -> list[str]:
+    """A line for each detector with single samples far from all others; bright points of the scene are none.
+
+    Args:
+        intensity: shape (n,) or (n, detectors).
+        beam: motion whose angles are on the intensity's clock, grid: the pixels; None where the places of the samples
+            are unknown.
+    """
     values = intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES))
-    wild = find_wild_samples(values, wild_limits(values))
+    limits = wild_limits(values)
+    wild = find_wild_samples(values, limits)
+    if beam is not None and grid is not None and wild.any():
+        x, y = (beam.axes[axis].angle.read(0, len(values)) for axis in AXES)
+        wild &= ~find_repeated(values, limits, find_sample_pixels(x, y, grid), (grid.height, grid.width))
     lines = []
     for name, column, own in zip(_detector_names(intensity), values.reshape(len(values), -1).T, wild.T, strict=True):
         if own.any():

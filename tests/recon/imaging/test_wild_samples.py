@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.imaging.saturation import detector_rails
-from recon.imaging.wild_samples import find_wild_samples, wild_limits
+from recon.imaging.wild_samples import find_repeated, find_wild_samples, wild_limits
 from recon.pipeline import reconstruct
 from recon.steps.notes import describe_wild_samples
 from recon.steps.reconstruction import Options
@@ -40,6 +40,26 @@ def test_a_bright_point_that_is_crossed_in_several_samples_is_not_wild() -> None
     for first in range(100, 50_000, 5_000):
         light[first : first + 4] = (40.0, 300.0, 280.0, 30.0)
     assert not find_wild_samples(light, wild_limits(light)).any()
+
+
+def test_points_smaller_than_the_step_of_the_beam_are_no_pulses() -> None:
+    """Points are far in single samples of several passes; pulses among them meet at one place only by chance."""
+    rng, side = np.random.default_rng(3), 100
+    pixel = rng.integers(0, side * side, 40_000).astype(np.int32)
+    corner = rng.choice(side * (side - 3), 12, replace=False)[:, None]
+    points = np.isin(pixel, corner + np.array([0, 1, 2, side, side + 1, side + 2]))
+    pulses = rng.choice(pixel.size, WILD, replace=False)
+    light = rng.gamma(2.0, 1.0, pixel.size)
+    light[points] = 1e3
+    light[pulses] = 1e3
+    limits = wild_limits(light)
+    wild = find_wild_samples(light, limits)[:, 0]
+    repeated = find_repeated(light, limits, pixel, (side, side))[:, 0]
+    assert wild[points].mean() > 0.9
+    assert repeated[points].mean() > 0.95
+    assert repeated[pulses].mean() < 0.1
+    outside = find_repeated(light, limits, np.full_like(pixel, -1), (side, side))
+    assert not outside.any()
 
 
 @pytest.mark.parametrize("mean", [0.002, 0.05, 1.0])
