@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from estimation.estimate import estimate
 from recon.evaluation import Truth, evaluate_axis
+from recon.imaging.intensity_correction import add_drift_errors
 from recon.imaging.intensity_gridding import find_visited_pixels, grid_intensity
 from recon.imaging.picture import Grid, Picture, grid_of_scan
 from recon.imaging.picture_kinds.picture_estimate import estimate_picture
@@ -207,7 +208,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
     """Compare the motion with the truth if there is one, and collect the notes."""
     estimated, prepared = gridded.estimated, gridded.estimated.prepared
     motion, beam, intensity = estimated.motion, estimated.beam, prepared.intensity
-    noise = measure_noise(beam, intensity, estimated.grid)
+    noise = add_drift_errors(measure_noise(beam, intensity, estimated.grid), estimated.intensity_drift)
     estimate = estimate_picture(options.picture, gridded.picture, noise, beam, intensity, gridded.unlocated)
     amplitude_checks = compare_with_signal(prepared.recording, prepared.device, motion)
     samples, angles = (beam, intensity, estimated.grid, gridded.unlocated), truth.angles if truth else {}

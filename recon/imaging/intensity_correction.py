@@ -13,6 +13,7 @@ from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.intensity_drift import IntensityDrift, SampleReader, estimate_intensity_drift
 from recon.imaging.intensity_drift_equations import DriftKind
 from recon.imaging.picture import Grid
+from recon.imaging.pixel_noise import SampleNoise
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples
 from scanner.device import AXES
@@ -85,6 +86,19 @@ def correct_drift(intensity: Channel, drifts: Sequence[IntensityDrift | None]) -
 
     samples = LazySamples(intensity.shape, np.dtype(np.float64), corrected)
     return replace(intensity, raw=samples, first=0, stop=intensity.size, gain=1.0, offset=0.0)
+
+
+def add_drift_errors(
+    noise: Sequence[SampleNoise | None], drifts: Sequence[IntensityDrift | None]
+) -> tuple[SampleNoise | None, ...]:
+    """The noise of a sample of each detector, measured without the drift, with the errors of the drift.
+
+    Args:
+        noise: by detector; None where none was measured.
+        drifts: by detector; None where none was removed, and empty if none was to be removed.
+    """
+    factors = [1.0 if drift is None else drift.noise_factor for drift in drifts] or [1.0] * len(noise)
+    return tuple(None if each is None else each.scaled(k) for each, k in zip(noise, factors, strict=True))
 
 
 def describe_drift(drifts: Sequence[IntensityDrift | None], unit: str) -> list[str]:

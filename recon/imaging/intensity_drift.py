@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import rfft, rfftfreq
+from scipy.fft import irfft, rfft, rfftfreq
 from scipy.optimize import nnls
 
 from recon.imaging.intensity_drift_equations import (
@@ -22,9 +22,11 @@ from recon.imaging.intensity_drift_equations import (
     SceneSums,
     gain_weight,
     score,
+    solve_linear,
     solve_window,
     sum_blocks,
 )
+from recon.imaging.pixel_noise import measure_sample_noise
 from recon.imaging.revisits import is_revisited
 from scanner.arrays import Array
 
@@ -60,12 +62,15 @@ class IntensityDrift:
         block: samples in a block.
         values: drift of each block, for a gain relative to the mean one, shape (blocks,); the mean is 0.
         sd: standard deviation of a value.
+        noise_factor: variance of the mean of a pixel without the drift, over that by the scatter of its samples. The
+            drift is found from this scatter and reduces it, and its own error is common to samples of one moment.
     """
 
     kind: DriftKind
     block: int
     values: Array
     sd: float
+    noise_factor: float = 1.0
 
     def correct(self, intensity: Array, first: int = 0) -> Array:
         """Return samples without the drift, shape (n,).
@@ -92,8 +97,8 @@ def estimate_intensity_drift(
     """
     block = max(1, round(BLOCK_S * sample_rate))
     window = WINDOW_SAMPLES // block * block
-    nothing, model, parts = SceneSums(np.zeros(pixels + 1), np.zeros(pixels + 1)), None, []
-    scene = nothing
+    nothing, model, parts = SceneSums(np.zeros(pixels + 1), np.zeros(pixels + 1)), None, list[Array]()
+    scene, sd, noise_factor = nothing, 0.0, 1.0
     for first in range(0, size, window):
         pixel, intensity = _fill_blocks(*read(first, min(first + window, size)), pixels, block)
         if model is None:
@@ -109,14 +114,14 @@ def estimate_intensity_drift(
             return IntensityDrift(kind, block, np.zeros(-(-size // block)), 0.0)
         drift = solve_window(pixel, intensity, scene, model)
         corrected = model.remove(intensity, drift)
+        if not parts:
+            sd, noise_factor = simulate_errors(pixel, corrected, nothing, model)
         scene = scene.add(pixel, corrected, np.repeat(gain_weight(pixel, corrected, scene, drift, model), block))
         parts.append(drift)
     if model is None:
         return None
-    drift = np.concatenate(parts)
-    gain = model.gain(drift)
-    values = drift - drift.mean() if kind == "offset" else gain / gain.mean() - 1.0
-    return IntensityDrift(kind, block, values, drift_sd(model, window // block) / model.level)
+    values = _relative_values(np.concatenate(parts), model)
+    return IntensityDrift(kind, block, values, sd, noise_factor)
 
 
 def fit_drift_model(
@@ -193,11 +198,49 @@ def refit_drift_model(pixel: NDArray[np.int32], intensity: Array, nothing: Scene
     return fit_drift_model(pixel, corrected, nothing, model.rate, model.block, model.kind, relative) or model
 
 
-def drift_sd(model: DriftModel, blocks: int) -> float:
-    """Standard deviation of the drift of a block, in the intensity's unit, for noise that is the same in all blocks."""
-    precision = model.precision(rfftfreq(blocks, 1.0 / model.rate))[1:]
-    variance = model.white * model.rate
-    return float(np.sqrt(np.mean(variance / (model.free + variance * precision))))
+def simulate_errors(
+    pixel: NDArray[np.int32], corrected: Array, nothing: SceneSums, model: DriftModel
+) -> tuple[float, float]:
+    """Standard deviation of the drift of a block, and the factor of the noise of :class:`IntensityDrift`.
+
+    A drift and noise of the fitted spectrum are drawn and solved on the same path, so that both contain what the
+    crossings of this scan determine. White noise has at least the scatter of the samples without the drift: a spectrum
+    that is none of the model's can leave nothing for it.
+
+    Args:
+        pixel: as in :func:`fit_drift_model`.
+        corrected: samples without the drift, shape (n,).
+        nothing: sums without samples.
+        model: with its spectrum.
+    """
+    inside = np.where(pixel < nothing.number.size - 1, pixel, np.int32(-1))
+    measured = measure_sample_noise(inside, corrected)
+    sums = nothing.add(pixel, corrected)
+    scatter = float(np.mean(measured.variance(sums.mean[pixel[inside >= 0]]))) if measured is not None else 0.0
+    noise = np.sqrt(max(model.white * model.rate * model.block, scatter))
+    random, blocks = np.random.default_rng(0), pixel.size // model.block
+    frequency = rfftfreq(2 * blocks, 1.0 / model.rate)  # the second half separates end and beginning
+    power = np.divide(1.0, model.precision(frequency), out=np.zeros(frequency.size), where=frequency > 0.0)
+    drift = irfft(rfft(random.standard_normal(2 * blocks)) * np.sqrt(power), 2 * blocks)[:blocks]
+    sensitivity = model.sensitivity(sums)
+    effect = sensitivity[pixel]
+    drawn = effect * np.repeat(drift, model.block) + noise * random.standard_normal(pixel.size)
+    found = solve_linear(pixel, drawn, np.ones(blocks), nothing, sensitivity, model)
+    sd = float(np.std(found - drift)) / model.level
+    without = drawn - effect * np.repeat(found - np.mean(found - drift), model.block)
+    scattered, means = measure_sample_noise(inside, without), nothing.add(pixel, without)
+    if scattered is None:
+        return sd, 1.0
+    number, error = means.number[:-1], means.mean[:-1]
+    visited = number > 0.0
+    expected = float(np.sum(scattered.variance(error[visited]) / number[visited]))
+    return sd, max(float(np.sum(error**2)) / expected, 1.0) if expected > 0.0 else 1.0
+
+
+def _relative_values(drift: Array, model: DriftModel) -> Array:
+    """Drift of each block as :class:`IntensityDrift` states it, of shape (blocks,)."""
+    gain = model.gain(drift)
+    return drift - drift.mean() if model.kind == "offset" else gain / gain.mean() - 1.0
 
 
 def _fill_blocks(

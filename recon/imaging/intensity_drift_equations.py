@@ -121,7 +121,7 @@ def solve_window(pixel: NDArray[np.int32], intensity: Array, earlier: SceneSums,
         scene = earlier.add(pixel, corrected, np.repeat(weight, model.block))
         sensitivity = model.sensitivity(scene)
         linear = corrected + sensitivity[pixel] * np.repeat(drift, model.block)
-        drift = _solve_linear(pixel, linear, weight, earlier, sensitivity, model)
+        drift = solve_linear(pixel, linear, weight, earlier, sensitivity, model)
     return drift
 
 
@@ -148,7 +148,7 @@ def _noise_terms(gain: Array) -> Array:
     return np.column_stack([gain**-2, gain**-1, np.ones_like(gain)])
 
 
-def _solve_linear(
+def solve_linear(
     pixel: NDArray[np.int32], intensity: Array, weight: Array, earlier: SceneSums, sensitivity: Array, model: DriftModel
 ) -> Array:
     """Posterior mean of a drift whose effect is proportional to the given sensitivity of each pixel.

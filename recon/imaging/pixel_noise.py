@@ -43,6 +43,10 @@ class SampleNoise(NamedTuple):
     dark: float
     relative_sd: float = 0.0
 
+    def scaled(self, factor: float) -> SampleNoise:
+        """The noise with a variance that is larger by a factor."""
+        return self._replace(floor=factor * self.floor, slope=factor * self.slope)
+
     def variance(self, intensity: Array) -> Array:
         """Variance of a sample of the mean ``intensity``, of any shape."""
         return self.floor + self.slope * np.maximum(intensity - self.dark, 0.0)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.frame_axis import FrameAxis, position_axis
+from recon.imaging.intensity_correction import add_drift_errors
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, fill_holes
 from recon.imaging.picture_kinds.picture_estimate import EstimatedPicture, estimate_picture
@@ -79,6 +80,7 @@ class ScanFrames:
             if self.slices is not None:
                 intensity = self.slices.intensity_of(number, result.intensity)
             own = measure_noise(result.beam, intensity, grid, min(end - begin, MAX_NOISE_SAMPLES), begin)
+            own = add_drift_errors(own, result.intensity_drift)
             noise = own if self.slices is not None else _choose_noise(own, result.sample_noise)
             means = grid_intensity(result.beam, intensity, grid, self.unlocated, begin, end)
             data = result.beam, intensity, self.unlocated, begin, end

@@ -10,6 +10,7 @@ import pytest
 from recon.cli import main
 from recon.imaging.intensity_drift import IntensityDrift, estimate_intensity_drift, fit_drift_model
 from recon.imaging.intensity_drift_equations import DriftKind, SceneSums
+from recon.imaging.pixel_noise import measure_sample_noise
 from tests.support.simulated import imaging
 
 RATE, PIXELS, NOISE_SD = 5e6, 200, 0.1
@@ -65,6 +66,34 @@ def test_flicker_noise_at_ten_times_the_slow_axis_costs_at_most_5_percent() -> N
     assert after <= 1.05 * best < before
     error = found.values[: clean.size // found.block] - block_means(drift - drift.mean(), found.block)
     assert 0.88 <= np.mean(np.abs(error - error.mean()) < 1.96 * found.sd) <= 0.99
+
+
+@pytest.mark.parametrize("kind", ["offset", "gain"])
+def test_noise_contains_the_error_of_the_drift(kind: DriftKind) -> None:
+    """A drift of flicker noise above the noise of the samples, from few crossings.
+
+    By the scatter of the samples alone, the variance of a pixel is too small by a factor of 2.0 and 1.3.
+    """
+    pixel, clean = crossing_scan(0.004)
+    rng = np.random.default_rng(7)
+    drift = NOISE_SD * flicker(clean.size, 4e5, rng)
+    noise = NOISE_SD * rng.standard_normal(clean.size)
+    values = (clean + drift if kind == "offset" else clean * np.exp(drift)) + noise
+    found = estimate(pixel, values, PIXELS**2, RATE, kind)
+    assert found is not None
+    truth = block_means(drift - drift.mean() if kind == "offset" else np.exp(drift) / np.exp(drift).mean(), found.block)
+    error = found.values[: truth.size] - truth
+    assert 0.5 * np.std(error) < found.sd < 1.3 * np.std(error)
+    corrected = found.correct(values)
+    scatter = measure_sample_noise(pixel, corrected)
+    assert scatter is not None
+    counts = np.bincount(pixel)
+    visited = counts > 0
+    mean = np.bincount(pixel, corrected)[visited] / counts[visited]
+    scene = np.bincount(pixel, clean)[visited] / counts[visited]
+    scene *= np.exp(drift).mean() if kind == "gain" else 1.0
+    predicted = np.mean(scatter.scaled(found.noise_factor).variance(scene) / counts[visited])
+    assert np.var(mean - scene) / predicted == pytest.approx(1.0, abs=0.2)
 
 
 def test_bleaching_is_a_gain() -> None:
