@@ -28,17 +28,37 @@ GRID_SAMPLES_PER_RUN = 16
 def slowest_motions(recording: Recording, device: Device) -> dict[str, float]:
     """Frequency of the slowest motion that each sense and angle channel shows [Hz], by channel.
 
-    A channel of an axis whose frequency neither a drive nor the device nor a position signal shows is left out.
+    Left out are channels of an axis whose frequency neither a drive nor the device nor a position signal shows, and
+    those without equal samples in a row, which no :func:`find_held_runs` needs: a spectrum of the drive takes longer.
     """
+    shown = {f"{kind}_{axis}": [axis] for kind in ("sense", "angle") for axis in device.axes}
+    shown |= {"sense": list(device.axes)}
+    held = {name: axes for name, axes in shown.items() if name in recording and _has_equal_samples(recording[name])}
     frequencies = {
-        name: frequency
-        for name, axis in device.axes.items()
-        if (frequency := next(_frequencies(recording, axis, name), None)) is not None
+        axis: next(_frequencies(recording, device.axis(axis), axis), None)
+        for axis in device.axes
+        if any(axis in axes for axes in held.values())
     }
-    slowest = {f"{kind}_{name}": frequency for name, frequency in frequencies.items() for kind in ("sense", "angle")}
-    if len(frequencies) == len(device.axes):
-        slowest["sense"] = min(frequencies.values())
-    return {name: frequency for name, frequency in slowest.items() if name in recording}
+    slowest = {}
+    for name, axes in held.items():
+        known = [frequency for axis in axes if (frequency := frequencies[axis]) is not None]
+        if len(known) == len(axes):
+            slowest[name] = min(known)
+    return slowest
+
+
+def _has_equal_samples(channel: Channel) -> bool:
+    """Whether a channel has a run of ``MIN_CLIPPED_RUN_SAMPLES`` equal samples, the shortest that may be held."""
+    reach = MIN_CLIPPED_RUN_SAMPLES - 1
+    for first in range(0, channel.size, READ_CHUNK_SAMPLES):
+        values = channel.stored(first, first + READ_CHUNK_SAMPLES + reach)
+        run, length = values[1:] == values[:-1], 1
+        while length < reach:  # equal to as many samples after each
+            more = min(length, reach - length)
+            run, length = run[more:] & run[:-more], length + more
+        if run.any():
+            return True
+    return False
 
 
 def _frequencies(recording: Recording, axis: Axis, name: str) -> Iterator[float]:

@@ -6,7 +6,7 @@ import pytest
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.device_fit.predict import predict
 from estimation.filters.baselines import estimate_from_sensor
-from estimation.held_samples import find_held_runs, held_while_driven, without_held_samples
+from estimation.held_samples import find_held_runs, held_while_driven, slowest_motions, without_held_samples
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
@@ -111,3 +111,13 @@ def test_a_sensor_that_stands_still_throughout_is_refused() -> None:
         BadInput, match="sense_x: stands at one value, or lacks samples, in nearly all of the recording"
     ):
         estimate_from_sensor(held, recording.device)
+
+
+@pytest.mark.parametrize(("equal", "expected"), [(7, False), (8, True)])
+@pytest.mark.parametrize("at", [0, 500, READ_CHUNK_SAMPLES - 3, READ_CHUNK_SAMPLES + 90])
+def test_only_channels_with_equal_samples_in_a_row_are_searched(equal: int, expected: bool, at: int) -> None:
+    values = np.arange(READ_CHUNK_SAMPLES + 100) % 1000
+    values[at : at + equal] = 2000
+    recording = Recording.from_arrays({"angle_x": (values.astype(float), "rad", 1e6)})
+    device = Device("stage", {"x": Axis(drive=Drive("linear", 1.0, frequency=1000.0), name="x")})
+    assert slowest_motions(recording, device) == ({"angle_x": 1000.0} if expected else {})
