@@ -2,9 +2,9 @@
 
 python -m benchmarks.scale [disk|disk_long|disk_sensors|live|length|pixels|axes|longest ...]
 
-A scan without drift repeats every 0.1 s, so that one simulated period makes a recording of any length. Its noise
-repeats too, which does not change the cost of the tracker. Each case runs in a separate process, whose peak memory is
-measured.
+A scan without drift repeats every second, so that one simulated period makes a recording of any length. Its noise
+repeats too, but no more than ten times in 10 s: noise that repeats each 0.1 s is a pattern which the check for a moving
+sample examines at length. Each case runs in a separate process, whose peak memory is measured.
 """
 
 from __future__ import annotations
@@ -40,8 +40,13 @@ from scanner.stages import Amdm
 
 SAMPLE_RATE_HZ = 5e6
 
-PERIOD_SAMPLES = 500_000
-"""Samples after which the scan repeats: 0.1 s has whole cycles of 13840 and of 3270 Hz."""
+START_S = 0.1
+"""Time that is left out before the period: the motion is steady after it."""
+
+PERIOD_S = 1.0
+"""Time after which the scan repeats: it has whole cycles of 13840 and of 3270 Hz."""
+
+PERIOD_SAMPLES = round(PERIOD_S * SAMPLE_RATE_HZ)
 
 LENGTHS_SAMPLES = (1_000_000, 10_000_000, 100_000_000)
 """Lengths of ``measure_lengths``: 0.2, 2 and 20 s."""
@@ -97,20 +102,20 @@ class RepeatedSamples:
 
 
 def simulate_period(device: Device | None = None) -> Recording:
-    """0.1 s of the demo's scan in its steady motion; with another device if one is given."""
-    experiment = Experiment(duration=0.2, drift={})
+    """A period of the demo's scan in its steady motion; with another device if one is given."""
+    experiment = Experiment(duration=START_S + PERIOD_S, drift={})
     recording, _ = simulate_experiment(experiment if device is None else replace(experiment, device=device), seed=1)
-    return recording.slice(0.1, 0.2)
+    return recording.slice(START_S, START_S + PERIOD_S)
 
 
 def simulate_sensors() -> Recording:
-    """0.1 s of the demo's scan with two angle channels in place of drives and sense signal."""
-    recording, truth = simulate_experiment(Experiment(duration=0.2, drift={}), seed=1)
+    """A period of the demo's scan with two angle channels in place of drives and sense signal."""
+    recording, truth = simulate_experiment(Experiment(duration=START_S + PERIOD_S, drift={}), seed=1)
     channels = {"intensity": recording["intensity"]}
     for name in ("angle_x", "angle_y"):
         values, _ = truth[name]  # type: ignore[misc]
         channels[name] = make_channel(name, values, unit="rad", sample_rate=SAMPLE_RATE_HZ)
-    return replace(recording, channels=MappingProxyType(channels)).slice(0.1, 0.2)
+    return replace(recording, channels=MappingProxyType(channels)).slice(START_S, START_S + PERIOD_S)
 
 
 def with_separate_readouts(device: Device) -> Device:

@@ -21,8 +21,8 @@ from recon.sample_ranges import SampleRanges
 from scanner.channel import Channel
 from scanner.motion import Motion
 
-MAX_CHECKED_SAMPLES = 1 << 21
-"""Samples that are compared, in periods of the slower axis spread over the scan: 1 s of computing time."""
+MAX_CHECKED_SAMPLES = 1 << 20
+"""Samples that are compared, in periods of the slower axis spread over the scan: 0.5 s of computing time."""
 
 CHECKED_CELLS_ACROSS = 200
 """Cells across the field at most: 0.3 s for the pictures of all folds; a motion of half a cell blurs each edge."""
@@ -53,7 +53,7 @@ def describe_unremoved_motion(
     samples, shape = read_samples(beam, intensity, grid, cell, unlocated, parts), cells(grid, cell)
     if len(parts) < MIN_BLOCKS or not _disagrees_with_rest(samples, len(parts), length, shape):
         return []
-    motion = estimate_sample_motion(samples, period, shape)
+    motion = estimate_sample_motion(samples, period, shape, widths=(CHECK_WIDTH,))
     if motion is None or not motion.moving:
         return []
     x, y = cell * np.ptp(motion.shift, axis=0)

@@ -91,13 +91,16 @@ class SampleMotion:
         return np.stack([np.interp(sample, self.sample, each) for each in self.shift.T])
 
 
-def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int, int]) -> SampleMotion | None:
+def estimate_sample_motion(
+    samples: ScanSamples, period: float, shape: tuple[int, int], widths: Sequence[float] = WIDTHS_PX
+) -> SampleMotion | None:
     """Estimate the motion of the sample; None where the scan has too few crossings.
 
     Args:
         samples: of the scan.
         period: of the slower axis [samples].
         shape: height and width of the picture [px].
+        widths: of the kernels that are compared at rest, ascending [px].
     """
     part = max(round(period / PARTS), 1)
     length = part * PARTS
@@ -106,7 +109,7 @@ def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int
         return None
     position = np.zeros((blocks, 2))
     at_rest = part_shift(position, [])
-    width, compared = choose_width(samples, at_rest, part, shape)
+    width, compared = choose_width(samples, at_rest, part, shape, widths)
     if compared < MIN_COMPARED:
         return None
     equations = block_equations(samples, at_rest, part, shape, width)
@@ -132,13 +135,15 @@ def estimate_sample_motion(samples: ScanSamples, period: float, shape: tuple[int
     return SampleMotion(length, sample, displacement, np.sqrt(sd**2 + left), moving, gain, np.sqrt(left), per_sample)
 
 
-def choose_width(samples: ScanSamples, shift: Array, part: int, shape: tuple[int, int]) -> tuple[float, float]:
+def choose_width(
+    samples: ScanSamples, shift: Array, part: int, shape: tuple[int, int], widths: Sequence[float] = WIDTHS_PX
+) -> tuple[float, float]:
     """Return the kernel [px] whose picture of the other blocks predicts the samples best.
 
     The fraction of the samples that the narrowest kernel compares with others is returned too.
     """
-    found = [block_equations(samples, shift, part, shape, width) for width in WIDTHS_PX]
-    return WIDTHS_PX[int(np.argmin([each.misfit for each in found]))], found[0].compared
+    found = [block_equations(samples, shift, part, shape, width) for width in widths]
+    return widths[int(np.argmin([each.misfit for each in found]))], found[0].compared
 
 
 def _prediction_gain(
