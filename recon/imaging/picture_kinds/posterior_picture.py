@@ -18,6 +18,7 @@ Source: Knutsson, Westin & Andersson 2011, "Representing local structure using t
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,13 @@ STRENGTH_STEP = 1.0
 """Step between the logarithms of the prior's strengths. The ``LANES`` of them span a factor of 20, and each repetition
 is centred on the best strength of the one before."""
 
-NOISE_LEVEL_WIDTH_PX = 1.5
-"""Smoothing of the intensity by which the noise of a sample is computed: that of a single mean would correlate with
-its error [px]."""
+MIN_NOISE_LEVEL_WIDTH_PX = 1.5
+"""Least smoothing of the intensity by which the noise of a sample is computed [px]."""
+
+NOISE_LEVEL_PHOTONS = 50.0
+"""Photons over which that intensity is averaged at least: a sample that is bright by chance has a smaller weight by its
+share in them, which makes the picture darker by this share, 2 %. With 200 the weights no longer follow the scene where
+photons are few, and a brightness that rises steadily is up to 1 dB less accurate."""
 
 MIN_RELATIVE_VARIANCE = 0.02
 """Lower bound on the variance of a sample, relative to that at the mean intensity: dark pixels have noise too."""
@@ -107,7 +112,8 @@ def posterior_picture(samples: SplitSums, noise: SampleNoise, initial_strength: 
     judged = representative_weights(samples)
     mean = kernel_mean(samples.kept_sums, kept_counts, width)
     gradients = _gradient_covariance(mean, 0.0, WINDOW * width)
-    precision = _sample_precision(mean, noise, scene_variance)
+    level_width = _noise_level_width(samples, noise)
+    precision = _sample_precision(mean, level_width, noise, scene_variance)
     strength = initial_strength or width**2 * float((kept_counts * precision).mean())
     start: Fields = np.repeat(_bordered(mean)[None], LANES, axis=0).astype(np.float32)
     for _ in range(REFINEMENTS):
@@ -119,7 +125,7 @@ def posterior_picture(samples: SplitSums, noise: SampleNoise, initial_strength: 
         strength, weights = log_average(strengths, misfits)
         mean = np.tensordot(weights, _inner(start), 1)
         gradients = _gradient_covariance(mean, GRADIENT_SMOOTHING * width, WINDOW * width)
-        precision = _sample_precision(mean, noise, scene_variance)
+        precision = _sample_precision(mean, level_width, noise, scene_variance)
     stencil = build_stencil(*_weights(gradients, MEAN_POWER))
     solved = _posterior_means(stencil, means, samples.counts * precision, strengths, start, FINE_TOLERANCE)
     image = np.tensordot(weights, _inner(solved), 1)
@@ -167,9 +173,17 @@ def _add_stationary(
     return image + weight * (stationary - image), mean + weight * difference, weight
 
 
-def _sample_precision(mean: Array, noise: SampleNoise, scene_variance: float) -> Array:
-    """Inverse variance of a sample by pixel."""
-    variance = noise.variance(smooth(mean, NOISE_LEVEL_WIDTH_PX))
+def _noise_level_width(samples: SplitSums, noise: SampleNoise) -> float:
+    """Standard deviation of the kernel that averages the intensity over ``NOISE_LEVEL_PHOTONS`` [px]."""
+    above_dark = float(samples.kept_sums.mean() - noise.dark * samples.kept_counts.mean())
+    photons = above_dark / noise.slope if noise.slope > 0.0 else np.inf
+    area = NOISE_LEVEL_PHOTONS / photons if photons > 0.0 else 0.0
+    return min(max(math.sqrt(area / (4.0 * math.pi)), MIN_NOISE_LEVEL_WIDTH_PX), float(max(samples.counts.shape)))
+
+
+def _sample_precision(mean: Array, level_width: float, noise: SampleNoise, scene_variance: float) -> Array:
+    """Inverse variance of a sample by pixel; ``level_width``: smoothing of the mean [px]."""
+    variance = noise.variance(smooth(mean, level_width))
     least = max(MIN_RELATIVE_VARIANCE * variance.mean(), MIN_VARIANCE_OF_SCENE * scene_variance, 1e-30)
     return 1.0 / np.maximum(variance, least)
 

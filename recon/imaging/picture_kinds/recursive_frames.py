@@ -24,7 +24,11 @@ import numpy as np
 
 from recon.imaging.picture_kinds.held_out import SplitSums
 from recon.imaging.picture_kinds.kernel_picture import PictureEstimate
-from recon.imaging.picture_kinds.posterior_picture import MIN_VARIANCE_OF_SCENE, NOISE_LEVEL_WIDTH_PX, posterior_picture
+from recon.imaging.picture_kinds.posterior_picture import (
+    MIN_NOISE_LEVEL_WIDTH_PX,
+    MIN_VARIANCE_OF_SCENE,
+    posterior_picture,
+)
 from recon.imaging.pixel_noise import SampleNoise
 from recon.imaging.smoothing import smooth
 from scanner.arrays import Array
@@ -101,7 +105,7 @@ def _compare(own: SplitSums, noise: SampleNoise, before: CarriedFrames) -> tuple
     known = np.isfinite(before.estimate.image)
     image, sd = (np.where(known, each, 0.0) for each in (before.estimate.image, before.estimate.sd))
     unit = max(float(image[known].var()), float(np.finfo(np.float64).tiny))
-    variance = noise.variance(smooth(image, NOISE_LEVEL_WIDTH_PX)) / unit
+    variance = noise.variance(smooth(image, MIN_NOISE_LEVEL_WIDTH_PX)) / unit
     precision = known / np.maximum(variance, MIN_VARIANCE_OF_SCENE)
     information = own.kept_counts * precision
     deviation = (own.kept_sums - own.kept_counts * image) * precision / np.sqrt(unit)
