@@ -13,7 +13,7 @@ from scanner.arguments import check_type
 from scanner.arrays import Array
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block
-from scanner.motion import AxisMotion
+from scanner.motion import AxisMotion, rms_phase
 from scanner.truth import read_truth
 
 CYCLES_PER_PHASE = 4.0
@@ -28,6 +28,7 @@ class AxisEvaluation:
         time: block centres, shape (n,) [s].
         phase: phase of the truth minus phase of the estimate, shape (n,) [rad], after correction of a wrong sign.
         amplitude: relative error, estimate over truth minus 1, shape (n,).
+        true_amplitude: amplitude of the truth, shape (n,) [rad].
         angle_rmse: of the angle at the intensity's samples, after correction of a wrong sign [rad].
         mirrored: whether the estimate has the wrong one of the two signs that an even capacitance allows.
     """
@@ -35,13 +36,14 @@ class AxisEvaluation:
     time: Array
     phase: Array
     amplitude: Array
+    true_amplitude: Array
     angle_rmse: float
     mirrored: bool
 
     @property
     def phase_rmse(self) -> float:
-        """Root mean square of ``phase`` [rad]."""
-        return float(np.sqrt(np.mean(self.phase**2)))
+        """Root mean square of ``phase``, weighted with the squared amplitude [rad]."""
+        return rms_phase(self.phase, self.true_amplitude)
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,7 @@ def evaluate_axis(axis: AxisMotion, angle: Array, rate: float, start: float) -> 
         time=time,
         phase=np.angle(sign * np.conj(estimated) * true),
         amplitude=np.abs(estimated) / np.abs(true) - 1.0,
+        true_amplitude=np.abs(true),
         angle_rmse=float(np.sqrt(np.nanmean((sign * track_angle - angle) ** 2))),
         mirrored=mirrored,
     )

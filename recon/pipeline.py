@@ -45,6 +45,7 @@ from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from recon.steps.estimated_motion import EstimatedMotion
 from recon.steps.estimator_choice import choose_estimator
 from recon.steps.field_check import check_field, check_units, own_half_angle
+from recon.steps.lost_position_signals import find_lost_position_signals, leave_out_lost
 from recon.steps.notes import (
     describe_clock_jumps,
     describe_coarse_sampling,
@@ -160,7 +161,19 @@ def estimate_motion(
     notes = [*notes, *sign_notes, *motion.notes, *describe_unconfirmed_signs(recording, device, motion)]
     notes += describe_resonance_mismatch(device, motion)
     motion = without_contradicted_signs(recording, device, motion)
-    return EstimatedMotion(prepared, motion, grid, field_notes, notes)
+    return _leave_out_lost_signals(EstimatedMotion(prepared, motion, grid, field_notes, notes))
+
+
+def _leave_out_lost_signals(estimated: EstimatedMotion) -> EstimatedMotion:
+    """The motion without the times at which position signals show a mirror at rest and the light shows motion."""
+    prepared, motion = estimated.prepared, estimated.motion
+    if motion.estimator != "sensor":
+        return estimated
+    lost = find_lost_position_signals(estimated.beam, prepared.intensity, estimated.grid)
+    if not lost:
+        return estimated
+    motion, defects = leave_out_lost(motion, lost, prepared.recording)
+    return replace(estimated, motion=motion, prepared=replace(prepared, defects=(*prepared.defects, *defects)))
 
 
 def correct_sample_motion(estimated: EstimatedMotion, options: Options) -> EstimatedMotion:

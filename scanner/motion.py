@@ -20,6 +20,38 @@ UNKNOWN_PHASE_SD_RAD = float(np.pi / np.sqrt(3.0))
 """Standard deviation of a phase of which nothing is known: the largest that an estimator states."""
 
 
+def typical_amplitude(amplitude: Array) -> float:
+    """Return the mean amplitude in which each time counts by its amplitude, in the unit of ``amplitude``, shape (n,).
+
+    It is that of the swinging mirror also where the recording contains the rest before its start.
+    """
+    size = float(np.sum(amplitude))
+    return float(np.sum(amplitude * (amplitude / size))) if size > 0.0 else 0.0
+
+
+def in_proportion_to_amplitude(phase: Array, amplitude: Array) -> Array:
+    """Return phase errors times the amplitude over :func:`typical_amplitude`, shape (n,) [rad].
+
+    An error of the phase displaces a sample in proportion to the amplitude. Where the mirror nearly rests its phase is
+    not known, and displaces nothing. Errors of a steady motion are returned as they are.
+
+    Args:
+        phase: errors of the phase or their standard deviations, shape (n,) [rad].
+        amplitude: shape (n,), in any unit.
+    """
+    typical = typical_amplitude(amplitude)
+    return phase * (amplitude / typical) if typical > 0.0 else phase
+
+
+def rms_phase(phase: Array, amplitude: Array) -> float:
+    """Return the root mean square of phase errors, weighted with the squared amplitude [rad].
+
+    Args as for :func:`in_proportion_to_amplitude`, for the same reason.
+    """
+    weight = in_proportion_to_amplitude(np.ones_like(phase), amplitude)
+    return float(np.sqrt(np.sum((weight * phase) ** 2) / np.sum(weight**2)))
+
+
 @dataclass(frozen=True)
 class AxisMotion:
     """Phase and amplitude of one axis on a slow clock, and its angle at the intensity's samples.
@@ -60,7 +92,7 @@ class AxisMotion:
         return known if known.any() else np.ones_like(known)
 
     def __repr__(self) -> str:
-        sd = np.degrees(np.sqrt(np.mean(np.square(self.phase_sd[self.known]))))
+        sd = np.degrees(rms_phase(self.phase_sd[self.known], self.amplitude[self.known]))
         return (
             f"{np.median(self.frequency):.6g} Hz, amplitude {np.median(self.amplitude):.4g} rad, "
             f"phase sd {sd:.3g}° rms, {self.time.size} times, sign {self.sign}"

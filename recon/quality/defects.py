@@ -53,7 +53,10 @@ PHASE_JUMP = "leap"
 HELD = "held"
 """Kind of an interval in which a signal of the motion stands at one value for a period or longer."""
 
-KIND_NAMES = {PHASE_JUMP: "phase jump", HELD: "held at one value"}
+LOST = "lost"
+"""Kind of an interval in which a position signal shows no motion and the intensity shows one."""
+
+KIND_NAMES = {PHASE_JUMP: "phase jump", HELD: "held at one value", LOST: "no motion, while the light shows one,"}
 """Names of kinds in messages, where they differ from the text in summary.json."""
 
 
@@ -63,9 +66,9 @@ class Defect:
 
     Attributes:
         channel: name of the channel.
-        kind: ``"gap"`` (samples that are not finite), ``HELD``, ``"clipped"``, ``"missing"`` (the channel begins later
-            or ends earlier than the intensity) or ``PHASE_JUMP`` (see :mod:`recon.quality.clock_jumps`; of the
-            intensity, see :mod:`recon.quality.dropped_samples`).
+        kind: ``"gap"`` (samples that are not finite), ``HELD``, ``LOST``, ``"clipped"``, ``"missing"`` (the channel
+            begins later or ends earlier than the intensity) or ``PHASE_JUMP`` (see :mod:`recon.quality.clock_jumps`; of
+            the intensity, see :mod:`recon.quality.dropped_samples`).
         start, stop: [s] on the recording's clock.
         fraction: of the samples in the interval that are affected.
     """

@@ -21,7 +21,7 @@ from recon.steps.z_slices import ZSlices
 from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.errors import BadInput
-from scanner.motion import AxisMotion
+from scanner.motion import AxisMotion, in_proportion_to_amplitude, rms_phase, typical_amplitude
 
 FILL_FRACTIONS = (0.25, 0.5, 0.75, 0.9, 0.99)
 """Fractions of visited pixels for which the time is stated."""
@@ -105,10 +105,12 @@ def readout_as_stated_summary(result: Reconstruction, axis: str) -> dict[str, fl
     """
     if axis not in result.estimator_phase_sd:
         return None
-    sd = result.estimator_phase_sd[axis][result.motion.axes[axis].known]
+    known = result.motion.axes[axis].known
+    sd, amplitude = result.estimator_phase_sd[axis][known], result.motion.axes[axis].amplitude[known]
+    displacing, noise_sd = in_proportion_to_amplitude(sd, amplitude), angle_noise_phase(result, axis)
     return {
-        "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(sd**2)))),
-        "within_bound": blur.within_bound(result.phase_bound(axis), sd=sd, noise_sd=angle_noise_phase(result, axis)),
+        "phase_sd_deg": math.degrees(rms_phase(sd, amplitude)),
+        "within_bound": blur.within_bound(result.phase_bound(axis), sd=displacing, noise_sd=noise_sd),
         "assumed_delay_us": None if axis in result.readout_phase else 1e6 * UNDESCRIBED_DELAY_SD_S,
     }
 
@@ -123,19 +125,20 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
     """What the summary says of one axis."""
     own, bound = known_part(result.motion.axes[axis]), result.phase_bound(axis)
     error, scale = result.evaluation.get(axis), result.picture.grid.angle_scale
-    metres = result.picture.grid.metres_per_radian
+    metres, noise_sd = result.picture.grid.metres_per_radian, angle_noise_phase(result, axis)
+    displacing = displacing_phase(own, error)
     summary: dict[str, Any] = {
-        "phase_sd_deg": float(np.degrees(np.sqrt(np.mean(own.phase_sd**2)))),
+        "phase_sd_deg": math.degrees(rms_phase(own.phase_sd, own.amplitude)),
         "bound_deg": float(np.degrees(bound)),
-        "within_bound": blur.within_bound(bound, sd=own.phase_sd, noise_sd=angle_noise_phase(result, axis))
+        "within_bound": blur.within_bound(bound, sd=displacing, noise_sd=noise_sd)
         if error is None
-        else blur.within_bound(bound, error=error.phase, noise_sd=angle_noise_phase(result, axis)),
+        else blur.within_bound(bound, error=displacing, noise_sd=noise_sd),
         "sign": own.sign,
-        "amplitude_rad": scale * float(np.mean(own.amplitude)),
-        "amplitude_um": None if metres is None else 1e6 * metres * float(np.mean(own.amplitude)),
+        "amplitude_rad": scale * typical_amplitude(own.amplitude),
+        "amplitude_um": None if metres is None else 1e6 * metres * typical_amplitude(own.amplitude),
         **amplitude_uncertainty(result, axis),
         "amplitude_from": amplitude_source(result, axis),
-        "frequency_hz": None if own.reference == "blocks" else float(np.mean(own.frequency)),
+        "frequency_hz": None if own.reference == "blocks" else mean_frequency(own),
         "phase_drift_deg": float(np.degrees(np.ptp(own.phase))),
         "picture_phase_error_deg": picture_phase_error(result.phase_errors, axis),
         "readout_phase_deg": readout_phase_summary(result, axis),
@@ -151,6 +154,19 @@ def axis_summary(result: Reconstruction, axis: str) -> dict[str, Any]:
             "mirrored": error.mirrored,
         }
     return summary
+
+
+def displacing_phase(own: AxisMotion, error: AxisEvaluation | None) -> Array:
+    """Phase errors in proportion to the amplitude, or their standard deviations where the truth is not known [rad]."""
+    if error is None:
+        return in_proportion_to_amplitude(own.phase_sd, own.amplitude)
+    return in_proportion_to_amplitude(error.phase, error.true_amplitude)
+
+
+def mean_frequency(own: AxisMotion) -> float:
+    """Mean frequency of an axis, weighted with the squared amplitude [Hz]: at rest the mirror has none."""
+    weight = in_proportion_to_amplitude(np.ones_like(own.frequency), own.amplitude) ** 2
+    return float(np.average(own.frequency, weights=weight))
 
 
 def known_part(own: AxisMotion) -> AxisMotion:
@@ -170,7 +186,7 @@ def amplitude_uncertainty(result: Reconstruction, axis: str) -> dict[str, float 
     if relative is None:
         return {"amplitude_sd_rad": None, "amplitude_sd_calibration_rad": None}
     scale = result.picture.grid.angle_scale
-    calibration = scale * relative * float(np.mean(own.amplitude))
+    calibration = scale * relative * typical_amplitude(own.amplitude)
     noise = 0.0 if own.amplitude_sd is None else scale * float(np.sqrt(np.mean(own.amplitude_sd**2)))
     return {"amplitude_sd_rad": math.hypot(noise, calibration), "amplitude_sd_calibration_rad": calibration}
 
@@ -187,14 +203,13 @@ def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEv
     """Blur of one axis in pixels, by its causes (see ``recon.imaging.blur``)."""
     grid = result.picture.grid
     half = grid.half_angle_x if axis == "x" else grid.half_angle_y
-    phase = own.phase_sd if error is None else error.phase
     amplitude = np.zeros(1) if error is None else error.amplitude - np.mean(error.amplitude)
     spot = result.truth.spot_sd * result.pixels("x") if result.spot is None and result.truth else result.spot or 0.0
     return blur.blur_by_cause(
-        float(np.mean(own.amplitude)),
+        typical_amplitude(own.amplitude),
         half,
         result.pixels(axis),
-        phase,
+        displacing_phase(own, error),
         amplitude,
         spot,
         float(sample_displacement_px(result)[AXES.index(axis)]),

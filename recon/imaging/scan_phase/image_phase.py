@@ -31,7 +31,7 @@ from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
-from scanner.motion import AxisMotion, Motion
+from scanner.motion import AxisMotion, Motion, rms_phase
 from scanner.recording import Recording
 
 PERIODS_PER_PICTURE = 800
@@ -252,11 +252,8 @@ def _disagreement(axis: AxisMotion, other: AxisMotion) -> float:
 
 
 def _rms_phase_sd(axis: AxisMotion) -> float:
-    """Root mean square of the phase's standard deviation, weighted with the squared amplitude [rad].
-
-    An error of the phase moves a sample in proportion to the amplitude: where the mirror nearly rests it moves none.
-    """
-    return _rms(axis.phase_sd * axis.amplitude) / _rms(axis.amplitude)
+    """Root mean square of the phase's standard deviation [rad]."""
+    return rms_phase(axis.phase_sd, axis.amplitude)
 
 
 def _rms(values: Array) -> float:

@@ -23,7 +23,7 @@ from recon.imaging.scan_phase.readout_phase_model import (
 )
 from scanner.arrays import Array
 from scanner.device import AXES
-from scanner.motion import AxisMotion, Motion
+from scanner.motion import AxisMotion, Motion, rms_phase
 
 MIN_DRIFT_SLICES = 3
 """Slices from which the error may vary with time. In a shorter scan neighbouring parts have the holes of the picture in
@@ -259,7 +259,7 @@ def _describe_late_signals(delay: float, estimator: str) -> str:
 def _sd_as_stated(axis: AxisMotion) -> float:
     """Standard deviation of a known phase, rms [deg], if the readout is as the device file states; axis: widened."""
     variance = np.maximum(axis.phase_sd**2 - _undescribed_variance(axis), 0.0)
-    return float(np.degrees(np.sqrt(np.mean(variance[axis.known]))))
+    return float(np.degrees(rms_phase(np.sqrt(variance[axis.known]), axis.amplitude[axis.known])))
 
 
 class CommonDelay(NamedTuple):
