@@ -17,9 +17,6 @@ from scanner.arrays import Array
 from scanner.errors import BadInput
 from scanner.lowpass import run_section, section_coefficients
 
-FWHM_PER_SD = 2 * math.sqrt(2 * math.log(2))
-"""Full width at half maximum of a Gaussian over its standard deviation."""
-
 MIN_SPOT_PX = 0.5
 """Least standard deviation of a spot [scene pixels]: a sampled Gaussian is 7 % too narrow there, 0.1 % at 0.7."""
 

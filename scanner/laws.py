@@ -29,13 +29,6 @@ def capacitance_slope(theta, C0, theta0, theta_th):  # type: ignore[no-untyped-d
     return gaussian_slope(u, np.exp(-u * u), C0, theta0)
 
 
-@njit(cache=True, nogil=True)
-def capacitance_curvature(theta, C0, theta0, theta_th):  # type: ignore[no-untyped-def]
-    """d2C/dtheta2 [F/rad2]."""
-    u = (theta - theta_th) / theta0
-    return (4.0 * u * u - 2.0) / (theta0 * theta0) * C0 * np.exp(-u * u)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def electrostatic_torque(slope, voltage):  # type: ignore[no-untyped-def]
     """Torque 1/2 C'(theta) V^2 [N m] (chen2020 eq 8), towards the largest capacitance."""

@@ -38,13 +38,14 @@ VARIABLES = {
 }
 """Variables of a law by its stage."""
 
-_HEAD = 7
-"""Numbers before the coefficients: how many there are, centres, lower and upper ends of two variables."""
-
 
 @njit(cache=True, nogil=True)
 def polynomial(p, first, second):  # type: ignore[no-untyped-def]
-    """Value of a packed law at two variables: a polynomial within its range, straight beyond it."""
+    """Value of a packed law at two variables: a polynomial within its range, straight beyond it.
+
+    ``p`` holds the number of coefficients; centre, lower and upper end, each of both variables; and for each
+    coefficient the powers of both variables and its value.
+    """
     a, b = min(max(first, p[3]), p[5]), min(max(second, p[4]), p[6])
     x, y = a - p[1], b - p[2]
     value, slope_a, slope_b = 0.0, 0.0, 0.0

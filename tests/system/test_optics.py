@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from phantoms.optics import FWHM_PER_SD, Detector, blur_by_spot, detect, sample_scene
+from phantoms.optics import Detector, blur_by_spot, detect, sample_scene
 from scanner.errors import BadInput
 
 HALF_ANGLE_X, HALF_ANGLE_Y = 0.18, 0.16
@@ -36,7 +36,7 @@ def test_the_spot_has_the_given_width_in_micrometres_on_both_axes(sd_um):
 
 def test_the_spot_is_half_as_bright_at_half_its_fwhm():
     fwhm = 12.0
-    blurred = blur_by_spot(spot(), fwhm / FWHM_PER_SD, 241.0, 161.0)
+    blurred = blur_by_spot(spot(), fwhm / (2.0 * np.sqrt(2.0 * np.log(2.0))), 241.0, 161.0)
     assert blurred[80, 126] / blurred[80, 120] == pytest.approx(0.5, rel=1e-6)
     assert blurred[74, 120] / blurred[80, 120] == pytest.approx(0.5, rel=1e-6)
 

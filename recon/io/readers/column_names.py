@@ -40,6 +40,7 @@ OTHER_UNITS = (
 """Further units that a line of units may hold, in lower case."""
 
 KNOWN_UNITS = {*UNIT_SPELLINGS, *TIME_UNITS, *OTHER_UNITS}
+"""All units that a line of units may hold, in lower case."""
 
 _LABELLED = re.compile(r"^(?P<name>.*\S)\s*[(\[](?P<unit>[^()\[\]]*)[)\]]$")
 
@@ -53,9 +54,7 @@ def split_label(label: str) -> tuple[str, str]:
 def is_unit_line(fields: Sequence[str]) -> bool:
     """Whether every field of a line is a unit, bare or in brackets, or empty, and one at least is a unit."""
     bare = [field.strip().strip("()[]").strip().lower() for field in fields]
-    return any(bare) and all(
-        not each or each in UNIT_SPELLINGS or each in TIME_UNITS or each in OTHER_UNITS for each in bare
-    )
+    return any(bare) and all(not each or each in KNOWN_UNITS for each in bare)
 
 
 def name_columns(head: Sequence[Sequence[str]], width: int) -> tuple[list[str], list[str]]:
