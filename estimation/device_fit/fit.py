@@ -10,11 +10,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimation.device_fit.data import Run
 from estimation.device_fit.deviations import MIN_PULL_PROBABILITY, deviations_are_improbable
 from estimation.device_fit.model import Model
-from estimation.device_fit.noise import Whitener
+from estimation.device_fit.noise import Whitener, sample_times
 from estimation.least_squares import fit_levenberg_marquardt, laplace_neg2_log_evidence
 from estimation.parallel import map_fits, map_parallel
 from scanner.arrays import Array, Mask
@@ -98,10 +99,19 @@ def stated_values(model: Model, x: Array) -> Array:
     return np.where([f.kind == "nominal" for f in model.parameters], 0.0, x)
 
 
+def time_blocks(time: Array) -> NDArray[np.intp]:
+    """Number of the block in which each of ``time``, as a fraction of the recording, lies."""
+    return np.floor(time * TIME_BLOCKS).astype(np.intp)
+
+
+def _is_held_out(time: Array) -> Mask:
+    """Whether ``time``, as a fraction of the recording, lies in a block that is held out."""
+    return np.asarray(time_blocks(time) % VALIDATION_BLOCK_INTERVAL == VALIDATION_BLOCK_INTERVAL // 2)
+
+
 def held_out_samples(size: int, guard: tuple[int, int] = (0, 0)) -> Mask:
     """Samples of a channel that no fit uses, shape (size,): every fifth block, without the guards at its ends."""
-    block = np.floor((np.arange(size) + 0.5) / size * TIME_BLOCKS).astype(int)
-    rows = block % VALIDATION_BLOCK_INTERVAL == VALIDATION_BLOCK_INTERVAL // 2
+    rows = _is_held_out(sample_times(size))
     rows[: guard[0]] = False
     rows[size - guard[1] :] = False
     return rows
@@ -126,8 +136,7 @@ class Likelihood:
         self.time = np.concatenate([whitener.time for whitener in flat])
         self.channel = np.concatenate([np.full(whitener.samples, i) for i, whitener in enumerate(flat)])
         compared = np.concatenate([whitener.keep for whitener in flat])
-        block = np.floor(self.time * TIME_BLOCKS).astype(int)
-        validation = block % VALIDATION_BLOCK_INTERVAL == VALIDATION_BLOCK_INTERVAL // 2
+        validation = _is_held_out(self.time)
         self.rows, self.validation_rows = compared & ~validation, compared & validation
         self._whitened: dict[tuple[int, str, str, float], Array] = {}
 

@@ -69,7 +69,7 @@ class Whitener:
     @property
     def time(self) -> Array:
         """Position of every whitened sample as a fraction of the recording."""
-        return (np.arange(self.samples) + 0.5) / self.samples
+        return sample_times(self.samples)
 
     def __call__(self, residual: Array) -> Array:
         """Whitened residual, shape (samples,).
@@ -83,11 +83,16 @@ class Whitener:
         return np.asarray(idct(dct(mirrored, norm="ortho")[: self.samples] * self.weights, norm="ortho"))
 
 
+def sample_times(samples: int) -> Array:
+    """Middle of every sample of a channel as a fraction of the recording, shape (samples,)."""
+    return (np.arange(samples) + 0.5) / samples
+
+
 def make_whitener(psd: Array, size: int, guard: tuple[int, int], first: float = 0.0) -> Whitener:
     """Whitener for noise of variance ``psd``, shape (m,), in the bins of a residual of ``size`` samples."""
     samples = 2 * (psd.size - 1)
     weights = np.sqrt(size) * np.exp(-0.5 * np.interp(0.5 * np.arange(samples), np.arange(psd.size), np.log(psd)))
-    time = (np.arange(samples) + 0.5) / samples
+    time = sample_times(samples)
     keep = (time >= guard[0] / size) & (time < 1.0 - guard[1] / size)
     return Whitener(size, weights, keep, guard, psd, first)
 

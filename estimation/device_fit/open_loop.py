@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import TIME_BLOCKS, Likelihood, fit_model, held_out_samples
+from estimation.device_fit.fit import Likelihood, fit_model, held_out_samples, time_blocks
 from estimation.device_fit.initial import fit_initial_state, flat_whiteners, window_schedule
 from estimation.device_fit.model import Model
+from estimation.device_fit.noise import sample_times
 from scanner.arrays import Array
 from scanner.device import Device
 
@@ -73,7 +74,7 @@ def open_loop(runs: Sequence[Run], device: Device) -> dict[str, OpenLoop]:
                 rows = held_out_samples(output.data.size, output.guard)
                 error = np.nan_to_num(output.data - signal, nan=DIVERGED_ERROR)
                 error = np.clip(error, -DIVERGED_ERROR, DIVERGED_ERROR)
-                blocks = np.floor((np.arange(error.size) + 0.5) / error.size * TIME_BLOCKS)[rows]
+                blocks = time_blocks(sample_times(error.size))[rows]
                 squares = [float(np.mean(error[rows][blocks == block] ** 2)) for block in np.unique(blocks)]
                 squared_errors.setdefault(output.name, []).append(np.array(squares))
                 data.setdefault(output.name, []).append(output.data[rows])

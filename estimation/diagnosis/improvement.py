@@ -11,7 +11,8 @@ import numpy as np
 from estimation.candidate_terms.discrepancy import is_discrepancy
 from estimation.candidate_terms.significance import DETECTION_THRESHOLD, held_out_gain, residual_is_noise
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import TIME_BLOCKS, Fit, fit_model, held_out_samples, misfit
+from estimation.device_fit.fit import Fit, fit_model, held_out_samples, misfit, time_blocks
+from estimation.device_fit.noise import sample_times
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.identifiability import determined_parameters
@@ -208,7 +209,7 @@ def remaining_offset(residual: Array, guard: tuple[int, int] = (0, 0)) -> float:
     Source: positive-part estimator, James & Stein, Proc. 4th Berkeley Symp. 1, 361 (1961).
     """
     size = residual.size
-    block = np.floor((np.arange(size) + 0.5) / size * TIME_BLOCKS)
+    block = time_blocks(sample_times(size))
     used = ~held_out_samples(size)
     used[: guard[0]] = used[size - guard[1] :] = False
     means = np.array([residual[used & (block == one)].mean() for one in np.unique(block[used])])
