@@ -199,29 +199,25 @@ class Model:
 
         Those of a diverging trajectory are not finite.
         """
-        axes = {name: self.nominal(name, x) for name in self.axes}
         with np.errstate(over="ignore", invalid="ignore"):
-            return [self._run_outputs(run, r, axes, x, stop) for r, run in enumerate(self.runs)]
+            return [self._run_outputs(r, x, stop) for r in range(len(self.runs))]
 
-    def full_signals(self, x: Array, r: int = 0) -> list[Array]:
-        """Every channel of one run on the integration grid, each shape (n + 1,), without additive waveforms."""
+    def full_signals(self, x: Array) -> list[Array]:
+        """Every channel of the first run on the integration grid, shape (n + 1,), without additive waveforms."""
         without_additive = np.where([spec.kind == "additive" for spec in self.parameters], 0.0, x)
-        return self._signals(
-            self.runs[r], r, {name: self.nominal(name, x) for name in self.axes}, without_additive, 1.0
-        )
+        return self._signals(0, without_additive, 1.0)
 
-    def _run_outputs(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
-        signals = self._signals(run, r, axes, x, stop)
-        return [self._offset(o, o.sampled(signal), r, x) for o, signal in zip(run.outputs, signals, strict=True)]
+    def _run_outputs(self, r: int, x: Array, stop: float) -> list[Array]:
+        signals = zip(self.runs[r].outputs, self._signals(r, x, stop), strict=True)
+        return [self._offset(output, output.sampled(signal), r, x) for output, signal in signals]
 
-    def _signals(self, run: Run, r: int, axes: dict[str, Axis], x: Array, stop: float) -> list[Array]:
-        active = {name: self.active_terms(name, r, x) for name in run.inputs}
-        trajectories = self.trajectories(run, r, axes, active, x, stop)
+    def _signals(self, r: int, x: Array, stop: float) -> list[Array]:
+        trajectories = self.trajectories(r, x, stop)
         signals = []
-        for output in run.outputs:
+        for output in self.runs[r].outputs:
             of_channel = [trajectories[name] for name in output.axes]
             if output.kind == "sense":
-                readout = axes[output.axes[0]].readout
+                readout = self.nominal(output.axes[0], x).readout
                 assert readout is not None
                 indices, waveforms = self._pre_saturation_basis.get((r, output.name), _EMPTY_BASIS)
                 signals.append(
@@ -233,17 +229,19 @@ class Model:
                 signals.append(reference_signal(of_channel[0], output.kind))
         return signals
 
-    def trajectories(self, run: Run, r: int, axes: dict[str, Axis], added: dict[str, tuple[ActiveTerm, ...]], x: Array,
-              stop: float) -> dict[str, AxisTrajectory]:  # fmt: skip
-        """Trajectories of all axes of one run."""
+    def trajectories(self, r: int, x: Array, stop: float = 1.0) -> dict[str, AxisTrajectory]:
+        """Trajectories of all axes of run ``r``, up to the fraction ``stop`` of the recording."""
+        run = self.runs[r]
+        axes = {name: self.nominal(name, x) for name in run.inputs}
+        active = {name: self.active_terms(name, r, x) for name in run.inputs}
 
         def simulate(name: str, inputs: DriveInput, start: tuple[float, float], other: Array | None) -> AxisTrajectory:
             if other is not None:
-                return simulate_axis(axes[name], added[name], inputs, start, other)
-            return self._trajectories.trajectory(MotionRequest(r, axes[name], added[name], start, inputs))
+                return simulate_axis(axes[name], active[name], inputs, start, other)
+            return self._trajectories.trajectory(MotionRequest(r, axes[name], active[name], start, inputs))
 
         inputs = {name: _truncate(drive, stop) for name, drive in run.inputs.items()}
-        coupled = any(drive.term.couples_motions for terms in added.values() for drive in terms)
+        coupled = any(each.term.couples_motions for terms in active.values() for each in terms)
         starts = {name: self.start(name, r, x) for name in run.inputs}
         return simulate_coupled(inputs, starts, coupled, simulate)
 

@@ -10,7 +10,6 @@ import numpy as np
 from estimation.device_fit.fit import Fit, Likelihood
 from estimation.least_squares import Z_95
 from scanner.arrays import Array
-from scanner.forward_model import AxisTrajectory
 
 POSTERIOR_DRAWS = 40
 """Draws from the posterior for a 95 % band. The ends of the band have a standard error of a tenth of its width."""
@@ -20,16 +19,6 @@ PORTRAIT_CELLS = 24
 
 PICTURE_HALF_WIDTH_PX = 200
 """Pixels from the middle of a line to its end, in a picture of 400 pixels."""
-
-
-def axis_trajectories(fit: Fit, x: Array, run_index: int) -> dict[str, AxisTrajectory]:
-    """The trajectory of every axis of one run at the parameters ``x``."""
-    model = fit.model
-    run = model.runs[run_index]
-    axes = {name: model.nominal(name, x) for name in model.axes}
-    return model.trajectories(
-        run, run_index, axes, {name: model.active_terms(name, run_index, x) for name in run.inputs}, x, 1.0
-    )
 
 
 def draw_parameters(fit: Fit, count: int = POSTERIOR_DRAWS) -> Array:
@@ -49,7 +38,7 @@ def phase_portrait(
     outputs_before = sum(len(run.outputs) for run in likelihood.runs[:run_index])
     output = likelihood.runs[run_index].outputs[channel_index]
     of_channel = likelihood.channel == outputs_before + channel_index
-    trajectory = axis_trajectories(final, final.x, run_index)[output.axes[0]]
+    trajectory = final.model.trajectories(run_index, final.x)[output.axes[0]]
     at = likelihood.time[of_channel] * output.data.size * output.stride + output.first
     grid = np.arange(trajectory.angle.size)
     row, column = (
@@ -95,7 +84,7 @@ def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int, points: int
     at = np.linspace(0, len(run.inputs[axis].voltage), points * 16 + 1).astype(np.intp)
 
     def phasor(fit: Fit, x: Array) -> Array:
-        trajectory = axis_trajectories(fit, x, run_index)[axis]
+        trajectory = fit.model.trajectories(run_index, x)[axis]
         return np.asarray(trajectory.angle[at] - 1j * trajectory.rate[at] / scales.rate)
 
     def mean_phase(product: Array) -> Array:

@@ -89,14 +89,7 @@ def beyond_measured_laws(recording: Recording, device: Device) -> dict[str, floa
         return {}
     run = prepare_run(recording, device)
     model, x = fit_start_only([run], device)
-    trajectories = model.trajectories(
-        run,
-        0,
-        {name: model.nominal(name, x) for name in model.axes},
-        {name: model.active_terms(name, 0, x) for name in run.inputs},
-        x,
-        1.0,
-    )
+    trajectories = model.trajectories(0, x)
     sensed = dict(zip((output.name for output in run.outputs), model.full_signals(x), strict=True))
     fractions = {}
     for name, law in laws.items():

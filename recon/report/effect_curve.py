@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
 from estimation.device_fit.fit import Fit
 from estimation.device_fit.parameters import Candidate
-from estimation.device_fit.posterior import axis_trajectories, draw_parameters
+from estimation.device_fit.posterior import draw_parameters
 from scanner.active_terms import ActiveTerm, with_constants
 from scanner.arrays import Array
 from scanner.forward_model import AxisTrajectory, apply_channel_terms, effective_drive, sense_signal
@@ -133,7 +133,7 @@ def _state_curve(
     fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], run_index: int, bins: int
 ) -> EffectCurve | None:
     """The change by an effect over the variable that explains most of its variance."""
-    trajectory = axis_trajectories(fit, fit.x, run_index)[candidate.axis]
+    trajectory = fit.model.trajectories(run_index, fit.x)[candidate.axis]
     other_terms = tuple(active for active in trajectory.active_terms if active.term is not candidate.term)
     nominal = fit.model.nominal(candidate.axis, fit.x)
     without = replace(trajectory, axis=with_constants(nominal, other_terms), active_terms=other_terms)

@@ -10,7 +10,6 @@ import pytest
 from estimation.device_fit.posterior import (
     PICTURE_HALF_WIDTH_PX,
     PORTRAIT_CELLS,
-    axis_trajectories,
     phase_error,
     phase_portrait,
     waveform,
@@ -21,7 +20,7 @@ from tests.support.ringdown import RINGDOWN, perfect_fit
 
 def test_the_portrait_shows_a_residual_at_the_state_of_the_mirror() -> None:
     likelihood, fit = perfect_fit(None)
-    trajectory = axis_trajectories(fit, fit.x, 0)["x"]
+    trajectory = fit.model.trajectories(0, fit.x)["x"]
     at = likelihood.time * RINGDOWN.outputs[0].data.size * RINGDOWN.outputs[0].stride
     angle = np.interp(at, np.arange(trajectory.angle.size), trajectory.angle)
     right, flat = phase_portrait(likelihood, fit, [np.where(angle > 0.0, 3.0, 1.0), np.full(angle.size, 2.0)], 0, 0)
