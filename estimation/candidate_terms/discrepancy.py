@@ -31,6 +31,10 @@ FORCE_POWERS = tuple((i, n - i) for n in range(2, FORCE_DEGREE + 1) for i in ran
 N_FORCE_POWERS = len(FORCE_POWERS)
 """Number of coefficients of the force polynomial."""
 
+PROFILE_POWERS = (1, 3, 4, 5, 6)
+"""Powers of (angle - theta_th) / theta0 in the extra capacitance, in the order of its coefficients. The powers 0 and 2
+change height and width of the comb's Gaussian, which are nominal values."""
+
 FORCE_DRIFT_COSINES = 3
 """Number of cosines over the duration for the drift of stiffness and damping in ``free-mechanics``. Three describe a
 monotonic drift; other drifts are described by ``free-stiffness``."""
@@ -139,8 +143,8 @@ def _profile(theta, p, nominal):  # type: ignore[no-untyped-def]
     u = (theta - nominal.theta_th) / nominal.theta0
     gaussian = nominal.C0 * np.exp(-u * u)
     value, slope = 0.0, 0.0
-    for i in range(5):
-        n = (1, 3, 4, 5, 6)[i]
+    for i in range(len(PROFILE_POWERS)):
+        n = PROFILE_POWERS[i]
         value += p[i] * u**n
         slope += p[i] * (n * u ** (n - 1) - 2.0 * u ** (n + 1))
     return gaussian * value, gaussian * slope / nominal.theta0
@@ -268,7 +272,7 @@ DISCREPANCY_TERMS: dict[str, Term] = {
         ),
         Term(
             "free-capacitance", "capacitance", "C(θ) + C0 exp(−u²) Σ a_n uⁿ",
-            tuple(Parameter(f"a{n}", "1", lambda s: 0.07) for n in (1, 3, 4, 5, 6)),
+            tuple(Parameter(f"a{n}", "1", lambda s: 0.07) for n in PROFILE_POWERS),
             SOURCE, capacitance=_profile, applies=lambda axis, scales: axis.capacitance is not None,
         ),
         Term(

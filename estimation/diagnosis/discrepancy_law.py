@@ -12,6 +12,7 @@ from estimation.candidate_terms.discrepancy import (
     GAIN_COSINES,
     MAPPING_KNOTS,
     PLAY_HALF_WIDTHS,
+    PROFILE_POWERS,
     apply_play,
 )
 from estimation.device_fit.fit import Fit
@@ -100,7 +101,7 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
             return [Section(waves("k"), "stiffness error / k", "1", time, "time (s)")]
         case "free-capacitance":
             span = 1.5 * u
-            profile = {f"a{n}": np.exp(-(span**2)) * span**n for n in (1, 3, 4, 5, 6)}
+            profile = {f"a{n}": np.exp(-(span**2)) * span**n for n in PROFILE_POWERS}
             return [Section(profile, "extra capacitance / C0", "1", span, "angle / theta0")]
         case "free-drive":
             static, slopes = {"v0": u, "v2": u**2, "v3": u**3}, {"v1": u, "v5": u**3}

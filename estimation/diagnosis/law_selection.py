@@ -28,7 +28,7 @@ from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
 from estimation.device_fit.initial import refit_under_own_noise
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.necessity import NO_LAWS, Need, need_of_laws
-from estimation.diagnosis.rival_laws import MAX_ALTERNATIVES, near_rivals, stated_confounders
+from estimation.diagnosis.rival_laws import MAX_ALTERNATIVES, best_not_fitted, near_rivals, stated_confounders
 from estimation.parallel import map_fits
 
 MAX_LINEARISATIONS = 8
@@ -230,12 +230,9 @@ def _further_additions(centre: _Centre, fitted: Collection[Effects]) -> dict[Eff
 
     They are tried where the sensitivities of the one that the linear model proposed were wrong.
     """
-    linear, best = centre.linear, dict[Effects, tuple[int, ...]]()
+    linear = centre.linear
     more = [(*centre.laws, i) for i in range(len(linear.laws)) if not linear.effects([i]) & centre.effects]
-    for laws in sorted(more, key=lambda one: linear.without_discrepancy(one).neg2_log_evidence):
-        if (effects := linear.effects(laws)) not in fitted:
-            best.setdefault(effects, laws)
-    return dict(list(best.items())[:MAX_ALTERNATIVES])
+    return best_not_fitted(linear, more, fitted)
 
 
 def _fit_sets(

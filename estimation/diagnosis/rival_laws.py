@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from estimation.candidate_terms.linear_model import Effects, Hypothesis, LinearModel
 from estimation.candidate_terms.significance import DETECTION_THRESHOLD
@@ -48,8 +48,18 @@ def stated_confounders(
             is_stated = other.term.effect in own.term.confounders or own.term.effect in other.term.confounders
             if is_stated and other.axis == own.axis and not present:
                 sets.append((*rest, i))
+    return best_not_fitted(linear, sets, fitted)
+
+
+def best_not_fitted(
+    linear: LinearModel, sets: Iterable[tuple[int, ...]], fitted: Collection[Effects]
+) -> dict[Effects, tuple[int, ...]]:
+    """Sets of laws with the best evidence without a discrepancy, one for each effects that have not been fitted.
+
+    They are up to ``MAX_ALTERNATIVES``, the best first.
+    """
     best: dict[Effects, tuple[int, ...]] = {}
-    for one in sorted(sets, key=lambda each: linear.without_discrepancy(each).neg2_log_evidence):
-        if (effects := linear.effects(one)) not in fitted:
-            best.setdefault(effects, one)
+    for laws in sorted(sets, key=lambda one: linear.without_discrepancy(one).neg2_log_evidence):
+        if (effects := linear.effects(laws)) not in fitted:
+            best.setdefault(effects, laws)
     return dict(list(best.items())[:MAX_ALTERNATIVES])
