@@ -22,6 +22,7 @@ from scanner.device import Axis, Device
 from scanner.forward_model import AxisTrajectory, DriveInput, apply_channel_terms, beside_each_other, effective_drive
 from scanner.integrator.nodes import nodes_to_samples, to_nodes
 from scanner.recording import Recording
+from scanner.replaced_samples import with_samples
 from scanner.stages import Amdm
 
 Terms = Mapping[str, Sequence[ActiveTerm]]
@@ -222,8 +223,3 @@ def trajectory(axis: Axis, terms: tuple[ActiveTerm, ...], drive: DriveInput, ang
     extended = np.append(angle, 2.0 * angle[-1] - angle[-2])
     omega = np.gradient(extended, drive.step)
     return AxisTrajectory(axis, terms, drive, extended, omega, nodes_to_samples(drive.voltage))
-
-
-def with_samples(channel: Channel, values: Array) -> Channel:
-    """The channel with other samples, given in its unit."""
-    return replace(channel, raw=values, first=0, stop=values.size, gain=1.0, offset=0.0)

@@ -37,7 +37,6 @@ from estimation.term_absorption import (
     with_clocks,
     with_drives,
     with_outputs,
-    with_samples,
     without_visible_clipping,
 )
 from scanner.active_terms import ActiveTerm, stated_terms
@@ -48,6 +47,7 @@ from scanner.device import Device
 from scanner.forward_model import AxisTrajectory, beside_each_other, reference_signal, sense_signal
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
+from scanner.replaced_samples import with_samples
 
 NominalEstimator = Callable[[Recording, Device], Motion]
 """Estimates the motion of a device without terms."""

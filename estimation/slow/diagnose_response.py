@@ -10,6 +10,7 @@ import numpy as np
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
+from estimation.slow.diagnose import MIN_REMAINDER
 from estimation.slow.response import AMPLITUDE_LAWS, FEEDTHROUGH, SECOND_MODE, Response, ResponseFit, fit_response
 from estimation.slow.response_selection import fit_subsets, prediction_error, select_effects, with_common_modes
 from scanner.device import Axis, Device
@@ -18,9 +19,6 @@ from scanner.terms.driven_modes import EFFECT as DRIVEN_MODES
 
 MAX_CONSISTENT_ERROR = 0.05
 """Error on held-out tones, as a fraction of the response, up to which a fit may be called consistent."""
-
-MIN_REMAINDER = 0.005
-"""Share of the misfit below which no remainder is reported: the accuracy of a share."""
 
 METRIC = "error of the response on tones not used in the fit, as a fraction of the response (rms)"
 

@@ -24,8 +24,9 @@ from estimation.tracker import PhaseMeasurement, track
 from estimation.tracker.drive_only import track_drive_only
 from recon.imaging.picture import Grid
 from recon.imaging.scan_phase.bidirectional_phase import PERIODS_PER_SLICE, measure_motion_phase_errors, slow_period
-from recon.imaging.scan_phase.frequency_phase import phases_from_picture
+from recon.imaging.scan_phase.frequency_phase import PERIODS_PER_PICTURE, phases_from_picture
 from recon.imaging.scan_phase.phase_error import PhaseError
+from recon.imaging.scan_phase.phase_search import cut_slices
 from recon.imaging.scan_phase.response_phase import check_response
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -33,9 +34,6 @@ from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion, rms_phase
 from scanner.recording import Recording
-
-PERIODS_PER_PICTURE = 800
-"""Periods of the slower axis that share one picture. It bounds the memory and the change of the specimen within it."""
 
 MAX_ROUNDS = 6
 """Rounds after which the iteration ends. Two or three are usual."""
@@ -104,7 +102,8 @@ def refine_motion(
     before = motion
     while rounds < MAX_ROUNDS and not ended:
         # In the first round amplitudes are wrong too and change, so slices far apart in time share no picture.
-        windows = registration_windows(motion, intensity, PERIODS_PER_PICTURE if rounds else PERIODS_PER_SLICE)
+        periods = PERIODS_PER_PICTURE if rounds else PERIODS_PER_SLICE
+        windows = cut_slices(intensity, slow_period(motion) * periods)
         errors = measure_motion_phase_errors(beam_motion(motion, device, recording.start), intensity, grid, windows)
         found = {name: _measured_phase(errors, motion.axes[name], name, flips.get(name, False)) for name in refined}
         # The first round compares each slice with a picture of its own.
@@ -171,22 +170,6 @@ def _smooth(
         return resolve_signs(smooth(compensated, nominal, referred), compensated, flips)
 
     return estimate_with_terms(recording, device, run, treats_clipping=True)
-
-
-def registration_windows(motion: Motion, intensity: Channel, periods: int) -> list[tuple[int, int]]:
-    """Cut the scan into equal parts.
-
-    Args:
-        motion: of the scan.
-        intensity: whose samples are cut.
-        periods: approximate length of a part in periods of the slower axis.
-
-    Returns:
-        Samples (first, stop) of each part.
-    """
-    parts = max(1, round(intensity.size / intensity.sample_rate / slow_period(motion) / periods))
-    edges = np.linspace(0, intensity.size, parts + 1).round().astype(int)
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
 def _measured_phase(errors: list[PhaseError], axis: AxisMotion, name: str, flipped: bool) -> PhaseMeasurement:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import logsumexp
 
+from estimation.curve_smoother import NOISE_FACTORS
 from recon.imaging.normal_density import normal_log_density
 from scanner.arrays import Array
 
@@ -47,9 +48,6 @@ changes better than the picture."""
 SENSE_ERROR_TIMES_S = (1e-3, *DRIFT_TIMES_S)
 """Correlation times τ of the estimator's error, equally probable: half decades down to 1 ms, which the error has in 1/f
 noise beside an amplifier's resonance. It is longer in white noise."""
-NOISE_FACTORS = np.array([1.0, 2.0, 4.0])
-"""Factors on the standard errors of the measurements, equally probable. Detail that the registration does not resolve
-acts on short parts as additional noise."""
 PRIOR_PROBABILITY_AS_STATED = 0.5
 """Prior probability that the delay is zero, and independently that all constants of single axes are, and that the
 varying part is: no preference either way."""
