@@ -11,11 +11,12 @@ import numpy as np
 from estimation.device_fit.data import output_channels
 from estimation.device_fit.fit import fit_model
 from estimation.device_fit.model import Model
-from estimation.diagnosis.diagnose import Diagnosis, diagnose, nominal_device
+from estimation.diagnosis.diagnose import Diagnosis, diagnose
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.selection import Progress
 from estimation.diagnosis.undriven import steady_without_drive
 from estimation.held_samples import held_while_driven
+from estimation.signals import require_device
 from estimation.slow.diagnose import diagnose_decays, slow_decays
 from estimation.slow.diagnose_response import diagnose_responses
 from estimation.slow.response import frequency_responses
@@ -74,7 +75,7 @@ def diagnose_with_optics(
     Raises:
         BadInput: no device, or a recording that cannot be compared with it.
     """
-    nominal = nominal_device(recordings, device)
+    nominal = require_device(recordings[0], device)
     diagnosis = _diagnose_motion(recordings, nominal, progress)
     pictures = [each for each in recordings if "intensity" in each and set(nominal.axes) == set(AXES)]
     try:

@@ -50,9 +50,8 @@ def require_device(recording: Recording, device: Device | None) -> Device:
     """
     chosen = device or recording.device
     if chosen is None:
-        raise DeviceInvalid(
-            "states no device", file=recording.path, channel="/device", hint="give one with --device FILE"
-        )
+        hint = "give one with --device, or record it under /device"
+        raise DeviceInvalid("states no device", file=recording.path, channel="/device", hint=hint)
     return chosen
 
 

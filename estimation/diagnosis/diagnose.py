@@ -18,8 +18,8 @@ from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
 from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
 from estimation.parallel import map_fits
+from estimation.signals import require_device
 from scanner.device import Device
-from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.terms import Term, catalogue
 
@@ -103,7 +103,7 @@ def diagnose(
     Raises:
         BadInput: no device, or a recording that cannot be compared with it.
     """
-    nominal = nominal_device(recordings, device)
+    nominal = require_device(recordings[0], device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
     diagnosis = _diagnose_with_modes(runs, nominal, progress, excluded)
     return replace(diagnosis, findings=with_held_drives(diagnosis.findings, recordings))
@@ -145,19 +145,6 @@ def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress, excl
             return diagnosis
         rejected = {step.candidate.term.effect for step in result.steps}
         terms = {effect: term for effect, term in terms.items() if effect not in rejected}
-
-
-def nominal_device(recordings: Sequence[Recording], device: Device | None) -> Device:
-    """The stated device, or else that of the first recording.
-
-    Raises:
-        BadInput: neither is given.
-    """
-    nominal = device or recordings[0].device
-    if nominal is None:
-        hint = "give one with --device, or record it under /device"
-        raise BadInput("states no device", file=recordings[0].path, hint=hint)
-    return nominal
 
 
 def build_diagnosis(result: SelectionResult) -> Diagnosis:

@@ -48,21 +48,19 @@ def identify_files(
     from contextlib import ExitStack
 
     from estimation.identification.calibrate import identify
+    from estimation.signals import require_device
     from recon.io.convert import check_different, open_any
     from recon.io.output import check_folder, replacing_folder, write_json
     from recon.report.conclusions import conclude_identification
     from recon.report.identification import identification_report
     from scanner import devices
-    from scanner.errors import BadInput
 
     check_different(paths)
     check_folder(output)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
-        nominal = devices.find(device) if device else next((r.device for r in recordings if r.device), None)
-        if nominal is None:
-            hint = "give one with --device, or record it under /device"
-            raise BadInput("states no device", file=paths[0], channel="/device", hint=hint)
+        first = next((recording for recording in recordings if recording.device), recordings[0])
+        nominal = require_device(first, devices.find(device) if device is not None else None)
         identification = identify(recordings, nominal)
     summary: dict[str, Any] = {
         "recordings": [str(path) for path in paths],

@@ -42,19 +42,16 @@ def predict_file(
     import numpy as np
 
     from estimation.device_fit.predict import beyond_measured_laws, drifts, predict
+    from estimation.signals import require_device
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder, write_json
     from recon.report.conclusions import conclude_prediction
     from scanner import devices
-    from scanner.errors import BadInput
     from scanner.recording import Recording
 
     check_folder(output)
     with open_any(path, mapping) as recording:
-        used = devices.find(device) if device is not None else recording.device
-        if used is None:
-            hint = "give one with --device, or record it under /device"
-            raise BadInput("states no device", file=path, channel="/device", hint=hint)
+        used = require_device(recording, devices.find(device) if device is not None else None)
         predictions = predict(recording, used)
         channels = {name: (p.values, p.unit, p.sample_rate, p.start) for name, p in predictions.items()}
         predicted = Recording.from_arrays(channels, device=used, name=f"{recording.name}, predicted")
