@@ -45,11 +45,10 @@ from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from recon.steps.estimated_motion import EstimatedMotion
 from recon.steps.estimator_choice import choose_estimator
 from recon.steps.field_check import check_field, check_units, own_half_angle
+from recon.steps.intensity_notes import describe_coarse_sampling, describe_intensity
 from recon.steps.lost_position_signals import find_lost_position_signals, leave_out_lost
 from recon.steps.notes import (
     describe_clock_jumps,
-    describe_coarse_sampling,
-    describe_intensity,
     describe_limits,
     describe_long_frames,
     describe_motion,

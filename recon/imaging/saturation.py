@@ -28,10 +28,9 @@ of a sample at most."""
 
 def detector_rails(intensity: Channel) -> list[tuple[float, int] | None]:
     """Return the value at which each detector saturates and the number of checked samples there; None without."""
-    count = min(intensity.size, MAX_CHECKED_SAMPLES)
-    values = intensity.read(0, count)
+    values = intensity.read(0, MAX_CHECKED_SAMPLES)
     usable = usable_samples(values, wild_limits(values))
-    finite = [column[use] for column, use in zip(values.reshape(count, -1).T, usable.T, strict=True)]
+    finite = [column[use] for column, use in zip(values.reshape(len(values), -1).T, usable.T, strict=True)]
     rails = [upper_rail(each) if each.size else None for each in finite]
     if intensity.unit not in COUNT_UNITS:
         return rails

@@ -127,7 +127,7 @@ def _quiet_blocks(intensity: Channel, length: int, count: int, parts: SampleRang
         count: of the blocks.
         parts: samples of each block that are used.
     """
-    limits = wild_limits(intensity.read(0, min(intensity.size, MAX_CHECKED_SAMPLES)))
+    limits = wild_limits(intensity.read(0, MAX_CHECKED_SAMPLES))
     used = np.concatenate([np.arange(*part) for part in parts])
     scatter = np.array([_scatter(intensity.read(k * length, (k + 1) * length)[used], limits) for k in range(count)])
     loud = np.nanpercentile(scatter, 75) if np.isfinite(scatter).any() else 0.0

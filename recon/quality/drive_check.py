@@ -46,10 +46,7 @@ def check_signals(recording: Recording, device: Device) -> None:
         if not all(name in recording for name in names):
             continue
         x, y = (recording[name] for name in names)
-        first, second = (channel.read(0, COMPARED_SAMPLES) for channel in (x, y))
-        if np.array_equal(first, second, equal_nan=True) and np.nanstd(first) > 0.0:
-            hint = "check the mapping: a column may be used twice"
-            raise BadInput(f"and {y.name} hold the same samples", file=x.file, channel=x.name, hint=hint)
+        _check_different_samples(x, y)
         if any(device.axis(axis).mechanics is None for axis in AXES):
             continue
         if kind == "sense" and not all(isinstance(device.axis(axis).readout, MotionSensor) for axis in AXES):
@@ -67,6 +64,14 @@ def check_signals(recording: Recording, device: Device) -> None:
         _check_common_ratio(recording, names, moves, resonance)
 
 
+def _check_different_samples(one: Channel, other: Channel) -> None:
+    """Raise BadInput if two channels hold the same samples and are not constant."""
+    first, second = (channel.read(0, COMPARED_SAMPLES) for channel in (one, other))
+    if np.array_equal(first, second, equal_nan=True) and np.nanstd(first) > 0.0:
+        hint = "check the mapping: a column may be used twice"
+        raise BadInput(f"and {other.name} hold the same samples", file=one.file, channel=one.name, hint=hint)
+
+
 def check_rates(recording: Recording, device: Device) -> None:
     """Check that a motion has the frequency of its linear drive.
 
@@ -80,10 +85,7 @@ def check_rates(recording: Recording, device: Device) -> None:
             continue
         light = recording.channels.get("intensity")
         if light is not None and len(light.shape) == 1:
-            first, second = (np.asarray(each.read(0, COMPARED_SAMPLES)) for each in (signal, light))
-            if np.array_equal(first, second, equal_nan=True) and np.nanstd(first) > 0.0:
-                hint = "check the mapping: a column may be used twice"
-                raise BadInput("and intensity hold the same samples", file=signal.file, channel=signal.name, hint=hint)
+            _check_different_samples(signal, light)
         own = device.axis(axis).drive
         if drive is None or own is None or own.motion_per_drive != 1.0:
             continue

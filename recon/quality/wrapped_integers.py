@@ -27,7 +27,7 @@ def describe_wrapped_integers(intensity: Channel) -> list[str]:
     """A line if unsigned integers of an intensity are signed ones."""
     if not np.issubdtype(intensity.raw.dtype, np.unsignedinteger):
         return []
-    stored = intensity.stored(0, min(intensity.size, MAX_CHECKED_SAMPLES))
+    stored = intensity.stored(0, MAX_CHECKED_SAMPLES)
     span = float(np.iinfo(stored.dtype).max) + 1.0
     share = _wrapped_share(stored.astype(np.float64).ravel(), span)
     if share == 0.0:

@@ -93,9 +93,7 @@ def cut_to_intensity(position: Channel, intensity: Channel) -> Channel:
     return replace(position, start=start, first=position.first + begin, stop=position.first + end)
 
 
-def read_blocks(
-    position: Channel,
-) -> PositionBlocks:
+def read_blocks(position: Channel) -> PositionBlocks:
     """Return mean and scatter of z in each block, read block by block.
 
     Raises:

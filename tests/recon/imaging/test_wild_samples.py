@@ -10,7 +10,7 @@ import pytest
 from recon.imaging.saturation import detector_rails
 from recon.imaging.wild_samples import find_repeated, find_wild_samples, wild_limits
 from recon.pipeline import reconstruct
-from recon.steps.notes import describe_wild_samples
+from recon.steps.intensity_notes import describe_wild_samples
 from recon.steps.reconstruction import Options
 from scanner.channel import Channel
 from tests.support.simulated import imaging

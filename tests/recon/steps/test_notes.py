@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.steps.notes import (
-    describe_fast_axes,
-    describe_long_frames,
+from recon.steps.intensity_notes import (
     describe_lower_rail,
     describe_negative_counts,
     describe_polarity,
     describe_running_sums,
     describe_saturation,
 )
+from recon.steps.notes import describe_fast_axes, describe_long_frames
 from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
