@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from recon.cli.argument_types import parse_count
+from recon.cli.shared_arguments import add_source_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,12 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="every recording by itself, a folder and a line of table.csv each; REC may be a folder of recordings",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the diagnosis")
-    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument(
-        "--device",
-        metavar="NAME|FILE",
-        help="a named device or TOML file in place of the recording's own",
-    )
+    add_source_arguments(parser)
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--scheduler", metavar="ADDRESS", help="each: on the Dask cluster of this scheduler")
     where.add_argument("--workers", type=parse_count, metavar="N", help="each: processes here (one a core)")

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recon.cli.shared_arguments import add_source_arguments
+
 if TYPE_CHECKING:
     from estimation.identification.calibrate import Identification
 
@@ -21,10 +23,7 @@ UNITS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recordings", type=Path, nargs="+", metavar="REC", help="calibration recordings (.h5)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the device")
-    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument(
-        "--device", metavar="NAME|FILE", help="nominal device, by name or TOML file, in place of the recordings' own"
-    )
+    add_source_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:

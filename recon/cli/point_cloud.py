@@ -6,15 +6,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from recon.cli.shared_arguments import add_source_arguments
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, help="the recording (.h5), or an instrument's file with --mapping")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the points")
     parser.add_argument("--format", choices=("pcd", "las"), default="pcd", help="points.pcd or points.las (pcd)")
-    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument(
-        "--device", metavar="NAME|FILE", help="a named device or TOML file in place of the recording's own"
-    )
+    add_source_arguments(parser)
     parser.add_argument("--estimator", metavar="NAME", help="tracker, ukf, ekf, ...; else by what was recorded")
     parser.add_argument("--flip-x", action="store_true", help="turn the sign of x")
     parser.add_argument("--flip-y", action="store_true", help="turn the sign of y")

@@ -6,16 +6,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from recon.cli.shared_arguments import add_source_arguments
 from scanner.wording import counted
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, help="the recording (.h5), or an instrument's file with --mapping")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the prediction")
-    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument(
-        "--device", metavar="NAME|FILE", help="a named device or TOML file in place of the recording's own"
-    )
+    add_source_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:

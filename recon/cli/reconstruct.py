@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recon.cli.argument_types import parse_count, parse_positive, parse_size, parse_whole
+from recon.cli.shared_arguments import add_source_arguments
 from scanner.wording import counted
 
 if TYPE_CHECKING:
@@ -75,10 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="follow: end when nothing came for so long (5)",
     )
-    parser.add_argument("--mapping", type=Path, metavar="FILE", help="TOML: which variable is which channel")
-    parser.add_argument(
-        "--device", metavar="NAME|FILE", help="a named device or TOML file in place of the recording's own"
-    )
+    add_source_arguments(parser)
     parser.add_argument("--estimator", metavar="NAME", help="tracker, ukf, ekf, ...; else by what was recorded")
     parser.add_argument(
         "--pixels", type=parse_size, default=(400, 400), metavar="WxH", help="size of the picture (400x400)"
@@ -126,7 +124,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.steps.reconstruction import Options
     from scanner.errors import BadInput
-    from scanner.extras import import_extra
 
     options = Options(
         device=args.device,
@@ -149,6 +146,20 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         zarr=args.zarr,
         movie=args.movie,
     )
+    _check_options(args, options)
+    if len(args.recordings) > 1 or args.recordings[0].is_dir() or args.scheduler or args.workers:
+        return _run_many(args, options)
+    if args.stack is not None:
+        raise BadInput("needs several recordings", channel="--stack", hint="name them, or their folder")
+    live = _follow(args, options) if args.follow else None
+    return reconstruct_file(args.recordings[0], args.output, options, args.mapping, live=live)
+
+
+def _check_options(args: argparse.Namespace, options: Options) -> None:
+    """Raise BadInput for options that contradict each other or have no effect."""
+    from scanner.errors import BadInput
+    from scanner.extras import import_extra
+
     if (args.zarr or args.movie) and not options.wants_frames and args.stack is None:
         option = "--zarr" if args.zarr else "--movie"
         raise BadInput("needs frames", channel=option, hint="add --frames, --frame-time, --z-step or --stack")
@@ -163,20 +174,22 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         import_extra("zarr", "zarr")
     if args.fill and args.picture != "mean":
         raise BadInput(f"a {args.picture} picture has no holes", channel="--fill", hint="leave out --fill or --picture")
-    if len(args.recordings) > 1 or args.recordings[0].is_dir() or args.scheduler or args.workers:
-        return _run_many(args, options)
-    if args.stack is not None:
-        raise BadInput("needs several recordings", channel="--stack", hint="name them, or their folder")
-    live = None
-    for option in ("--intensity-drift", "--sample-motion"):
-        if args.follow and getattr(args, option[2:].replace("-", "_")):
-            raise BadInput("needs a whole recording", channel=option, hint="leave out --follow")
-    if args.follow:
-        from recon.live.follow import QUIET_TIME_S, follow_recording
 
-        times = {"frame_time": args.frame_time, "quiet_time": args.quiet_time or QUIET_TIME_S}
-        live = follow_recording(args.recordings[0], args.output, options, args.mapping, **times).summary()
-    return reconstruct_file(args.recordings[0], args.output, options, args.mapping, live=live)
+
+def _follow(args: argparse.Namespace, options: Options) -> dict[str, Any]:
+    """Show the frames of a growing recording until it ends; return the summary of them.
+
+    Raises:
+        BadInput: an option needs the whole recording, or it cannot be followed.
+    """
+    from recon.live.follow import QUIET_TIME_S, follow_recording
+    from scanner.errors import BadInput
+
+    for option, value in (("--intensity-drift", args.intensity_drift), ("--sample-motion", args.sample_motion)):
+        if value:
+            raise BadInput("needs a whole recording", channel=option, hint="leave out --follow")
+    times = {"frame_time": args.frame_time, "quiet_time": args.quiet_time or QUIET_TIME_S}
+    return follow_recording(args.recordings[0], args.output, options, args.mapping, **times).summary()
 
 
 def _run_many(args: argparse.Namespace, options: Options) -> dict[str, Any]:
