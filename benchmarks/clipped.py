@@ -18,7 +18,7 @@ from estimation.signals import phase_reference, sense_channels
 from estimation.tracker import track
 from estimation.tracker.block_tracking import track_blocks
 from estimation.tracker.cramer_rao import NO_RAILS, phase_sd_bounds
-from estimation.tracker.initial_state import initial_estimate, resolve_signs
+from estimation.tracker.initial_state import choose_signs, initial_estimate
 from estimation.tracker.observations import demodulate_blocks, lay_out_blocks
 from estimation.tracker.state_space import PHASE
 from phantoms.forward import Plan, simulate
@@ -112,7 +112,7 @@ def track_between_rails(noises: int) -> dict[str, dict[str, float]]:
     (sense,) = sense_channels(quiet, device)
     reference = phase_reference(quiet, device, "x", sense.channel, True)
     exact = demodulate_blocks(lay_out_blocks(quiet, device, sense, {"x": reference}))
-    start, _ = resolve_signs(exact, initial_estimate(exact, device))
+    start, _ = choose_signs(exact, initial_estimate(exact, device))
     states = track_blocks(exact, start, DENSITIES[None])[0].states
     true_phase = states[:, PHASE] + exact.signal.psi[:, 0] - reference.phase(exact.time)
     noise_sd = device.axis("x").require_readout().noise_sd

@@ -18,7 +18,7 @@ from estimation.estimate import estimate
 from estimation.signals import phase_reference, sense_channels
 from estimation.tracker.block_tracking import average_over_noise, track_blocks
 from estimation.tracker.cramer_rao import phase_sd_bounds
-from estimation.tracker.initial_state import initial_estimate, resolve_signs
+from estimation.tracker.initial_state import choose_signs, initial_estimate
 from estimation.tracker.observations import BlockObservations, demodulate_blocks, lay_out_blocks
 from estimation.tracker.process_noise import (
     noise_posterior,
@@ -104,7 +104,7 @@ def wrap_half_turn(phase: Array) -> Array:
 
 def track_phase(observations: BlockObservations, device: Device) -> tuple[Array, Array]:
     """Tracked phases and their standard deviations, each of shape (blocks, axes) [rad]."""
-    start, _ = resolve_signs(observations, initial_estimate(observations, device))
+    start, _ = choose_signs(observations, initial_estimate(observations, device))
     parts = tuning_parts(observations.signal)
     densities, offset_density = tune_process_noise(observations, start, parts)
     observations, parts = observations.with_offset_density(offset_density), with_offset_density(parts, offset_density)
@@ -132,7 +132,7 @@ def compare_with_bound(shared: bool, drifts: int) -> Points:
         for sense in sense_channels(quiet, device):
             references = {name: phase_reference(quiet, device, name, sense.channel, True) for name in sense.axes}
             exact = demodulate_blocks(lay_out_blocks(quiet, device, sense, references))
-            start, _ = resolve_signs(exact, initial_estimate(exact, device))
+            start, _ = choose_signs(exact, initial_estimate(exact, device))
             densities = np.tile(NOISE_FREE_DENSITIES, (1, len(sense.axes), 1))
             truth = track_blocks(exact, start, densities)[0].states
             true_densities = np.tile([0.0, STIFFNESS_RATE_DENSITY, 0.0, 0.0], (len(sense.axes), 1))

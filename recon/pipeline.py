@@ -25,7 +25,7 @@ from recon.imaging.sample_motion.motion_check import describe_unremoved_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.imaging.scan_phase.image_phase import refine_motion
 from recon.imaging.scan_phase.start_shift import describe_start_shift
-from recon.quality.amplitude_check import amplitude_calibration, compare_with_signal, describe_contradictions
+from recon.quality.amplitude_check import amplitude_calibration, compare_with_signal, describe_amplitude_contradictions
 from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
@@ -261,7 +261,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *prepared.clock_notes,
             *prepared.unknown_entries,
             *estimated.motion_notes,
-            *describe_contradictions(amplitude_checks),
+            *describe_amplitude_contradictions(amplitude_checks),
             *describe_motion(motion, intensity),
             *describe_defects(prepared.defects),
             *describe_intensity(beam, intensity, estimated.grid),

@@ -121,7 +121,7 @@ def _score_starts(
             sensitivities = [(likelihood.residual(model, x, stop) - base.residual)[:, None] for x in batch]
         for x, columns in zip(batch, sensitivities, strict=True):
             normal, gradient, response = profiled.normal_equations(columns[base.rows])
-            gain, estimate = linear_gain(normal, gradient)
+            gain, estimate = predict_gain(normal, gradient)
             step = np.zeros(x.size)
             if amplitudes:
                 estimate = np.clip(estimate, -MAX_PRIOR_SIGMAS, MAX_PRIOR_SIGMAS)
@@ -236,7 +236,7 @@ class ProfiledLinearModel:
         return normal, columns.T @ self._residual - cross.T @ solved[:, -1], np.asarray(-solved[:, :-1])
 
 
-def linear_gain(normal: Array, gradient: Array) -> tuple[float, Array]:
+def predict_gain(normal: Array, gradient: Array) -> tuple[float, Array]:
     """Predicted fall of -2 log evidence, and estimate, shape (q,), of a linear model."""
     estimate = np.asarray(-np.linalg.solve(normal, gradient))
     return float(-gradient @ estimate - np.linalg.slogdet(normal)[1]), estimate

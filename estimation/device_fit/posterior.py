@@ -57,7 +57,7 @@ def phase_portrait(
 
 
 @dataclass(frozen=True)
-class PhaseError:
+class PredictionPhaseError:
     """Phase error of an open-loop prediction of the motion.
 
     Attributes:
@@ -75,7 +75,7 @@ class PhaseError:
         return PICTURE_HALF_WIDTH_PX * float(np.sqrt(np.mean(phase**2)))
 
 
-def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int, points: int = 200) -> PhaseError | None:
+def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int, points: int = 200) -> PredictionPhaseError | None:
     """Phase error of one axis; None if it is driven far below its resonance, where it follows the drive."""
     run = final.model.runs[run_index]
     scales = run.scales[axis]
@@ -94,7 +94,7 @@ def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int, points: int
     spread = [mean_phase(phasor(final, x) * reference) for x in draw_parameters(final, POSTERIOR_DRAWS // 2)]
     before = mean_phase(phasor(nominal, nominal.x) * reference)
     time = run.inputs[axis].time[at[:-1]].reshape(points, 16).mean(axis=1)
-    return PhaseError(time, before, Z_95 * np.sqrt(np.mean(np.square(spread), axis=0)))
+    return PredictionPhaseError(time, before, Z_95 * np.sqrt(np.mean(np.square(spread), axis=0)))
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from estimation.identification.sweep import SweptRecord, has_one_frequency
 from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
 from estimation.reference import drive_reference
 from estimation.slow.response import Response, ResponseFit, frequency_responses
-from estimation.slow.response_selection import select_effects
+from estimation.slow.response_selection import select_response_effects
 from scanner.arrays import Array
 from scanner.clock import on_clock
 from scanner.device import DEFAULT_TOLERANCE, Axis, Device
@@ -152,7 +152,7 @@ class _AxisIdentification:
         responses = frequency_responses(recording, Device("", {self.name: self.axis}))
         if responses:
             self.used.append(f"{recording.name}: frequency response")
-            fit = select_effects(responses[0])
+            fit = select_response_effects(responses[0])
             self.responses.append((responses[0], fit))
             self.values = combine_values([self.values, values_of_mode(fit)])
             self.notes.append(f"{self.name}: J is the nominal one; steady tones determine only k/J and b/J")

@@ -75,7 +75,7 @@ def candidate_effects(
     return [effect for effect in effects if effect is not None]
 
 
-def natural_scales(scan: ScanSamples, axis: str, rates: Mapping[str, float]) -> NaturalScales:
+def optics_scales(scan: ScanSamples, axis: str, rates: Mapping[str, float]) -> NaturalScales:
     """Natural sizes of one axis of a scan, of which the optics use amplitude, rate and duration."""
     return NaturalScales(scan.half_swing[axis], rates[axis], 1.0, 1.0, 1.0, scan.duration)
 
@@ -84,7 +84,7 @@ def _linearise(term: Term, axis: str, scan: ScanSamples, rates: Mapping[str, flo
     """The direction of a term at its natural size; None if its first parameter is not the size of the effect."""
     if not term.parameters or term.parameters[0].kind not in AMPLITUDE_KINDS:
         return None
-    scales = natural_scales(scan, axis, rates)
+    scales = optics_scales(scan, axis, rates)
     x = [float(parameter is term.parameters[0]) for parameter in term.free_parameters]
     if "intensity" in term.channels:
         active = ActiveTerm(term, term.values(x, scales), "intensity")

@@ -168,7 +168,7 @@ def phase_change(reference: ReferencePhase, device: Device) -> Array:
     return np.array(changes)
 
 
-def improved_device(
+def with_readout_effects(
     device: Device, effects: Sequence[ReadoutEffect], sizes: Sequence[Array], scales: Mapping[str, NaturalScales]
 ) -> Device:
     """The device with the terms of the effects of the readout, and with calibrated corner frequencies."""

@@ -32,10 +32,10 @@ from estimation.optics.readout_effects import (
     candidate_terms,
     effects_beside_the_readout,
     estimator_variance,
-    improved_device,
     natural_scales,
     phase_change,
     term_values,
+    with_readout_effects,
 )
 from estimation.optics.reporting import EffectDescription, build_finding
 from scanner.arrays import Array
@@ -216,10 +216,10 @@ def _size_together(
     """The data corrected for what effects change together beyond the sum of each, and the device with their sizes."""
     everything = [*data.calibrations, *selected]
     sizes = data.posterior(selected).sizes
-    changed = improved_device(reference.device, everything, sizes, scales)
+    changed = with_readout_effects(reference.device, everything, sizes, scales)
     predicted = sum((e.change(x) for e, x in zip(everything, sizes, strict=True) if e.is_in_device), np.zeros(2))
     joint = replace(data, value=data.value - (phase_change(reference, changed) - predicted))
-    return joint, improved_device(reference.device, everything, joint.posterior(selected).sizes, scales)
+    return joint, with_readout_effects(reference.device, everything, joint.posterior(selected).sizes, scales)
 
 
 def _report(

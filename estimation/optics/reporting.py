@@ -10,7 +10,7 @@ import numpy as np
 from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
-from estimation.optics.candidates import OpticsEffect, natural_scales
+from estimation.optics.candidates import OpticsEffect, optics_scales
 from estimation.optics.fit import UNRESOLVED_SD_CELLS, validation_error
 from estimation.optics.samples import OpticsParameters, ScanSamples
 from scanner.device import AXES
@@ -110,7 +110,7 @@ def describe_effect(
         )
         return _describe_term(axis, name, speed * value, (speed * low, speed * high), where)
     if effect.name != "intensity-delay":
-        return _describe_linearised(effect, name, value, sd, natural_scales(scan, axis, rates))
+        return _describe_linearised(effect, name, value, sd, optics_scales(scan, axis, rates))
     delay, interval = (value, (low, high)) if value > 0.0 else (-value, (-high, -low))
     late = "the intensity lags behind the motion" if value > 0.0 else "the estimated motion lags behind the intensity"
     where = f"{late}: forward and backward half-periods of both axes are displaced by the same {1e6 * delay:.4g} us"

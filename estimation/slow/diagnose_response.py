@@ -12,7 +12,7 @@ from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
 from estimation.slow.diagnose import MIN_REMAINDER
 from estimation.slow.response import AMPLITUDE_LAWS, FEEDTHROUGH, SECOND_MODE, Response, ResponseFit, fit_response
-from estimation.slow.response_selection import fit_subsets, prediction_error, select_effects, with_common_modes
+from estimation.slow.response_selection import fit_subsets, prediction_error, select_response_effects, with_common_modes
 from scanner.device import Axis, Device
 from scanner.terms import catalogue
 from scanner.terms.driven_modes import EFFECT as DRIVEN_MODES
@@ -32,7 +32,7 @@ def diagnose_responses(responses: Sequence[Response], device: Device) -> Diagnos
     response is in rad, and, if it states a linear drive, a second mode as ``driven-modes``, relative to the first one.
     """
     tables = [fit_subsets(response) for response in responses]
-    selected = [select_effects(response, table) for response, table in zip(responses, tables, strict=True)]
+    selected = [select_response_effects(response, table) for response, table in zip(responses, tables, strict=True)]
     selected = with_common_modes(responses, selected)
     findings: list[Finding] = []
     unexplained, remainders, loops = [], [], {}

@@ -26,7 +26,9 @@ def fit_subsets(response: Response) -> dict[tuple[str, ...], ResponseFit]:
     return {effects: fit_response(response, effects) for effects in SUBSETS}
 
 
-def select_effects(response: Response, table: Mapping[tuple[str, ...], ResponseFit] | None = None) -> ResponseFit:
+def select_response_effects(
+    response: Response, table: Mapping[tuple[str, ...], ResponseFit] | None = None
+) -> ResponseFit:
     """The fit of the lowest score, without effects that predict worse than the same fit without them.
 
     Args:

@@ -8,7 +8,7 @@ from math import isclose
 import numpy as np
 
 from estimation.signals import drive_motion_frequency
-from estimation.sync.edge_phase import is_significant, phase_from_edges
+from estimation.sync.edge_phase import asymmetry_is_significant, phase_from_edges
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.edges import Edges
@@ -96,7 +96,7 @@ def check_one_direction(edges: Edges) -> None:
     period = found.numbered.length
     difference = float(np.median(np.abs(found.asymmetry))) * 2.0 * period / np.pi
     least = max(MIN_ALTERNATION_PERIODS * period, MIN_ALTERNATION_TICKS * _clock_step(edges.times))
-    if difference < least or not is_significant(found.asymmetry, found.asymmetry_sd):
+    if difference < least or not asymmetry_is_significant(found.asymmetry, found.asymmetry_sd):
         return
     short, long = 0.5 * (period - difference), 0.5 * (period + difference)
     what = f"states {edges.event}, and its intervals alternate between {short:.6g} s and {long:.6g} s, as those of "

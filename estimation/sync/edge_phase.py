@@ -112,19 +112,23 @@ def _sign(edges: Edges, asymmetry: Array, sd: Array) -> tuple[bool, str]:
     """Whether the phase has to be turned by half a period, and what the edges say of the sign."""
     if edges.is_one_direction:
         return False, f"known: {edges.name}"
-    if edges.event == "turn" or not edges.angle or not is_significant(asymmetry, sd):
+    if edges.event == "turn" or not edges.angle or not asymmetry_is_significant(asymmetry, sd):
         return False, "ambiguous"
     return bool(np.median(asymmetry) * edges.angle < 0.0), f"known: {edges.name}"
 
 
-def is_significant(asymmetry: Array, sd: Array) -> bool:
+def asymmetry_is_significant(asymmetry: Array, sd: Array) -> bool:
     """Whether the asymmetry differs from 0 by ``SIGNIFICANT_SD`` at every edge, and has one sign."""
     return bool(np.all(np.abs(asymmetry) > SIGNIFICANT_SD * sd) and np.ptp(np.sign(asymmetry)) == 0.0)
 
 
 def amplitude_from_edges(edges: Edges, found: EdgePhase) -> tuple[Array, Array] | None:
     """Amplitude and its sd at each edge, shape (n,) [rad], by a detector at a known angle; else None."""
-    if not edges.angle or found.sign == "ambiguous" or not is_significant(found.asymmetry, found.asymmetry_sd):
+    if (
+        not edges.angle
+        or found.sign == "ambiguous"
+        or not asymmetry_is_significant(found.asymmetry, found.asymmetry_sd)
+    ):
         return None
     amplitude = edges.angle / np.sin(found.asymmetry)
     return amplitude, np.abs(amplitude / np.tan(found.asymmetry)) * found.asymmetry_sd

@@ -16,7 +16,7 @@ from estimation.held_samples import without_samples
 from estimation.reference import DRIVE_ON_RATIO, PhaseReference, drive_phasors
 from estimation.signals import is_capacitive, phase_reference
 from estimation.tracker.filter_run import filter_blocks
-from estimation.tracker.initial_state import initial_estimate, resolve_signs
+from estimation.tracker.initial_state import choose_signs, initial_estimate
 from estimation.tracker.linearisation import empty_linearisation
 from estimation.tracker.observations import BlockLayout, BlockObservations, demodulate_blocks, lay_out_blocks
 from estimation.tracker.process_noise import INITIAL_DENSITIES
@@ -120,7 +120,7 @@ def _log_likelihood_gain(recorded: BlockLayout, continued: BlockLayout, part: tu
 
 def _log_likelihood(observations: BlockObservations, device: Device) -> float:
     """Log-likelihood of all blocks at the usual process noise."""
-    start, _ = resolve_signs(observations, initial_estimate(observations, device))
+    start, _ = choose_signs(observations, initial_estimate(observations, device))
     densities = np.tile(INITIAL_DENSITIES, (len(observations.parameters), 1))
     signal = observations.signal
     return filter_blocks(observations, signal, empty_linearisation(signal), start, densities).log_likelihood

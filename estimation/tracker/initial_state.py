@@ -106,7 +106,7 @@ def _detect_motion(signal: BlockSignal, a: int, x: Array) -> bool:
     return False
 
 
-def resolve_signs(observations: BlockObservations, start: StateEstimate) -> tuple[StateEstimate, list[str]]:
+def choose_signs(observations: BlockObservations, start: StateEstimate) -> tuple[StateEstimate, list[str]]:
     """Choose the sign of each axis by the likelihood of the first blocks.
 
     A symmetric comb has even harmonics only, which are the same for theta and -theta: the sign is ambiguous. Odd

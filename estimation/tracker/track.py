@@ -16,7 +16,7 @@ from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noi
 from estimation.tracker.continuation import TrackEnd, Tuning, continued_prior, end_of_track, find_end
 from estimation.tracker.drive_consistency import without_contradicted_pauses
 from estimation.tracker.drive_ends import describe_pauses, with_whole_drives
-from estimation.tracker.initial_state import initial_estimate, resolve_signs
+from estimation.tracker.initial_state import choose_signs, initial_estimate
 from estimation.tracker.kalman_filter import StateEstimate
 from estimation.tracker.observations import BlockLayout, BlockObservations, demodulate_blocks, lay_out_blocks
 from estimation.tracker.phase_measurements import PhaseMeasurement, with_phase_measurements
@@ -201,7 +201,7 @@ class TunedSection(NamedTuple):
 
     Attributes:
         observations: with clipped samples expanded. prior: before its first block.
-        signs: see ``resolve_signs``. tuning: most probable process noise, its posterior, and the noise level.
+        signs: see ``choose_signs``. tuning: most probable process noise, its posterior, and the noise level.
     """
 
     observations: BlockObservations
@@ -235,7 +235,7 @@ def tune_section(
     observations = demodulate_blocks(layout, *part)
     if known_offset_density is not None:
         observations = observations.with_offset_density(known_offset_density)
-    start, signs = resolve_signs(observations, initial_estimate(observations, device))
+    start, signs = choose_signs(observations, initial_estimate(observations, device))
     residual_var, scale = observations.signal.noise_var, 1.0
     for noise_round in range(MAX_NOISE_ROUNDS):
         observations = expand_clipped_blocks(observations, prior or start, densities, causal)

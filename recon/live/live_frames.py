@@ -36,7 +36,7 @@ from recon.quality.sensor_noise import check_sensor_noise
 from recon.report.figures import save_picture
 from recon.sample_ranges import subtract_ranges, to_sample_ranges
 from recon.steps.estimated_motion import EstimatedMotion
-from recon.steps.phase_and_drift import measure_phase_errors, wants_readout_phase
+from recon.steps.phase_and_drift import measure_picture_phase_errors, wants_readout_phase
 from recon.steps.preparation import prepare_frame, select_device
 from recon.steps.reconstruction import Options
 from recon.steps.registration_segments import MAX_REGISTERED_PERIODS
@@ -232,7 +232,7 @@ def measure_readout(part: FramePart, known: Mapping[str, ReadoutPhase]) -> Mappi
     Raises:
         BadInput: the samples cannot be used.
     """
-    errors = measure_phase_errors(part.estimated)
+    errors = measure_picture_phase_errors(part.estimated)
     return update_readout_phase(part.sensed, part.estimated.motion, errors, known)
 
 

@@ -37,7 +37,7 @@ def amplitude_calibration(
     }
 
 
-def describe_contradictions(checks: Mapping[str, AmplitudeCheck]) -> list[str]:
+def describe_amplitude_contradictions(checks: Mapping[str, AmplitudeCheck]) -> list[str]:
     """A line for every axis whose signal contradicts the device at the estimated amplitude."""
     lines = []
     for name, check in checks.items():

@@ -7,7 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from estimation.device_fit.posterior import PICTURE_HALF_WIDTH_PX, PhaseError, phase_error, phase_portrait, waveform
+from estimation.device_fit.posterior import (
+    PICTURE_HALF_WIDTH_PX,
+    PredictionPhaseError,
+    phase_error,
+    phase_portrait,
+    waveform,
+)
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability, detectability
@@ -120,7 +126,9 @@ def _effect_figures(finding: Finding, search: SelectionResult) -> list[Figure]:
     return [effect_figure(curve, finding.effect) for curve in curves]
 
 
-def _motion_sections(diagnosis: Diagnosis, search: SelectionResult, errors: Mapping[str, PhaseError]) -> list[Section]:
+def _motion_sections(
+    diagnosis: Diagnosis, search: SelectionResult, errors: Mapping[str, PredictionPhaseError]
+) -> list[Section]:
     """The evidence from drive to readout."""
     sections = [_waveforms(search)]
     if search.steps:
@@ -137,7 +145,7 @@ def _motion_sections(diagnosis: Diagnosis, search: SelectionResult, errors: Mapp
     return [*sections, _detectability(effects), _nominal_values(diagnosis)]
 
 
-def _phase_errors(search: SelectionResult) -> dict[str, PhaseError]:
+def _phase_errors(search: SelectionResult) -> dict[str, PredictionPhaseError]:
     """Phase errors of open-loop predictions by recording and axis."""
     errors = {}
     for r, run in enumerate(search.likelihood.runs):
@@ -161,7 +169,7 @@ def _waveforms(search: SelectionResult) -> Section:
     return Section("Measured and simulated waveforms", figures=figures, least="26rem")
 
 
-def _blur_section(errors: Mapping[str, PhaseError]) -> Section:
+def _blur_section(errors: Mapping[str, PredictionPhaseError]) -> Section:
     """The consequence for a picture."""
     heading = "Blur of a picture without feedback"
     if not errors:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimation.device_fit.posterior import PICTURE_HALF_WIDTH_PX, PhaseError, Waveform
+from estimation.device_fit.posterior import PICTURE_HALF_WIDTH_PX, PredictionPhaseError, Waveform
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability
 from recon.report.effect_curve import EffectCurve
 from recon.report.figures import figure_uri, new_figure, use_plain_ticks
@@ -128,7 +128,7 @@ def portrait_figure(before: Array, after: Array, caption: str) -> Figure:
     return Figure(figure_uri(drawing), caption)
 
 
-def phase_error_figure(error: PhaseError, caption: str, tolerated_px: float = 1.0) -> Figure:
+def phase_error_figure(error: PredictionPhaseError, caption: str, tolerated_px: float = 1.0) -> Figure:
     """Blur at the centre of a line by the phase error of an open-loop prediction, over time."""
 
     def draw(axes: Axes) -> None:

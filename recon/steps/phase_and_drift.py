@@ -93,7 +93,7 @@ def wants_readout_phase(motion: Motion, options: Options) -> bool:
     return motion.estimator in ESTIMATORS_WITH_READOUT_PHASE and not options.sense_only
 
 
-def measure_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
+def measure_picture_phase_errors(estimated: EstimatedMotion) -> list[PhaseError]:
     """Return the phase errors that forward and backward half-periods show in slices of the scan.
 
     Their standard errors allow for a shift that all slices have in common.
@@ -113,7 +113,7 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
     motion = estimated.motion
 
     def register(corrected: Motion) -> list[PhaseError]:
-        return measure_phase_errors(replace(estimated, motion=corrected))
+        return measure_picture_phase_errors(replace(estimated, motion=corrected))
 
     errors = register(motion)
     if not wants_readout_phase(motion, options):

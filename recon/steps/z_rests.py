@@ -70,7 +70,7 @@ def rest_ranges(position: Channel, intensity: Channel) -> SampleRanges:
     """Return the samples of the intensity during which z rests at one position; all where z nowhere rests."""
     try:
         position = cut_to_intensity(position, intensity)
-        blocks, rests, _ = find_rests(read_blocks(position))
+        blocks, rests, _ = find_z_rests(read_blocks(position))
     except BadInput:
         return [(0, intensity.size)]
     if blocks.constant or not rests.size:
@@ -130,7 +130,7 @@ def read_blocks(position: Channel) -> PositionBlocks:
     return PositionBlocks(edges, mean, low, high, least, most, position.size - finite, constant)
 
 
-def find_rests(blocks: PositionBlocks) -> tuple[PositionBlocks, NDArray[np.intp], float]:
+def find_z_rests(blocks: PositionBlocks) -> tuple[PositionBlocks, NDArray[np.intp], float]:
     """Return where z rests: of all band widths and three lengths of the blocks, those rests that last longest.
 
     Returns:

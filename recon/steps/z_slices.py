@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.sample_ranges import SampleRanges
-from recon.steps.z_rests import PositionBlocks, cut_to_intensity, find_rests, read_blocks, rest_times
+from recon.steps.z_rests import PositionBlocks, cut_to_intensity, find_z_rests, read_blocks, rest_times
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, LazySamples
 from scanner.errors import BadInput
@@ -75,7 +75,7 @@ def find_z_slices(position: Channel, intensity: Channel, step: float | None = No
     if step is not None or blocks.constant:
         positions, label_times = _bins(position, blocks, step or np.inf, intensity.size)
     else:
-        used, rests, band = find_rests(blocks)
+        used, rests, band = find_z_rests(blocks)
         positions, number_of_rest, label_times = _levels(position, used, rests, band)
         varying = tuple(_describe_variation(blocks, used.edges[rests], number_of_rest, positions, band))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.harmonic_amplitude import AmplitudeCheck, check_amplitudes
-from recon.quality.amplitude_check import compare_with_signal, describe_contradictions
+from recon.quality.amplitude_check import compare_with_signal, describe_amplitude_contradictions
 from scanner import devices
 from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
@@ -100,7 +100,7 @@ def test_feedthrough_contradicts_in_its_axis() -> None:
     found = checks(signal(IMAGING, feedthrough=0.2))
     assert found["x"].error_sd > 0.1
     assert found["y"].error_sd == 0.0
-    (line,) = describe_contradictions(found)
+    (line,) = describe_amplitude_contradictions(found)
     assert line.startswith("x: the sense signal contradicts the device")
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from phantoms.optics import sample_scene
-from recon.imaging.sample_motion.block_equations import ScanSamples
+from recon.imaging.sample_motion.block_equations import PlacedSamples
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 
 RATE, PIXELS = 1.5e6, 96
@@ -22,7 +22,7 @@ def scene() -> np.ndarray:
 
 def scan(
     displacement: np.ndarray, photons: float = 300.0, blocks: int = BLOCKS, picture: np.ndarray | None = None
-) -> ScanSamples:
+) -> PlacedSamples:
     """A scan of a sample whose displacement [px] is given at equal times, of :func:`scene` without a picture."""
     time = np.arange(round(blocks * PERIOD)) / RATE
     x, y = (0.5 * PIXELS * (1.0 + np.sin(2.0 * np.pi * f * time + f)) for f in FREQUENCIES)
@@ -32,7 +32,7 @@ def scan(
     half = 0.5 * len(picture)
     light = sample_scene(picture, x - u - 0.5 * PIXELS, y - v - 0.5 * PIXELS, half, half)
     counts = np.random.default_rng(1).poisson(photons * np.maximum(light, 0.0))
-    return ScanSamples.from_arrays(x, y, counts)
+    return PlacedSamples.from_arrays(x, y, counts)
 
 
 def error_of(found: SampleMotion, displacement: np.ndarray) -> np.ndarray:

@@ -173,7 +173,7 @@ def shrunk_weight(judged: Array, difference: Array, residual: Array) -> float:
     return min(max(weight - variance / weight, 0.0), 1.0) if weight > 0.0 else 0.0
 
 
-def excess_variance(residual: Array, noise: Array, predicted: Array, weight: Array) -> tuple[float, float]:
+def error_variance_ratio(residual: Array, noise: Array, predicted: Array, weight: Array) -> tuple[float, float]:
     """Return the error variance of held-out pixels as a multiple of the predicted one, and its standard deviation.
 
     Args:

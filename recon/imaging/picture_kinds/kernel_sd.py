@@ -23,7 +23,7 @@ import numpy as np
 
 from recon.imaging.picture_kinds.held_out import (
     SplitSums,
-    excess_variance,
+    error_variance_ratio,
     pixel_means,
     positive_mean,
     representative_weights,
@@ -114,7 +114,7 @@ def _measure_scale(
     residual: Array, of_residual: Array, removed: Array, weight: Array, noise: SampleNoise
 ) -> tuple[float, float]:
     """Excess of squared residuals over their noise as a multiple of ``removed``, and its standard deviation."""
-    found, sd = excess_variance(residual, of_residual, removed, weight)
+    found, sd = error_variance_ratio(residual, of_residual, removed, weight)
     return found, float(np.hypot(sd, noise.relative_sd * (weight @ of_residual) / (weight @ removed)))
 
 

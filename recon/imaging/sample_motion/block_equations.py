@@ -74,7 +74,7 @@ MARGIN_PX = 64.0
 """Distance beyond the field up to which places are kept [px]: a motion of the sample brings them into the picture."""
 
 
-class ScanSamples(NamedTuple):
+class PlacedSamples(NamedTuple):
     """Samples of a scan, each of shape (n,): place of the beam from the corner of the field, and intensity.
 
     Places are integers in steps of ``STEP_PX`` from ``-MARGIN_PX`` on: 8 bytes a sample in place of 12.
@@ -89,12 +89,12 @@ class ScanSamples(NamedTuple):
     value: NDArray[np.float32]
 
     @classmethod
-    def empty(cls, size: int) -> ScanSamples:
+    def empty(cls, size: int) -> PlacedSamples:
         """Return ``size`` samples without values."""
         return cls(np.zeros(size, np.uint16), np.zeros(size, np.uint16), np.full(size, np.nan, np.float32))
 
     @classmethod
-    def from_arrays(cls, x: Array, y: Array, value: Array) -> ScanSamples:
+    def from_arrays(cls, x: Array, y: Array, value: Array) -> PlacedSamples:
         """Return samples at places in pixels, arrays of shape (n,)."""
         samples = cls.empty(x.size)
         samples.write(0, x, y, value)
@@ -134,7 +134,7 @@ class BlockEquations(NamedTuple):
 
 
 def block_equations(
-    samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int], width: float
+    samples: PlacedSamples, shift: Array, length: int, shape: tuple[int, int], width: float
 ) -> BlockEquations:
     """Return the equations of the translation of each block, around given ones of its parts.
 
@@ -172,7 +172,7 @@ def block_equations(
 
 
 def scatter_by_place(
-    samples: ScanSamples,
+    samples: PlacedSamples,
     shift: Array,
     length: int,
     reference: NDArray[np.float32],
@@ -204,7 +204,7 @@ def scatter_by_place(
 
 
 def measure_residual_noise(
-    samples: ScanSamples, shift: Array, length: int, reference: NDArray[np.float32]
+    samples: PlacedSamples, shift: Array, length: int, reference: NDArray[np.float32]
 ) -> ResidualNoise:
     """Return the variance of the residuals, from ``MAX_NOISE_SAMPLES``; args as in :func:`scatter_by_place`."""
     step = -(-samples.x.size // MAX_NOISE_SAMPLES)
@@ -215,7 +215,7 @@ def measure_residual_noise(
 
 
 def sample_log_likelihoods(
-    samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int], width: float
+    samples: PlacedSamples, shift: Array, length: int, shape: tuple[int, int], width: float
 ) -> NDArray[np.float32]:
     """Return the log likelihood of each sample under the picture of the other blocks, but for a constant, shape (n,).
 
@@ -235,7 +235,7 @@ def by_shape(displacement: Array) -> Array:
 
 
 def fold_references(
-    samples: ScanSamples, shift: Array, length: int, shape: tuple[int, int], width: float
+    samples: PlacedSamples, shift: Array, length: int, shape: tuple[int, int], width: float
 ) -> NDArray[np.float32]:
     """Return the picture of the samples of all other folds, by fold, shape (FOLDS, height, width, 5).
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from recon.imaging.sample_motion.block_equations import ScanSamples
+from recon.imaging.sample_motion.block_equations import PlacedSamples
 from recon.imaging.sample_motion.residual_noise import fit_residual_noise
 from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
@@ -37,7 +37,7 @@ JUMP_PENALTY = 12.0
 """Negative log probability of a jump to a given cell, beside the number of cells: one in 10^5 parts."""
 
 
-def search_motion(samples: ScanSamples, length: int, parts: int, shape: tuple[int, int]) -> Array:
+def search_motion(samples: PlacedSamples, length: int, parts: int, shape: tuple[int, int]) -> Array:
     """Return the translation of each part, shape (parts, 2) [px].
 
     Args:
@@ -66,7 +66,7 @@ def search_motion(samples: ScanSamples, length: int, parts: int, shape: tuple[in
     return found - found.mean(axis=0)
 
 
-def _grid(samples: ScanSamples, part: slice, shift: Array, shape: tuple[int, int]) -> Array:
+def _grid(samples: PlacedSamples, part: slice, shift: Array, shape: tuple[int, int]) -> Array:
     """Count, sum and sum of squares by cell of the samples of a part, shape (3, height, width)."""
     (x, y), value = samples.places(part), samples.value[part]
     column, row = np.floor((x - shift[0]) / CELL_PX), np.floor((y - shift[1]) / CELL_PX)

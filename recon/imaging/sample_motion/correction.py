@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon.imaging.picture import Grid
-from recon.imaging.sample_motion.block_equations import ScanSamples
+from recon.imaging.sample_motion.block_equations import PlacedSamples
 from recon.imaging.sample_motion.rigid_motion import SampleMotion, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.sample_ranges import SampleRanges
@@ -94,12 +94,12 @@ def read_samples(
     cell: float,
     unlocated: SampleRanges,
     parts: Sequence[tuple[int, int]],
-) -> ScanSamples:
+) -> PlacedSamples:
     """Samples of parts (first, stop) of a scan, one part after the other, at places in cells of a width [px].
 
     The other arguments are those of :func:`measure_sample_motion`.
     """
-    samples = ScanSamples.empty(sum(stop - first for first, stop in parts))
+    samples = PlacedSamples.empty(sum(stop - first for first, stop in parts))
     x, y = (beam.axes[axis].angle for axis in AXES)
     offset = 0
     for first, stop in parts:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.sample_motion.block_equations import FOLDS, PARTS, ScanSamples, fold_references
+from recon.imaging.sample_motion.block_equations import FOLDS, PARTS, PlacedSamples, fold_references
 from recon.imaging.sample_motion.motion_smoother import SmoothedMotion
 from recon.imaging.sample_motion.vibrations import vibration_shift
 from scanner.arrays import Array
@@ -25,7 +25,7 @@ class MotionKnots(NamedTuple):
 
 
 def place_jumps(
-    samples: ScanSamples, motion: SmoothedMotion, part_length: int, shape: tuple[int, int], width: float
+    samples: PlacedSamples, motion: SmoothedMotion, part_length: int, shape: tuple[int, int], width: float
 ) -> MotionKnots:
     """Return the motion with knots in the middles of blocks, and two knots at each jump in place of those around it.
 
@@ -79,7 +79,7 @@ def _interpolated(sample: NDArray[Any], knots: Array, values: Array) -> Array:
 
 
 def _residuals(
-    samples: ScanSamples,
+    samples: PlacedSamples,
     part: NDArray[np.int64],
     shift: Array,
     references: NDArray[np.float32],

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from recon.imaging.picture import Grid
-from recon.imaging.sample_motion.block_equations import PARTS, ScanSamples
+from recon.imaging.sample_motion.block_equations import PARTS, PlacedSamples
 from recon.imaging.sample_motion.correction import cell_width, cells, read_samples
 from recon.imaging.sample_motion.motion_smoother import part_shift
-from recon.imaging.sample_motion.residual import residual_variance
+from recon.imaging.sample_motion.residual import remaining_motion_variance
 from recon.imaging.sample_motion.rigid_motion import MIN_BLOCKS, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from recon.sample_ranges import SampleRanges
@@ -65,7 +65,7 @@ def describe_unremoved_motion(
     ]
 
 
-def _disagrees_with_rest(samples: ScanSamples, blocks: int, length: int, shape: tuple[int, int]) -> bool:
+def _disagrees_with_rest(samples: PlacedSamples, blocks: int, length: int, shape: tuple[int, int]) -> bool:
     """Whether two halves of the scene show a motion; ``length`` of a block in samples, ``shape`` in cells."""
     at_rest = part_shift(np.zeros((blocks, 2)), [])
-    return bool(residual_variance(samples, at_rest, length // PARTS, shape, CHECK_WIDTH).any())
+    return bool(remaining_motion_variance(samples, at_rest, length // PARTS, shape, CHECK_WIDTH).any())

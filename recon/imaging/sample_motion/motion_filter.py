@@ -60,8 +60,8 @@ class Data(NamedTuple):
         return cls(weighted, equations.information, float(energy), max(int(used.sum()), 1))
 
 
-class Motion(NamedTuple):
-    """Motion under a walk.
+class MotionUnderWalk(NamedTuple):
+    """Motion of the sample under a walk.
 
     Attributes:
         position: of the walk in each block, shape (blocks, 2) [px].
@@ -123,7 +123,7 @@ class Observations(NamedTuple):
         """β, shape (k,)."""
         return self._solved(self._filtered(walk, jump_variance)[1])[0]
 
-    def smoothed(self, walk: tuple[int, int], jump_variance: Array) -> Motion:
+    def smoothed(self, walk: tuple[int, int], jump_variance: Array) -> MotionUnderWalk:
         """Return the motion under a walk."""
         _, explained, means, covariances, predicted = self._filtered(walk, jump_variance)
         coefficients, scale, inverse = self._solved(explained)
@@ -131,7 +131,7 @@ class Observations(NamedTuple):
         position = smoothed[..., 0] - smoothed[..., 1:] @ coefficients
         free = self.columns - smoothed[:, None, :, 1:]
         displacement = position[:, None] + self.columns @ coefficients
-        return Motion(position, scale * covariance, displacement, coefficients, inverse, free, scale)
+        return MotionUnderWalk(position, scale * covariance, displacement, coefficients, inverse, free, scale)
 
     def _filtered(self, walk: tuple[int, int], jump_variance: Array) -> tuple[float, Array, Array, Array, Array]:
         steps, acceleration = WALKS_PX[walk[0]] ** 2 + jump_variance, VELOCITY_WALKS_PX[walk[1]] ** 2

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.imaging.sample_motion.block_equations import PARTS, BlockEquations, by_shape
-from recon.imaging.sample_motion.motion_filter import Data, Motion, Observations, climb
+from recon.imaging.sample_motion.motion_filter import Data, MotionUnderWalk, Observations, climb
 from recon.imaging.sample_motion.vibrations import (
     Vibration,
     coefficient_covariance,
@@ -51,7 +51,7 @@ class SmoothedMotion(NamedTuple):
 
     position: Array
     vibrations: list[Vibration]
-    motion: Motion
+    motion: MotionUnderWalk
     equations: BlockEquations
     around: Array
     gain: float

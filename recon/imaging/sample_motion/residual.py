@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.sample_motion.block_equations import SHAPES, ScanSamples, block_equations
+from recon.imaging.sample_motion.block_equations import SHAPES, PlacedSamples, block_equations
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES
 
@@ -22,7 +22,9 @@ MIN_STANDARD_SCORE = 3.9
 probability of 5e-5, as for a motion that is reported."""
 
 
-def residual_variance(samples: ScanSamples, shift: Array, part: int, shape: tuple[int, int], width: float) -> Array:
+def remaining_motion_variance(
+    samples: PlacedSamples, shift: Array, part: int, shape: tuple[int, int], width: float
+) -> Array:
     """Return the variance of the motion that is left in x and y, shape (2,) [px²]; 0 where none is significant.
 
     Args:
@@ -43,7 +45,7 @@ def residual_variance(samples: ScanSamples, shift: Array, part: int, shape: tupl
     return np.where(total > MIN_STANDARD_SCORE * sd, variance, 0.0)
 
 
-def _of_colour(samples: ScanSamples, shift: Array, part: int, colour: float) -> NDArray[np.float32]:
+def _of_colour(samples: PlacedSamples, shift: Array, part: int, colour: float) -> NDArray[np.float32]:
     """Intensity on the squares of a colour, 0 or 1; NaN on the others."""
     value = samples.value.copy()
     knots = (np.arange(len(shift)) + 0.5) * part - 0.5

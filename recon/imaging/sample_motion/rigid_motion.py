@@ -21,11 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.imaging.sample_motion.block_equations import PARTS, ScanSamples, block_equations, sample_log_likelihoods
+from recon.imaging.sample_motion.block_equations import PARTS, PlacedSamples, block_equations, sample_log_likelihoods
 from recon.imaging.sample_motion.coarse_search import search_motion
 from recon.imaging.sample_motion.jumps import MotionKnots, place_jumps
 from recon.imaging.sample_motion.motion_smoother import SmoothedMotion, part_shift, smooth_motion
-from recon.imaging.sample_motion.residual import residual_variance
+from recon.imaging.sample_motion.residual import remaining_motion_variance
 from recon.imaging.sample_motion.vibrations import Vibration, vibration_shift
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -92,7 +92,7 @@ class SampleMotion:
 
 
 def estimate_sample_motion(
-    samples: ScanSamples, period: float, shape: tuple[int, int], widths: Sequence[float] = WIDTHS_PX
+    samples: PlacedSamples, period: float, shape: tuple[int, int], widths: Sequence[float] = WIDTHS_PX
 ) -> SampleMotion | None:
     """Estimate the motion of the sample; None where the scan has too few crossings.
 
@@ -129,14 +129,14 @@ def estimate_sample_motion(
         information = equations.information[:, :2, :2].mean(axis=0) + MIN_INFORMATION * np.eye(2)
         sd_of_a_block = np.sqrt(first.motion.scale * np.diag(np.linalg.inv(information)))
         knots, shift, vibrations = MotionKnots(middle, position, np.tile(sd_of_a_block, (blocks, 1))), at_rest, []
-    left = residual_variance(samples, shift, part, shape, final_width if moving else width)
+    left = remaining_motion_variance(samples, shift, part, shape, final_width if moving else width)
     sample, displacement, sd = (each[knots.sample < samples.x.size] for each in knots)  # the last block may be cut off
     per_sample = tuple(each._replace(frequency=each.frequency / length) for each in vibrations)
     return SampleMotion(length, sample, displacement, np.sqrt(sd**2 + left), moving, gain, np.sqrt(left), per_sample)
 
 
 def choose_width(
-    samples: ScanSamples, shift: Array, part: int, shape: tuple[int, int], widths: Sequence[float] = WIDTHS_PX
+    samples: PlacedSamples, shift: Array, part: int, shape: tuple[int, int], widths: Sequence[float] = WIDTHS_PX
 ) -> tuple[float, float]:
     """Return the kernel [px] whose picture of the other blocks predicts the samples best.
 
@@ -147,7 +147,7 @@ def choose_width(
 
 
 def _prediction_gain(
-    samples: ScanSamples, part: int, shape: tuple[int, int], width: float, moved: Array, without: Array
+    samples: PlacedSamples, part: int, shape: tuple[int, int], width: float, moved: Array, without: Array
 ) -> float:
     """Gain of the log likelihood of the samples under the pictures of the other blocks, at least 0.
 
@@ -161,7 +161,7 @@ def _prediction_gain(
 
 
 def _follow(
-    samples: ScanSamples, start: SmoothedMotion, part: int, shape: tuple[int, int]
+    samples: PlacedSamples, start: SmoothedMotion, part: int, shape: tuple[int, int]
 ) -> tuple[SmoothedMotion, float]:
     """The motion after rounds of Gauss-Newton from a coarse one, and the kernel [px] of the last ones.
 
@@ -189,7 +189,7 @@ def _follow(
 
 
 def _converge(
-    samples: ScanSamples,
+    samples: PlacedSamples,
     smoothed: SmoothedMotion,
     part: int,
     shape: tuple[int, int],
@@ -207,7 +207,7 @@ def _converge(
 
 
 def _round(
-    samples: ScanSamples,
+    samples: PlacedSamples,
     around: SmoothedMotion,
     part: int,
     shape: tuple[int, int],
@@ -220,7 +220,7 @@ def _round(
     return smoothed._replace(position=smoothed.position - smoothed.position.mean(axis=0))
 
 
-def _coarse_motion(samples: ScanSamples, length: int, blocks: int, shape: tuple[int, int]) -> Array:
+def _coarse_motion(samples: PlacedSamples, length: int, blocks: int, shape: tuple[int, int]) -> Array:
     """Translation of each block by the coarse search, linear between the middles of its parts."""
     parts = max(blocks // SEARCH_PERIODS, 1)
     coarse = search_motion(samples, SEARCH_PERIODS * length, parts, shape)

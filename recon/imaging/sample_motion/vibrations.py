@@ -17,7 +17,14 @@ import numpy as np
 from scipy.fft import fft, next_fast_len
 
 from recon.imaging.sample_motion.block_equations import PARTS, SHAPES, BlockEquations, by_shape
-from recon.imaging.sample_motion.motion_filter import VELOCITY_WALKS_PX, WALKS_PX, Data, Motion, Observations, climb
+from recon.imaging.sample_motion.motion_filter import (
+    VELOCITY_WALKS_PX,
+    WALKS_PX,
+    Data,
+    MotionUnderWalk,
+    Observations,
+    climb,
+)
 from scanner.arrays import Array
 
 MAX_FREQUENCY = 0.75
@@ -145,7 +152,7 @@ def refine_vibrations(
     return vibrations
 
 
-def coefficient_covariance(equations: BlockEquations, motion: Motion, around: Array) -> Array:
+def coefficient_covariance(equations: BlockEquations, motion: MotionUnderWalk, around: Array) -> Array:
     """Return the covariance of the amplitudes and frequencies, from sums by place, shape (k, k).
 
     Args:

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from estimation.candidate_terms.anchor import MAX_RESIDUAL_RATIO, fit_anchor, residual_ratio
 from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, FORCE_POWERS, N_FORCE_POWERS, cosine_series
-from estimation.candidate_terms.screening import ProfiledLinearModel, all_candidates, damped_start, linear_gain
+from estimation.candidate_terms.screening import ProfiledLinearModel, all_candidates, damped_start, predict_gain
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, fit_models
 from estimation.device_fit.initial import fit_initial_state, fit_progressively, flat_whiteners, window_schedule
@@ -115,7 +115,7 @@ def test_a_diverged_motion_predicts_no_gain() -> None:
         jacobian=np.full((3, 2), 1e20), residual=np.full(3, 1e6), rows=np.ones(3, bool), x=np.zeros(2), model=model
     )
     known = ProfiledLinearModel(diverged)  # type: ignore[arg-type]
-    assert linear_gain(*known.normal_equations(np.ones((3, 1)))[:2])[0] == 0.0
+    assert predict_gain(*known.normal_equations(np.ones((3, 1)))[:2])[0] == 0.0
 
 
 def test_parallel_fits_equal_sequential_fits() -> None:

@@ -10,7 +10,7 @@ from estimation.tracker import block_tracking, observations, rts_smoother, track
 from estimation.tracker.averaged_dynamics import average_cycle, axis_parameters
 from estimation.tracker.block_tracking import track_blocks
 from estimation.tracker.filter_run import FilterRun, filter_blocks
-from estimation.tracker.initial_state import initial_estimate, resolve_signs
+from estimation.tracker.initial_state import choose_signs, initial_estimate
 from estimation.tracker.linearisation import empty_linearisation, expected_projections, predict
 from estimation.tracker.observations import BlockObservations
 from estimation.tracker.process_noise import tune_process_noise, tuning_parts
@@ -184,7 +184,7 @@ def test_score_is_the_derivative_of_the_likelihood() -> None:
 
 def test_windows_give_the_result_of_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = prepared_of(8)
-    start, _ = resolve_signs(prepared, initial_estimate(prepared, devices.load("imaging")))
+    start, _ = choose_signs(prepared, initial_estimate(prepared, devices.load("imaging")))
     walk = tune_process_noise(prepared, start, tuning_parts(prepared.signal))[0][None]
     (whole,) = track_blocks(prepared, start, walk)
     monkeypatch.setattr(block_tracking, "WINDOW_BLOCKS", 10)
@@ -231,7 +231,7 @@ def test_sign_does_not_depend_on_the_start_or_the_block_length(share: float, mon
     start = initial_estimate(prepared, device)
     turned = start.mean.copy()
     turned[PHASE] += np.pi
-    results = [resolve_signs(prepared, estimate) for estimate in (start, replace(start, mean=turned))]
+    results = [choose_signs(prepared, estimate) for estimate in (start, replace(start, mean=turned))]
     assert [sign for _, (sign,) in results] == ["known: the combs' offset theta_th"] * 2
     difference = results[0][0].mean[PHASE] - results[1][0].mean[PHASE]
     assert np.exp(1j * difference) == pytest.approx(1.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.imaging.sample_motion import rigid_motion
-from recon.imaging.sample_motion.block_equations import PARTS, ScanSamples, sample_log_likelihoods
+from recon.imaging.sample_motion.block_equations import PARTS, PlacedSamples, sample_log_likelihoods
 from recon.imaging.sample_motion.rigid_motion import estimate_sample_motion
 from scanner.arrays import Array
 from tests.support.sample_motion import BLOCKS, PERIOD, PIXELS, beads, scan
@@ -36,7 +36,7 @@ def test_the_true_motion_has_the_larger_likelihood(size: float) -> None:
 def test_a_drift_is_found_whichever_kernel_predicts_best_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wider one averages more noise at few photons. That gains as much as this drift does."""
 
-    def chosen(samples: ScanSamples, shift: Array, *_: object) -> tuple[float, float]:
+    def chosen(samples: PlacedSamples, shift: Array, *_: object) -> tuple[float, float]:
         return (0.7 if shift.any() else 1.4), 1.0
 
     monkeypatch.setattr(rigid_motion, "choose_width", chosen)

@@ -10,7 +10,7 @@ import pytest
 
 from phantoms.optics import sample_scene
 from recon.cli import main
-from recon.imaging.sample_motion.block_equations import PARTS, SHAPES, BlockEquations, ScanSamples, block_equations
+from recon.imaging.sample_motion.block_equations import PARTS, SHAPES, BlockEquations, PlacedSamples, block_equations
 from recon.imaging.sample_motion.correction import describe_sample_motion
 from recon.imaging.sample_motion.motion_smoother import smooth_motion
 from recon.imaging.sample_motion.rigid_motion import MIN_LOG_LIKELIHOOD_GAIN, SampleMotion, estimate_sample_motion
@@ -55,7 +55,7 @@ def test_a_jump_is_found_at_its_moment() -> None:
 def test_a_phase_error_is_no_motion() -> None:
     """It displaces forward and backward half-periods in opposite directions."""
     samples = scan(np.zeros((2, 2)))
-    late = ScanSamples(np.roll(samples.x, 1), samples.y, samples.value)
+    late = PlacedSamples(np.roll(samples.x, 1), samples.y, samples.value)
     found = estimate_sample_motion(late, PERIOD, (PIXELS, PIXELS))
     assert found is not None
     assert not found.moving
@@ -98,7 +98,7 @@ def test_a_scene_without_structure_and_a_scan_without_crossings_are_stated() -> 
     assert not found.moving
     assert "too little structure" in describe_sample_motion(found, RATE)
     line = (0.5 + 4.0 * (np.arange(samples.x.size) // 1800)).astype(np.float32)
-    raster = ScanSamples.from_arrays(samples.places(slice(None))[0], line, samples.value)
+    raster = PlacedSamples.from_arrays(samples.places(slice(None))[0], line, samples.value)
     assert estimate_sample_motion(raster, 1800.0, (PIXELS, PIXELS)) is None
     assert "too rarely" in describe_sample_motion(None, RATE)
 
