@@ -188,7 +188,10 @@ def drive_phasors(drive: Channel, frequency: float, cycles: float) -> tuple[Arra
 
 
 def tone_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
-    """Frequency of a tone in (low, high) [Hz], also of few periods; arguments as for ``dominant_frequency``.
+    """Frequency of a tone in (low, high) [Hz], also of few periods.
+
+    Args:
+        window: duration from the start that is searched [s]; at most 2^18 samples, which is the default.
 
     Raises:
         BadInput: the channel holds no oscillation there.
@@ -202,15 +205,15 @@ def tone_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, win
     return found
 
 
-def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf, window: float | None = None) -> float:
-    """Frequency of the strongest line in (low, high) over the first ``window`` seconds (at most 2^18 samples) [Hz].
+def dominant_frequency(channel: Channel, low: float = 0.0, high: float = np.inf) -> float:
+    """Frequency of the strongest line in (low, high) over the first 2^18 samples at most [Hz].
 
     A few periods of ``low`` are searched first, which is fast, unless samples are missing there (NaN).
 
     Raises:
         BadInput: no line exceeds the noise there.
     """
-    found = _spectral_frequency(channel, low, high, window)
+    found = _spectral_frequency(channel, low, high, None)
     if found is None:
         raise _no_oscillation(channel)
     return found

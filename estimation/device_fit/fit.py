@@ -34,6 +34,10 @@ DIVERGED_RESIDUAL, MAX_RESIDUAL = 1e6, 1e100
 """Residuals of a diverging trajectory above the second number, whose square would overflow, are replaced by the
 first."""
 
+MISFIT_TOLERANCE = 0.05
+"""Fall of the misfit by a step below which a fit ends: about a hundredth of the difference in -2 log evidence
+between laws that are distinguished."""
+
 INITIAL_STEP = 1e-4
 """First difference step of every parameter, in prior standard deviations."""
 
@@ -215,7 +219,7 @@ def fit_model(
     stop: float = 1.0,
     max_iterations: int = 12,
     steps: Array | None = None,
-    tolerance: float = 0.05,
+    tolerance: float = MISFIT_TOLERANCE,
     abort_above: float = np.inf,
     fixed: Sequence[int] = (),
 ) -> Fit:
@@ -256,23 +260,22 @@ def fit_models(
     starts: Iterable[tuple[Model, Array]],
     stop: float = 1.0,
     max_iterations: int = 12,
-    tolerance: float = 0.05,
     abort_above: float = np.inf,
 ) -> list[Fit]:
     """:func:`fit_model` for each model and start, ``MAX_PARALLEL_FITS`` at a time, in the order of ``starts``."""
 
     def fit(start: tuple[Model, Array]) -> Fit:
-        return fit_model(likelihood, *start, stop, max_iterations, tolerance=tolerance, abort_above=abort_above)
+        return fit_model(likelihood, *start, stop, max_iterations, abort_above=abort_above)
 
     return map_fits(fit, starts, likelihood.steps)
 
 
-def linearise_at(likelihood: Likelihood, model: Model, x: Array, stop: float = 1.0) -> Fit:
+def linearise_at(likelihood: Likelihood, model: Model, x: Array) -> Fit:
     """Residual and Jacobian of a model at ``x``, as a fit without iterations."""
-    residual, steps = likelihood.residual(model, x, stop), np.full(x.size, INITIAL_STEP)
+    residual, steps = likelihood.residual(model, x), np.full(x.size, INITIAL_STEP)
     for _ in range(2):  # the first Jacobian adapts the steps
-        jacobian = likelihood.jacobian(model, x, residual, steps, stop)
-    return _finalise_fit(likelihood, model, x, residual, jacobian, likelihood.fitted(stop))
+        jacobian = likelihood.jacobian(model, x, residual, steps)
+    return _finalise_fit(likelihood, model, x, residual, jacobian, likelihood.rows)
 
 
 def linearise_simulated(model: Model, x: Array, whiteners: Sequence[Sequence[Whitener]]) -> tuple[Likelihood, Fit]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimation.device_fit.data import Output
-from estimation.device_fit.fit import INITIAL_STEP, Fit, Likelihood, fit_model, fit_models
+from estimation.device_fit.fit import INITIAL_STEP, MISFIT_TOLERANCE, Fit, Likelihood, fit_model, fit_models, misfit
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import Whitener, flat_psd, make_whitener, near_lines, noise_psd
 from scanner.arrays import Array
@@ -21,8 +21,18 @@ WINDOW_GROWTH = 3.0
 """Ratio of the lengths of successive windows. A frequency that was fitted over one window predicts the phase over three
 times its length with an error far below half a cycle."""
 
-WINDOW_ITERATIONS = 6
-"""Largest number of iterations over a window: the next one continues the fit. The last has twice as many."""
+WINDOW_ITERATIONS, WINDOW_TOLERANCE = 6, 1.0
+"""Largest number of iterations over a window, and the fall of the misfit by a step below which its fit ends: the next
+window continues the fit. The last has twice as many iterations, and ends as other fits do."""
+
+START_AMPLITUDES = np.geomspace(0.03, 1.5, 9)
+"""Amplitudes of the motion at the first sample that are tried, in its natural amplitude."""
+
+START_PHASES_RAD = 2 * np.pi * np.arange(12) / 12
+"""Phases of the motion at the first sample that are tried."""
+
+FITTED_STARTS = 3
+"""Starts of lowest misfit from which the initial state is fitted."""
 
 EXCLUDED_HARMONICS = 12
 """Harmonics of the motion around which no noise is measured, because a misfit concentrates there."""
@@ -98,9 +108,7 @@ def _lines_overlap(output: Output, lines: Array, width: float, motion: float) ->
     return bool(near_lines(frequency, lines, width)[around].mean() > 0.8)
 
 
-def fit_initial_state(
-    likelihood: Likelihood, model: Model, stop: float, grid: tuple[int, int] = (9, 12), finalists: int = 3
-) -> Fit:
+def fit_initial_state(likelihood: Likelihood, model: Model, stop: float) -> Fit:
     """Fit the initial angle and rate over the first window, from a grid of amplitudes and phases for each run.
 
     An even capacitance determines the phase modulo pi only: the sign of the motion is not identifiable from the
@@ -108,8 +116,6 @@ def fit_initial_state(
 
     Args:
         stop: end of the window as a fraction of the recordings.
-        grid: numbers of amplitudes and phases.
-        finalists: starts of lowest misfit from which the fit is run.
     """
     x = np.zeros(len(model.parameters))
     states: list[list[Array]] = []
@@ -117,21 +123,21 @@ def fit_initial_state(
         for axis in run.inputs:
             indices = start_indices(model, axis, r)
             misfits = []
-            for amplitude in np.geomspace(0.03, 1.5, grid[0]):
-                for phase in 2 * np.pi * np.arange(grid[1]) / grid[1]:
+            for amplitude in START_AMPLITUDES:
+                for phase in START_PHASES_RAD:
                     x[indices] = amplitude * np.cos(phase), amplitude * np.sin(phase)
-                    misfits.append((_misfit(model, r, x, stop), x[indices].copy()))
+                    misfits.append((_relative_misfit(model, r, x, stop), x[indices].copy()))
             misfits.sort(key=lambda pair: pair[0])
             x[indices] = misfits[0][1]
-            states.append([values for _, values in misfits[:finalists]])
-    starts_x = [x.copy() for _ in range(finalists)]
+            states.append([values for _, values in misfits[:FITTED_STARTS]])
+    starts_x = [x.copy() for _ in range(FITTED_STARTS)]
     for i, x_start in enumerate(starts_x):
         best_states = iter(states)
         for r, run in enumerate(model.runs):
             for axis in run.inputs:
                 x_start[start_indices(model, axis, r)] = next(best_states)[i]
     fits = fit_models(likelihood, [(model, x_start) for x_start in starts_x], stop, max_iterations=10)
-    return min(fits, key=lambda fit: fit.chi2 + fit.penalty)
+    return min(fits, key=misfit)
 
 
 def start_indices(model: Model, axis: str, r: int) -> list[int]:
@@ -139,7 +145,7 @@ def start_indices(model: Model, axis: str, r: int) -> list[int]:
     return [i for i, f in enumerate(model.parameters) if (f.kind, f.owner, f.run) == ("start", axis, r)]
 
 
-def _misfit(model: Model, r: int, x: Array, stop: float) -> float:
+def _relative_misfit(model: Model, r: int, x: Array, stop: float) -> float:
     """Sum over the channels of run ``r`` of the residual's variance relative to that of the channel."""
     total = 0.0
     for output, signal in zip(model.runs[r].outputs, model.outputs(x, stop)[r], strict=True):
@@ -160,6 +166,8 @@ def fit_progressively(likelihood: Likelihood, model: Model, stops: Sequence[floa
     for stop in stops:
         last = stop == stops[-1]
         iterations = 2 * WINDOW_ITERATIONS if last else WINDOW_ITERATIONS
-        fits.append(fit_model(likelihood, model, x, stop, iterations, steps, 0.05 if last else 1.0))
+        fits.append(
+            fit_model(likelihood, model, x, stop, iterations, steps, MISFIT_TOLERANCE if last else WINDOW_TOLERANCE)
+        )
         x = fits[-1].x
     return fits

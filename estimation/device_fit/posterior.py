@@ -17,6 +17,12 @@ POSTERIOR_DRAWS = 40
 PORTRAIT_CELLS = 24
 """Number of cells of a phase portrait along each side: each is about 4 % of the peak-to-peak range."""
 
+PHASE_POINTS, SAMPLES_PER_PHASE = 200, 16
+"""Times at which a phase error is computed, and samples of the motion whose mean is that at one time."""
+
+WAVEFORM_SAMPLES = 120
+"""Samples of a channel whose waveform is shown: a few periods."""
+
 PICTURE_HALF_WIDTH_PX = 200
 """Pixels from the middle of a line to its end, in a picture of 400 pixels."""
 
@@ -75,25 +81,25 @@ class PredictionPhaseError:
         return PICTURE_HALF_WIDTH_PX * float(np.sqrt(np.mean(phase**2)))
 
 
-def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int, points: int = 200) -> PredictionPhaseError | None:
+def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int) -> PredictionPhaseError | None:
     """Phase error of one axis; None if it is driven far below its resonance, where it follows the drive."""
     run = final.model.runs[run_index]
     scales = run.scales[axis]
     if scales.rate < 0.5 * np.sqrt(scales.k / scales.J):
         return None
-    at = np.linspace(0, len(run.inputs[axis].voltage), points * 16 + 1).astype(np.intp)
+    at = np.linspace(0, len(run.inputs[axis].voltage), PHASE_POINTS * SAMPLES_PER_PHASE + 1).astype(np.intp)
 
     def phasor(fit: Fit, x: Array) -> Array:
         trajectory = fit.model.trajectories(run_index, x)[axis]
         return np.asarray(trajectory.angle[at] - 1j * trajectory.rate[at] / scales.rate)
 
     def mean_phase(product: Array) -> Array:
-        return np.angle(product[:-1].reshape(points, 16).mean(axis=1))
+        return np.angle(product[:-1].reshape(PHASE_POINTS, SAMPLES_PER_PHASE).mean(axis=1))
 
     reference = phasor(final, final.x).conj()
     spread = [mean_phase(phasor(final, x) * reference) for x in draw_parameters(final, POSTERIOR_DRAWS // 2)]
     before = mean_phase(phasor(nominal, nominal.x) * reference)
-    time = run.inputs[axis].time[at[:-1]].reshape(points, 16).mean(axis=1)
+    time = run.inputs[axis].time[at[:-1]].reshape(PHASE_POINTS, SAMPLES_PER_PHASE).mean(axis=1)
     return PredictionPhaseError(time, before, Z_95 * np.sqrt(np.mean(np.square(spread), axis=0)))
 
 
@@ -112,12 +118,12 @@ class Waveform:
     after: Array
 
 
-def waveform(nominal: Fit, final: Fit, run_index: int, channel_index: int, samples: int = 120) -> Waveform:
+def waveform(nominal: Fit, final: Fit, run_index: int, channel_index: int) -> Waveform:
     """The part of a channel in which the nominal device is most wrong, without the samples that are not compared."""
     output = final.model.runs[run_index].outputs[channel_index]
     before, after = (fit.model.outputs(fit.x)[run_index][channel_index] for fit in (nominal, final))
     start, stop = output.guard[0], output.data.size - output.guard[1]
-    length = min(samples, stop - start)
+    length = min(WAVEFORM_SAMPLES, stop - start)
     misfit = np.concatenate([[0.0], np.cumsum((output.data - before)[start:stop] ** 2)])
     first = start + int(np.argmax(misfit[length:] - misfit[:-length]))
     part = slice(first, first + length)

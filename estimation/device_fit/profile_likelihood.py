@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.device_fit.fit import Fit, Likelihood, fit_model
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
 from estimation.least_squares import Z_95
 
 PARABOLIC_TOLERANCE = 0.1
@@ -35,12 +35,12 @@ def profile_interval(likelihood: Likelihood, fit: Fit, i: int) -> tuple[float, f
 def _profile_endpoint(likelihood: Likelihood, fit: Fit, i: int, side: float) -> float:
     """Distance from x[i] to the end of its interval on one side, -1 or 1."""
     covariance, precision = fit.covariance, fit.model.precision
-    minimum, ridge = fit.chi2 + fit.penalty, covariance[:, i] / covariance[i, i]
+    minimum, ridge = misfit(fit), covariance[:, i] / covariance[i, i]
     distance = float(side * Z_95 * np.sqrt(covariance[i, i]))
 
-    def relative_rise(misfit: float) -> float:
-        """Square root of the rise to a misfit, relative to that at an end of the interval."""
-        return float(np.sqrt(max(misfit - minimum, 1e-12)) / Z_95)
+    def relative_rise(value: float) -> float:
+        """Square root of the rise of the misfit to a value, relative to that at an end of the interval."""
+        return float(np.sqrt(max(value - minimum, 1e-12)) / Z_95)
 
     x = fit.x + ridge * distance
     is_free = np.arange(x.size) != i
@@ -60,5 +60,5 @@ def _profile_endpoint(likelihood: Likelihood, fit: Fit, i: int, side: float) -> 
         trial = fit_model(
             likelihood, fit.model, fit.x + ridge * distance, max_iterations=4, tolerance=PROFILE_TOLERANCE, fixed=(i,)
         )
-        ridge, rise = (trial.x - fit.x) / distance, relative_rise(trial.chi2 + trial.penalty)
+        ridge, rise = (trial.x - fit.x) / distance, relative_rise(misfit(trial))
     return float(distance / np.clip(rise, 0.5, 2.0))

@@ -66,16 +66,15 @@ def _filter(y, voltage, parameters, measure, q, x, P, full, event, ahead, rates,
     return chi2, logdet
 
 
-def make_detector(problem: FilterInput, sigma: float | None = None, noise_sd: float | None = None) -> CrossingDetector:
+def make_detector(problem: FilterInput, sigma: float | None = None) -> CrossingDetector:
     """The crossing detector that suits a signal.
 
     Args:
         sigma: sigma_DOG [samples]; ``SIGMA_CYCLES`` of the motion by default.
-        noise_sd: of the signal [V]; the readout's by default.
     """
     cycle = 1.0 / (problem.references[problem.model.axes[0]].frequency * problem.model.step)
     sigma = SIGMA_CYCLES * cycle if sigma is None else sigma
-    noise_sd = float(np.sqrt(problem.model.noise_var)) if noise_sd is None else noise_sd
+    noise_sd = float(np.sqrt(problem.model.noise_var))
     return CrossingDetector(sigma, int(8 * sigma) + 2, round(SUPPRESS_CYCLES * cycle), noise_sd)
 
 

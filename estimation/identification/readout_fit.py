@@ -54,7 +54,6 @@ def fit_readout(
     senses: Sequence[Array],
     sections: Sequence[float],
     terms: Sequence[str] = READOUT_FEATURES,
-    skip: float = SETTLE_TIME_S,
 ) -> ReadoutFit:
     """Gain and offset of an AMDM readout, with corrections to the formula a_cir C + b_cir, by least squares.
 
@@ -62,12 +61,11 @@ def fit_readout(
         records: with the reference angle. senses: the output at the same samples [V].
         sections: corner of every low-pass section [Hz].
         terms: which of ``READOUT_FEATURES``; the paper's own fit is ``("a_cir", "b_cir")`` and no sections.
-        skip: start of each record that is left out while the sections settle [s].
     """
     columns = [READOUT_FEATURES.index(term) for term in terms]
     basis, target = [], []
     for record, sense in zip(records, senses, strict=True):
-        first = round(skip * record.rate)
+        first = round(SETTLE_TIME_S * record.rate)
         features = readout_features(comb, record.angle, record.voltage, record.rate, sections)
         basis.append(features[first:, columns])
         target.append(sense[first:])

@@ -28,6 +28,9 @@ TIME_BINS = 120
 SPECTRUM_BINS = 400
 """Bins of a spectrum, about as many as its figure has columns."""
 
+TOLERATED_BLUR_PX = 1.0
+"""Blur that is marked as tolerated: the default of ``--p``."""
+
 MIN_DRAWN_BLUR_PX = 1e-3
 """Blur below this value is drawn at it, because a logarithmic axis has no zero."""
 
@@ -128,7 +131,7 @@ def portrait_figure(before: Array, after: Array, caption: str) -> Figure:
     return Figure(figure_uri(drawing), caption)
 
 
-def phase_error_figure(error: PredictionPhaseError, caption: str, tolerated_px: float = 1.0) -> Figure:
+def phase_error_figure(error: PredictionPhaseError, caption: str) -> Figure:
     """Blur at the centre of a line by the phase error of an open-loop prediction, over time."""
 
     def draw(axes: Axes) -> None:
@@ -139,7 +142,7 @@ def phase_error_figure(error: PredictionPhaseError, caption: str, tolerated_px: 
         ):
             blur = np.maximum(PICTURE_HALF_WIDTH_PX * np.abs(phase), MIN_DRAWN_BLUR_PX)
             axes.plot(time, blur, color=colour, label=label)
-        axes.axhline(tolerated_px, color="#444", lw=0.8, ls="--", label="tolerated, 1 pixel")
+        axes.axhline(TOLERATED_BLUR_PX, color="#444", lw=0.8, ls="--", label=f"tolerated, {TOLERATED_BLUR_PX:g} pixel")
         axes.set(xlabel="time (ms)", ylabel="blur (pixels)", yscale="log")
         use_plain_ticks(axes.yaxis)
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8)

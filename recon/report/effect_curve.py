@@ -49,7 +49,7 @@ class EffectCurve:
     logarithmic: bool = False
 
 
-def effect_curve(fit: Fit, candidate: Candidate, bins: int = CURVE_BINS) -> EffectCurve | None:
+def effect_curve(fit: Fit, candidate: Candidate) -> EffectCurve | None:
     """The curve of a catalogue effect with its 95 % band; None if it has hidden states or no effect in the run.
 
     The fitted motion is used for all parameter values, so the band is that of the effect alone.
@@ -67,7 +67,7 @@ def effect_curve(fit: Fit, candidate: Candidate, bins: int = CURVE_BINS) -> Effe
     if term.corners is not None or term.clock is not None:
         duration = fit.model.runs[run_index].duration
         return _timing_curve(fit, candidate, values, scales.rate / (2.0 * np.pi), duration)
-    return _state_curve(fit, candidate, values, run_index, bins)
+    return _state_curve(fit, candidate, values, run_index)
 
 
 def _timing_curve(
@@ -113,24 +113,24 @@ class _Representation:
     regressor: Array
     scale: float = 1.0
 
-    def coefficients(self, change: Array, bins: int) -> Array:
-        """Least-squares coefficient in each bin, shape (bins,), NaN for an empty bin."""
-        bin_index = _bin_indices(self.variable, bins)
-        weight = np.bincount(bin_index, self.regressor**2, bins)
+    def coefficients(self, change: Array) -> Array:
+        """Least-squares coefficient in each bin, shape (CURVE_BINS,), NaN for an empty bin."""
+        bin_index = _bin_indices(self.variable)
+        weight = np.bincount(bin_index, self.regressor**2, CURVE_BINS)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(weight > 0.0, np.bincount(bin_index, change * self.regressor, bins) / weight, np.nan)
+            return np.where(weight > 0.0, np.bincount(bin_index, change * self.regressor, CURVE_BINS) / weight, np.nan)
 
-    def unexplained(self, change: Array, bins: int) -> float:
+    def unexplained(self, change: Array) -> float:
         """Mean square of ``change`` that the coefficients do not explain."""
-        fitted = self.coefficients(change, bins)[_bin_indices(self.variable, bins)] * self.regressor
+        fitted = self.coefficients(change)[_bin_indices(self.variable)] * self.regressor
         return float(np.nanmean((change - fitted) ** 2))
 
-    def curve(self, change: Array, bins: int) -> Array:
-        return self.scale * self.coefficients(change, bins)
+    def curve(self, change: Array) -> Array:
+        return self.scale * self.coefficients(change)
 
 
 def _state_curve(
-    fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], run_index: int, bins: int
+    fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], run_index: int
 ) -> EffectCurve | None:
     """The change by an effect over the variable that explains most of its variance."""
     trajectory = fit.model.trajectories(run_index, fit.x)[candidate.axis]
@@ -147,11 +147,13 @@ def _state_curve(
     fitted = change(fit.x)
     if not fitted.any():
         return None
-    representation = _choose_representation(_representations(without, candidate, samples), fitted, bins)
-    bin_index = _bin_indices(representation.variable, bins)
-    x = np.bincount(bin_index, representation.variable, bins) / np.maximum(np.bincount(bin_index, minlength=bins), 1)
-    y = representation.curve(fitted, bins)
-    drawn = np.stack([representation.curve(change(p), bins) for p in draw_parameters(fit)])
+    representation = _choose_representation(_representations(without, candidate, samples), fitted)
+    bin_index = _bin_indices(representation.variable)
+    x = np.bincount(bin_index, representation.variable, CURVE_BINS) / np.maximum(
+        np.bincount(bin_index, minlength=CURVE_BINS), 1
+    )
+    y = representation.curve(fitted)
+    drawn = np.stack([representation.curve(change(p)) for p in draw_parameters(fit)])
     not_empty = np.isfinite(y)
     band = np.percentile(drawn[:, not_empty], [2.5, 97.5], axis=0)
     return EffectCurve(x[not_empty], y[not_empty], band, representation.x_label, representation.y_label)
@@ -180,13 +182,13 @@ def _representations(without: AxisTrajectory, candidate: Candidate, samples: NDA
     return plain + products
 
 
-def _choose_representation(options: Sequence[_Representation], change: Array, bins: int) -> _Representation:
+def _choose_representation(options: Sequence[_Representation], change: Array) -> _Representation:
     plain = [option for option in options if not np.ptp(option.regressor)]
     products = [option for option in options if np.ptp(option.regressor)]
-    best_plain = min(plain, key=lambda option: option.unexplained(change, bins))
+    best_plain = min(plain, key=lambda option: option.unexplained(change))
     if products:
-        product = min(products, key=lambda option: option.unexplained(change, bins))
-        if MODULATION_ADVANTAGE * product.unexplained(change, bins) < best_plain.unexplained(change, bins):
+        product = min(products, key=lambda option: option.unexplained(change))
+        if MODULATION_ADVANTAGE * product.unexplained(change) < best_plain.unexplained(change):
             return product
     return best_plain
 
@@ -235,6 +237,6 @@ def _change(without: AxisTrajectory, active: ActiveTerm, samples: NDArray[np.int
     return (sense_signal(readout, [changed]) - sense_signal(readout, [without]))[samples]
 
 
-def _bin_indices(variable: Array, bins: int) -> NDArray[np.intp]:
+def _bin_indices(variable: Array) -> NDArray[np.intp]:
     low, high = variable.min(), variable.max()
-    return np.minimum((variable - low) / (high - low) * bins, bins - 1).astype(np.intp)
+    return np.minimum((variable - low) / (high - low) * CURVE_BINS, CURVE_BINS - 1).astype(np.intp)

@@ -30,8 +30,8 @@ def point_cloud_report(cloud: PointCloud, summary: Mapping[str, Any]) -> str:
     x, y, z = cloud.position[part].T
     distance = np.linalg.norm(cloud.position[part], axis=1)
     figures = [
-        Figure(draw_view(x, y, distance, "x [m]", "y [m]", "distance [m]"), "From the scanner; colour: distance."),
-        Figure(draw_view(x, z, y, "x [m]", "z [m]", "y [m]"), "From above; colour: y."),
+        Figure(draw_view(x, y, distance, "y [m]", "distance [m]"), "From the scanner; colour: distance."),
+        Figure(draw_view(x, z, y, "z [m]", "y [m]"), "From above; colour: y."),
     ]
     head = ["axis", "smallest [m]", "largest [m]", "standard deviation, rms [m]"]
     counts = [
@@ -48,13 +48,13 @@ def point_cloud_report(cloud: PointCloud, summary: Mapping[str, Any]) -> str:
     return render("Point cloud", summary["conclusion"], sections, summary["notes"], subject)
 
 
-def draw_view(across: Array, up: Array, colour: Array, across_label: str, up_label: str, colour_label: str) -> str:
-    """A scatter of points coloured by a length, as the address of a picture; all lengths in metres."""
+def draw_view(x: Array, up: Array, colour: Array, up_label: str, colour_label: str) -> str:
+    """A scatter of points over x, coloured by a length, as the address of a picture; all lengths in metres."""
     drawing, axes = new_figure(1, 1, (NARROW_WIDTH_IN, 3.4))
     panel = axes[0, 0]
     colour = np.round(colour, COLOUR_DECIMALS)
-    points = panel.scatter(across, up, s=1.0, c=colour, cmap="viridis", linewidths=0, rasterized=True)
+    points = panel.scatter(x, up, s=1.0, c=colour, cmap="viridis", linewidths=0, rasterized=True)
     drawing.colorbar(points, ax=panel, label=colour_label)
-    panel.set(xlabel=across_label, ylabel=up_label)
+    panel.set(xlabel="x [m]", ylabel=up_label)
     panel.set_aspect("equal", adjustable="datalim")
     return figure_uri(drawing)

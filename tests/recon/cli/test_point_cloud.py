@@ -172,7 +172,7 @@ def test_geometry_is_read_and_written_with_the_device() -> None:
 
 def test_a_colour_bar_of_equal_distances_does_not_show_the_rounding_of_the_arithmetic() -> None:
     across, distance = np.linspace(-1.0, 1.0, 50), np.linspace(1.0, 1.0 + 1e-14, 50) * 2.0
-    picture = draw_view(across, across, distance, "x [m]", "y [m]", "distance [m]")
+    picture = draw_view(across, across, distance, "y [m]", "distance [m]")
     labels = re.findall("<!-- (.*?) -->", base64.b64decode(picture.partition(",")[2]).decode())
     assert "2.00" in labels
     assert max(map(len, labels)) == len("distance [m]")
