@@ -38,9 +38,8 @@ def is_steady(line: float, values: Array, rate: float) -> bool:
     part = values[:LINE_SEARCH_SAMPLES]
     power, harmonic = periodogram(part - part.mean()), np.arange(1, STEADY_TONE_HARMONICS + 1)
     bins_from_line = np.abs(np.arange(power.size)[:, None] - harmonic * line * part.size / rate)
-    in_tone = np.any(
-        bins_from_line <= 2.0 + 0.5 * harmonic, axis=1
-    )  # two bins of the window, half a bin error of the line
+    half_widths = 2.0 + 0.5 * harmonic  # two bins of the window, and half a bin of error of the line
+    in_tone = np.any(bins_from_line <= half_widths, axis=1)
     return bool(power[in_tone].sum() > STEADY_TONE_POWER_SHARE * power.sum())
 
 

@@ -25,8 +25,8 @@ MIN_LINES_OF_BROAD_DRIVE = 50
 among the lines of the drive, as a line that exceeds its neighbours in the residual."""
 
 NEIGHBOUR_BINS = 64
-"""Bins on either side of a line that it has to exceed. Their median tells it from a resonance of an amplifier, which is
-narrower than a band of the noise spectrum; among the lines of a broad drive it is their 90 % quantile."""
+"""Bins on either side of a line that it has to exceed. Their median distinguishes it from a resonance of an amplifier,
+which is narrower than a band of the noise spectrum; among the lines of a broad drive it is their 90 % quantile."""
 
 
 def strongest_interfering_line(fit: Fit) -> float | None:

@@ -24,8 +24,8 @@ from scanner.arrays import Array
 from scanner.terms.term import AMPLITUDE_KINDS
 
 MAX_WINDOW_STARTS = 2
-"""Starts of such a law that are fitted over a window around each of two fits, for either sign of its size. In two scans
-with a mode that grows, one of the first two led to the right fit."""
+"""Starts of a law that is linear in no amplitude that are fitted over a window around each of two fits, for either sign
+of its size. In two scans with a mode that grows, one of the first two led to the right fit."""
 
 MAX_CONTINUED_FITS = 3
 """Fits over a window, in different minima, that are continued: a mode of either sign explains the first periods."""
@@ -55,12 +55,12 @@ def fit_with_stated_values(likelihood: Likelihood, model: Model, x: Array, first
 
 
 def fit_in_another_minimum(likelihood: Likelihood, nominal: Fit, drifting: Sequence[Fit]) -> Fit | None:
-    """The nominal device in a minimum in which it leaves but noise, reached from fits with drifts; None where none is.
+    """The nominal device in a minimum in which it leaves only noise, reached from fits with drifts; None if none is.
 
     With the device file of another scanner, fits of its first window from the stated values end in a wrong minimum.
 
     Args:
-        nominal: which leaves more than noise, else there is none.
+        nominal: the fit of the nominal device; if it leaves only noise, no other minimum is sought.
         drifting: fits with drifts from the stated values.
     """
     if residual_is_noise(nominal):
@@ -76,11 +76,11 @@ def fit_in_another_minimum(likelihood: Likelihood, nominal: Fit, drifting: Seque
 def fit_nonlinear_law(
     likelihood: Likelihood, nominal: Fit, pool: Sequence[Candidate], stops: Sequence[float]
 ) -> Fit | None:
-    """The device with a law that is linear in no amplitude, as a mode that grows, if it leaves but noise; else None.
+    """The device with a law that is linear in no amplitude, as a mode that grows, if it leaves only noise; else None.
 
     Over the whole recording its misfit has several minima, and nominal values have absorbed a part of the effect.
     Early, the stated values are nearly right. There starts of the law are compared, the nominal values are fitted after
-    it, and fits that leave but noise are continued over growing windows.
+    it, and fits that leave only noise are continued over growing windows.
 
     Args:
         stops: ends of growing windows as fractions of the recordings. The longest in which such a fit is found is used.
@@ -138,7 +138,7 @@ def _fit_law_first(likelihood: Likelihood, start: ScoreTest, stop: float) -> Fit
 
 
 def _leaves_noise(fit: Fit) -> bool:
-    """Whether the fitted samples of a window are explained but for noise."""
+    """Whether a fit leaves only noise in the samples of its window."""
     return fit.chi2 < MAX_HELD_OUT_CHI2 * int(np.count_nonzero(fit.rows))
 
 

@@ -48,7 +48,7 @@ class Improvement:
 
 
 def improve(result: SelectionResult) -> Improvement:
-    """Improve the device by the findings that its open-loop prediction bears out.
+    """Improve the device by the findings that its open-loop prediction supports.
 
     Findings beside others that the held-out samples contradict are rejected first. The weakest finding is removed as
     long as the prediction rejects it; a rail at which samples stand is certain and stays. If the findings leave noise

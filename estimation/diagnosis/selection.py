@@ -220,9 +220,9 @@ def _choose_from_stated_values(search: _Search, drifting: Sequence[Fit]) -> Sele
     """Named laws around a fit from the stated values, where nominal values have absorbed a misfit.
 
     It is that with the drifts that have the best evidence or, where all drifts leave more than noise, with a law that
-    is linear in no amplitude and leaves but noise. None where nominal values have absorbed nothing, where drifts follow
-    the motion neither with probable nor with improbable nominal values, or where the named laws are not the answer or
-    leave improbable values too.
+    is linear in no amplitude and leaves only noise. None where nominal values have absorbed nothing, where drifts
+    follow the motion neither with probable nor with improbable nominal values, or where the named laws are not the
+    answer or leave improbable values too.
 
     Args:
         drifting: fits with drifts from the stated values.

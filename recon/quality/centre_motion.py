@@ -30,8 +30,8 @@ nor a constant counts as the other one's."""
 def describe_centre_motion(
     recording: Recording, device: Device, motion: Motion, grid: Grid, max_pixels: float
 ) -> list[str]:
-    """A line for each axis whose position signal moves by more than ``max_pixels`` with the other axis, or otherwise
-    about a centre that moves, but for the drive.
+    """A line for each axis whose position signal follows the other axis, or whose centre moves without a cause in the
+    drive, by more than ``max_pixels``.
 
     A mirror at resonance moves about its rest position, which only a slow torque displaces: what a recorded drive does
     not cause is an error of the sensor, and the estimator ``sensor`` maps it. What follows the other axis is crosstalk.

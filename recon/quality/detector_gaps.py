@@ -1,4 +1,4 @@
-"""Times in which the detector did not see the scene: it was off, covered or disconnected for a part of the scan."""
+"""Times in which the detector did not show the scene: it was off, covered or disconnected for a part of the scan."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def find_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: 
 
 
 def describe_detector_gaps(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> list[str]:
-    """A line if the detector did not see the scene for a part of the scan; arguments as ``find_detector_gaps``."""
+    """A line if the detector did not show the scene for a part of the scan; arguments as ``find_detector_gaps``."""
     gaps = find_detector_gaps(beam, intensity, grid, unlocated)
     if not gaps:
         return []

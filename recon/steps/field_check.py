@@ -73,7 +73,7 @@ def check_field(
         picture: with the count of samples outside.
         motion: of the mirror.
         allow_outside: accept that most samples lie outside.
-        sample_moved: whether the samples were moved with the sample.
+        sample_moved: whether the places of the samples were corrected for a motion of the specimen.
         clock_notes: why the sample rates are doubted; with a wrong one, few samples are mapped, at any place.
 
     Raises:

@@ -1,8 +1,8 @@
 """Sign with which an axis goes on after it nearly rested, by the picture.
 
-An even capacitance shows the motion but for its sign. Where the amplitude vanishes, as beside a coupled mode or between
-two drives, the noise decides in which direction the estimated phase turns, and with it the sign of the motion that
-follows. With the wrong one, the later part of the scan shows the specimen mirrored.
+An even capacitance shows the motion except for its sign. Where the amplitude vanishes, as beside a coupled mode or
+between two drives, the noise decides in which direction the estimated phase turns, and with it the sign of the motion
+that follows. With the wrong one, the later part of the scan shows the specimen mirrored.
 """
 
 from __future__ import annotations

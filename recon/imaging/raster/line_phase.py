@@ -205,8 +205,9 @@ def shift_equations(frame: NDArray[Any], shift: float, fill_squared: float, inst
 def _sum_products(  # type: ignore[no-untyped-def]
     moved, mean_x, mean_y, other_x, other_y, own_y, border, band, score, slope
 ):
-    """Add up, by band of lines and column, the products of which scores and slopes consist but for factors that depend
-    on the column alone.
+    """Add up, by band of lines and column, the products of which scores and slopes consist.
+
+    Factors that depend on the column alone are left out.
 
     Args:
         score: the gradient along and across the lines times the difference, shape (2, bands, columns).

@@ -217,7 +217,7 @@ def measure_residual_noise(
 def sample_log_likelihoods(
     samples: PlacedSamples, shift: Array, length: int, shape: tuple[int, int], width: float
 ) -> NDArray[np.float32]:
-    """Return the log likelihood of each sample under the picture of the other blocks, but for a constant, shape (n,).
+    """Return the log likelihood of each sample under the picture of the other blocks, up to a constant, shape (n,).
 
     It is NaN where a sample is not compared. Args as in :func:`block_equations`.
     """

@@ -78,7 +78,7 @@ def _grid(samples: PlacedSamples, part: slice, shift: Array, shape: tuple[int, i
 
 
 def _costs(own: Array, reference: Array, size: tuple[int, ...], steps: NDArray[np.int64]) -> Array:
-    """Negative log probability of the part's samples by step, but for a constant, shape (steps, steps): rows are y.
+    """Negative log probability of the part's samples by step, up to a constant, shape (steps, steps): rows are y.
 
     The earlier samples around a cell draw its value from the level of the scene to their mean, in the proportion of
     their number to ``PRIOR_SAMPLES``. The variance is that of the residuals at the present translation, and the share

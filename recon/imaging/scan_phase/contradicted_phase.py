@@ -19,7 +19,7 @@ from scanner.motion import Motion
 def include_contradictions(motion: Motion, found: Sequence[Contradiction]) -> Motion:
     """The motion with the distance to the phase at which the picture agrees in the ``phase_sd`` of each axis.
 
-    The distance is known but for whole half-periods, so that it is a lower bound of the error.
+    The distance is known up to whole half-periods, so that it is a lower bound of the error.
 
     Args:
         motion: with the phases that the picture contradicts.

@@ -45,7 +45,7 @@ MIN_PERIODS = 3
 
 MAX_AGREEMENT_RATIO = 0.8
 """Correlation at the motion's phase over the largest of all phases up to which the picture contradicts the motion. At
-the right phase the ratio is 1 but for noise; at a wrong one a bright middle of the field alone keeps it above 0.5."""
+the right phase the ratio is 1, within noise; at a wrong one a bright middle of the field alone keeps it above 0.5."""
 
 MIN_CONTRADICTION_SD = 10.0
 """Difference of the two correlations from which it counts, in standard deviations of pure noise. The structure of a
@@ -312,7 +312,7 @@ def _is_doubled(match: PhaseMatches, repeated: float) -> bool:
 
 
 def _is_folded(match: PhaseMatches, repeated: float) -> bool:
-    """Whether samples agree as well for a phase a quarter of a turn away, but for noise: the picture is symmetric."""
+    """Whether samples agree as well, within the noise, a quarter of a turn away: the picture is symmetric."""
     at = (match.best + PHASE_CELLS // 2) % PHASE_CELLS
     noise = MIN_CORRELATION_SD * float(np.hypot(match.noise_sd[match.best], match.noise_sd[at]))
     best, quarter = float(match.reflected[match.best]), float(match.reflected[at])

@@ -32,7 +32,7 @@ BANDS = 8
 """Bands of phase of the other axis in which correlations are compared: each holds 16 cells of it."""
 
 MIN_VARIANCE_SHARE = 1e-9
-"""Variance of the samples of a band over their mean square below which they do not differ but for rounding."""
+"""Variance of the samples of a band over their mean square below which they differ by rounding only."""
 
 
 PERIODS_PER_SEARCH = 12

@@ -1,4 +1,4 @@
-"""The search over half a turn (``phase_search``) in slices of a scan whose motion is known but for its phase."""
+"""The search over half a turn (``phase_search``) in slices of a scan whose motion is known except for its phase."""
 
 from __future__ import annotations
 
