@@ -10,18 +10,21 @@ Reading guide, in the order of the data:
 Measurements
     ``demodulation`` projects blocks of samples on the harmonics of the axes; ``change_points`` finds where a drive
     switches; ``drive_blocks`` demodulates a drive. ``observations`` joins them for a sense channel into a
-    ``block_signal``. ``clipping`` adds the information of clipped samples.
+    ``block_signal``, with the noise of the channel from ``line_noise``. ``clipping`` adds the information of clipped
+    samples. ``drive_ends`` extends a drive that was recorded for a part of the time; ``drive_consistency`` finds pauses
+    of a drive that the motion contradicts.
 Model
     ``averaged_dynamics`` gives the rates of phase and amplitude by harmonic balance; ``state_space`` propagates state
     and covariance between blocks; ``linearisation`` linearises the expected projections.
 Estimation
     ``kalman_filter`` (forward) and ``rts_smoother`` (backward) are compiled; ``filter_run`` calls them.
-    ``process_noise`` tunes the drift's spectral densities; ``initial_state`` provides the first estimate and the signs;
-    ``phase_measurements`` adds phases from the picture. ``block_tracking`` joins them to tracks.
+    ``process_noise`` tunes the drift's spectral densities; ``initial_state`` provides the first estimate, with the
+    amplitude from ``amplitude_table``, and the signs; ``phase_measurements`` adds phases from the picture.
+    ``block_tracking`` joins them to tracks. ``readout_curve`` measures a curved characteristic of the readout.
 Result
     ``track`` runs everything over a recording, section by section, and ``continuation`` continues it in the next
-    segment; ``to_motion`` and ``angle_synthesis`` make the angle
-    at any sample. ``drive_only`` is the same for an axis without a sense signal.
+    segment; ``to_motion`` and ``angle_synthesis`` make the angle at any sample. ``drive_only`` is the same for an axis
+    without a sense signal, from its ``steady_motion`` under the drive.
 Reference
     ``cramer_rao`` computes the bound of an ideal estimator.
 """
