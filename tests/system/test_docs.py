@@ -78,3 +78,13 @@ def test_the_pages_contain_the_generated_tables(site: Path) -> None:
         page = (site / "reference" / f"{name}.html").read_text(encoding="utf-8")
         assert content in words(site / "reference" / f"{name}.html")
         assert "generated:" not in page
+
+
+def test_explanations_name_functions_and_modules_that_exist() -> None:
+    folders = ("scanner", "phantoms", "estimation", "recon", "lissajous", "benchmarks", "examples", "tests")
+    sources = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    known = set(re.findall(r"\w+", "\n".join(path.read_text(encoding="utf-8") for path in sources)))
+    known |= {path.stem for path in sources}
+    for page in sorted((ROOT / "docs" / "explanation").glob("*.md")):
+        named = set(re.findall(r"`(?:[\w/]*/)?([A-Za-z]\w*_\w+)(?:\.py)?`", page.read_text(encoding="utf-8")))
+        assert named <= known, f"{page.name}: {sorted(named - known)}"
