@@ -8,7 +8,7 @@ the drive feeds through into the signal.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from math import hypot, sqrt
@@ -91,19 +91,38 @@ def check_amplitudes(recording: Recording, device: Device, motion: Motion) -> di
         By axis. An axis is left out if its signal is not capacitive, a term of the device changes the harmonics, or the
         recording is too short.
     """
-    checked = {}
+    return {
+        name: _check(blocks, comb, readout, device, name)
+        for name, blocks, comb, readout in _capacitive_axes(recording, device, motion)
+        if (blocks.amplitude > 0.0).sum() >= MIN_BLOCKS
+    }
+
+
+def relative_signal_sizes(recording: Recording, device: Device, motion: Motion) -> dict[str, float]:
+    """Second harmonic of the signal of every axis over the one that the device gives at the estimated amplitude.
+
+    Args and axes as for :func:`check_amplitudes`, from one block of ``BLOCK_PERIODS`` on.
+    """
+    sizes = {}
+    for name, blocks, comb, readout in _capacitive_axes(recording, device, motion):
+        measured = np.abs(blocks.second / readout_response(readout, 2 * blocks.frequency))
+        expected = float(np.sum([abs(capacitance_harmonics(each, comb)[2]) for each in blocks.amplitude]))
+        if expected > 0.0:
+            sizes[name] = float(measured.sum()) / expected
+    return sizes
+
+
+def _capacitive_axes(
+    recording: Recording, device: Device, motion: Motion
+) -> Iterator[tuple[str, _Blocks, Capacitance, Amdm | Transimpedance]]:
+    """Each axis with a capacitive signal whose harmonics no term of the device changes."""
     for sense in sense_channels(recording, device, gaps_ok=True):
         if not isinstance(sense.readout, (Amdm, Transimpedance)):
             continue
         for name, blocks in _harmonics(sense, motion).items():
             axis = device.sensed_axis(name)
-            if (
-                axis.capacitance is not None
-                and not _changes_harmonics(axis)
-                and (blocks.amplitude > 0.0).sum() >= MIN_BLOCKS
-            ):
-                checked[name] = _check(blocks, axis.capacitance, sense.readout, device, name)
-    return checked
+            if axis.capacitance is not None and not _changes_harmonics(axis):
+                yield name, blocks, axis.capacitance, sense.readout
 
 
 def _changes_harmonics(axis: Axis) -> bool:

@@ -205,13 +205,11 @@ def diagnose(
     Raises:
         BadInput: no device, no recording, or one that cannot be compared with it.
     """
-    from estimation.complete_diagnosis import diagnose_with_optics
-    from recon.reference_phase import measure_reference_phase
-    from recon.steps.sign_after_rest import follow_signs
+    from recon.diagnose_recordings import diagnose_recordings
 
     opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
     nominal = _stated_device(opened[0]) if device is None else load_device(device)
-    return diagnose_with_optics(opened, nominal, progress, measure_reference_phase, follow_signs)
+    return diagnose_recordings(opened, nominal, progress)
 
 
 def identify(

@@ -25,7 +25,12 @@ from recon.imaging.sample_motion.motion_check import describe_unremoved_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.imaging.scan_phase.image_phase import refine_motion
 from recon.imaging.scan_phase.start_shift import describe_start_shift
-from recon.quality.amplitude_check import amplitude_calibration, compare_with_signal, describe_amplitude_contradictions
+from recon.quality.amplitude_check import (
+    amplitude_calibration,
+    check_signal_units,
+    compare_with_signal,
+    describe_amplitude_contradictions,
+)
 from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
@@ -149,6 +154,8 @@ def estimate_motion(
     """
     recording, device = prepared.recording, prepared.device
     motion = estimate(recording, device, options.estimator, options.flips, before)
+    if before is None:
+        check_signal_units(recording, device, motion)
     if grid is not None:
         motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)
         return EstimatedMotion(prepared, motion, grid, [], notes)

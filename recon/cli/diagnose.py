@@ -73,10 +73,9 @@ def diagnose_files(
 
     from tqdm import tqdm
 
-    from estimation.complete_diagnosis import diagnose_with_optics
+    from recon.diagnose_recordings import diagnose_recordings
     from recon.io.convert import check_different, open_any
     from recon.io.output import check_folder, replacing_folder
-    from recon.reference_phase import measure_reference_phase
     from recon.report.diagnosis import diagnosis_report
     from scanner import devices
 
@@ -87,7 +86,7 @@ def diagnose_files(
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = devices.find(device) if device is not None else None
         with tqdm(file=sys.stderr, disable=quiet or None, bar_format="{elapsed} {desc}", leave=False) as bar:
-            diagnosis = diagnose_with_optics(recordings, nominal, bar.set_description_str, measure_reference_phase)
+            diagnosis = diagnose_recordings(recordings, nominal, bar.set_description_str)
             bar.set_description_str("report")
             conclusion, page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
         content = diagnosis.to_json() | {"conclusion": conclusion}

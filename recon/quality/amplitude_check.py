@@ -7,17 +7,45 @@ from math import hypot
 
 from estimation.amplitude_calibration import MODEL_FREE_ESTIMATORS, motion_calibration_sd
 from estimation.estimators import find_estimator
-from estimation.harmonic_amplitude import AmplitudeCheck, check_amplitudes
+from estimation.harmonic_amplitude import AmplitudeCheck, check_amplitudes, relative_signal_sizes
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
+
+MAX_RELATIVE_SIGNAL = 30.0
+"""Size of a capacitive signal over that which the device gives at the estimated amplitude, above which its unit is
+wrong: units differ by a thousand, and a gain that is wrong by less is found by :func:`compare_with_signal`."""
+
+
+def check_signal_units(recording: Recording, device: Device, motion: Motion) -> None:
+    """Check that a capacitive signal has the unit that its channel states.
+
+    A smaller signal is accepted: drive and picture determine the motion beside a sensor that hardly responds.
+
+    Raises:
+        BadInput: a signal is far larger than the device gives.
+    """
+    if not _is_from_sense(recording, device, motion):
+        return
+    for name, size in relative_signal_sizes(recording, device, motion).items():
+        if size > MAX_RELATIVE_SIGNAL:
+            what = f"the signal of {name} is {size:.0f} times what the device gives at the estimated amplitude"
+            hint = f"check units, the gain of [{name}.readout], and C0 of [{name}.capacitance]"
+            raise BadInput(what, file=recording.path, channel=name, hint=hint)
+
+
+def _is_from_sense(recording: Recording, device: Device, motion: Motion) -> bool:
+    """Whether the motion was estimated from sense signals through a model of the device."""
+    is_sensed = "sense" in recording or all(f"sense_{name}" in recording for name in device.axes)
+    return (
+        is_sensed and motion.estimator not in MODEL_FREE_ESTIMATORS and find_estimator(motion.estimator).is_model_based
+    )
 
 
 def compare_with_signal(recording: Recording, device: Device, motion: Motion) -> Mapping[str, AmplitudeCheck]:
     """As :func:`estimation.harmonic_amplitude.check_amplitudes`; empty if another signal gave the motion."""
-    is_sensed = "sense" in recording or all(f"sense_{name}" in recording for name in device.axes)
-    from_sense = motion.estimator not in MODEL_FREE_ESTIMATORS and find_estimator(motion.estimator).is_model_based
-    if not is_sensed or not from_sense:
+    if not _is_from_sense(recording, device, motion):
         return {}
     return check_amplitudes(recording, device, motion)
 

@@ -144,10 +144,11 @@ def _phase_displacement(summary: Mapping[str, Any]) -> Displacement:
             "Use --estimator tracker, which follows the motion through the noise; it needs the drives and [mechanics] "
             "in the device file.",
         )
+    advice = "Run lissajous diagnose on this recording to find what the device file lacks."
+    if summary["estimator"] == "constant":
+        advice = "Use --estimator tracker, which follows the drift of the phase."
     return Displacement(
-        within,
-        f"{what} {errors} ({kind}), and {within:.1%} of the scan lies within the bound of {bounds}",
-        "Run lissajous diagnose on this recording to find what the device file lacks.",
+        within, f"{what} {errors} ({kind}), and {within:.1%} of the scan lies within the bound of {bounds}", advice
     )
 
 
