@@ -165,9 +165,9 @@ def measured_law_table(fit: Fit) -> dict[str, Any] | None:
         angle, rate = scales.amplitude, scales.amplitude * scales.rate
         powers = [list(exponents) for exponents in FORCE_POWERS]
         factors = [scales.k * angle / (angle**i * rate**j) for i, j in FORCE_POWERS]
-        run_scales = [run.scales[candidate.axis] for run in model.runs if candidate.axis in run.scales]
-        variables, centre = ["angle", "rate"], [0.0, 0.0]
-        half_width = [max(s.amplitude for s in run_scales), max(s.amplitude * s.rate for s in run_scales)]
+        motions = _motions(fit, candidate.axis)
+        radius = max(float(np.hypot(theta / angle, omega / rate).max()) for theta, omega in motions)
+        variables, centre, half_width = ["angle", "rate"], [0.0, 0.0], [radius * angle, radius * rate]
     elif static:
         if term.effect == "free-readout":
             output = next(o for o in run.outputs if o.kind == "sense" and candidate.axis in o.axes)
@@ -189,3 +189,10 @@ def measured_law_table(fit: Fit) -> dict[str, Any] | None:
         "coefficients": [value[name] * factor for name, factor in zip(static, factors, strict=True)],
         "coefficients_sd": [sd[name] * factor for name, factor in zip(static, factors, strict=True)],
     }
+
+
+def _motions(fit: Fit, axis: str) -> list[tuple[Array, Array]]:
+    """Angle [rad] and rate [rad/s] of an axis in every run that contains it, each shape (n,)."""
+    model = fit.model
+    found = [model.trajectories(r, fit.x)[axis] for r, run in enumerate(model.runs) if axis in run.inputs]
+    return [(trajectory.angle, trajectory.rate) for trajectory in found]

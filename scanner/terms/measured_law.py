@@ -12,8 +12,10 @@ A device file states it under ``[x.terms.measured-law]``:
     coefficients_sd = [1e-11, 3e-11]     # standard deviations; no law uses them
 
 Other stages have one variable. ``readout`` adds to the signal [V] a law of the signal [V], ``drive`` adds to the
-voltage a law of the voltage [V], ``optics`` adds to the reference angle a law of the angle [rad]. Beyond its range a
-law continues with the slope at the edge. It is not part of the catalogue that a diagnosis searches.
+voltage a law of the voltage [V], ``optics`` adds to the reference angle a law of the angle [rad]. The range of two
+variables is the ellipse between ``lower`` and ``upper``: an oscillation reaches its largest angle and its largest rate
+at different times, so no sample was measured in the corners. Beyond its range a law continues along the radius with the
+slope at the edge. It is not part of the catalogue that a diagnosis searches.
 """
 
 from __future__ import annotations
@@ -41,12 +43,22 @@ VARIABLES = {
 
 @njit(cache=True, nogil=True)
 def polynomial(p, first, second):  # type: ignore[no-untyped-def]
-    """Value of a packed law at two variables: a polynomial within its range, straight beyond it.
+    """Value of a packed law at two variables: a polynomial within its range, straight along the radius beyond it.
 
     ``p`` holds the number of coefficients; centre, lower and upper end, each of both variables; and for each
     coefficient the powers of both variables and its value.
     """
-    a, b = min(max(first, p[3]), p[5]), min(max(second, p[4]), p[6])
+    middle_a, middle_b = 0.5 * (p[3] + p[5]), 0.5 * (p[4] + p[6])
+    half_a, half_b = 0.5 * (p[5] - p[3]), 0.5 * (p[6] - p[4])
+    square = 0.0
+    if half_a > 0.0:
+        square += ((first - middle_a) / half_a) ** 2
+    if half_b > 0.0:
+        square += ((second - middle_b) / half_b) ** 2
+    radius = np.sqrt(square)
+    a, b = first, second
+    if radius > 1.0:
+        a, b = middle_a + (first - middle_a) / radius, middle_b + (second - middle_b) / radius
     x, y = a - p[1], b - p[2]
     value, slope_a, slope_b = 0.0, 0.0, 0.0
     for n in range(int(p[0])):
@@ -123,12 +135,14 @@ def measured_law(table: Mapping[str, Any]) -> tuple[Term, tuple[float, ...]]:
 
 
 def beyond(table: Mapping[str, Any], values: Sequence[Array]) -> float:
-    """Fraction of samples that lie beyond a law's range.
+    """Fraction of samples that lie beyond a law's range or are not finite.
 
     Args:
         values: of each of its variables, shape (n,) each.
     """
-    outside = np.zeros(np.shape(values[0]), bool)
+    square = np.zeros(np.shape(values[0]))
     for lower, upper, each in zip(table["lower"], table["upper"], values, strict=True):
-        outside |= (np.asarray(each) < lower) | (np.asarray(each) > upper)
-    return float(outside.mean())
+        half = 0.5 * (upper - lower)
+        if half > 0.0:
+            square += ((np.asarray(each) - lower) / half - 1.0) ** 2
+    return float(np.mean(~(square <= (1.0 + 1e-9) ** 2)))

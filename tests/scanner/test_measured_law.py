@@ -13,7 +13,7 @@ from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.forward_model import DriveInput, simulate_axis
 from scanner.terms import catalogue
-from scanner.terms.measured_law import added, beyond, measured_law
+from scanner.terms.measured_law import added, beyond, measured_law, polynomial
 
 TABLE: dict[str, Any] = {
     "stage": "mechanics", "variables": ["angle", "rate"], "centre": [0.0, 0.0],
@@ -63,6 +63,31 @@ def test_beyond_its_range_a_measured_law_continues_with_the_slope_at_the_edge() 
     _, packed = measured_law(table)
     assert added(values, packed) == pytest.approx([0.025, 0.0, 0.225, 0.225 + 0.3, 0.025 + 0.1])
     assert beyond(table, [values]) == pytest.approx(0.4)
+
+
+def test_beyond_the_ellipse_of_its_range_a_law_of_two_variables_continues_along_the_radius() -> None:
+    """The polynomial is rate² times angle; in a corner of the box around the ellipse no sample was measured."""
+    table = TABLE | {"powers": [[1, 2]], "coefficients": [1.0]}
+    _, packed = measured_law(table)
+    on_edge = np.sqrt(0.5) * np.array([1.0, 10.0])
+    value, slope = on_edge[0] * on_edge[1] ** 2, 3.0 * on_edge[0] * on_edge[1] ** 2
+    for radius in (0.5, 1.0):
+        assert polynomial(np.array(packed), *(radius * on_edge)) == pytest.approx(radius**3 * value)
+    for radius in (1.4, 3.0):
+        assert polynomial(np.array(packed), *(radius * on_edge)) == pytest.approx(value + slope * (radius - 1.0))
+    angle, rate = np.array([0.0, 1.0, 0.9, 0.0, np.inf]), np.array([10.0, 0.0, 9.0, 11.0, 0.0])
+    assert beyond(table, [angle, rate]) == pytest.approx(0.6)
+
+
+def test_a_law_that_does_no_work_over_a_turn_does_none_beyond_its_range() -> None:
+    """In the corners of the box around the ellipse, which no turn reaches, the slope of this law is that of a motor."""
+    rate = np.sqrt(114.0)
+    table = TABLE | {
+        "lower": [-1.0, -rate], "upper": [1.0, rate],
+        "powers": [[0, 5], [2, 3]], "coefficients": [0.24 / rate**4, -1.2 / rate**2],
+    }  # fmt: skip
+    swing, damped = angle(device({"measured-law": table}), 2.5), angle(device({}), 2.5)
+    assert np.abs(swing[-120:]).max() == pytest.approx(np.abs(damped[-120:]).max(), rel=0.02)
 
 
 @pytest.mark.parametrize(
