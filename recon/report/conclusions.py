@@ -79,7 +79,8 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     else:
         text = _describe_findings(findings)
         if (content.get("remainder") or {}).get("share", 0.0) > 0.5:
-            text = f"Most of the difference between recording and nominal device is not explained. {text}"
+            near_noise = "" if content.get("unexplained") else " with fitted values, which is near the noise,"
+            text = f"Most of the difference between recording and nominal device{near_noise} is not explained. {text}"
     if blur_px is not None and findings and blur_px[0] > blur_px[1]:
         text += (
             f" Predicted from the drive alone, the nominal motion is wrong by {format_value(blur_px[0], 2)} px rms in "

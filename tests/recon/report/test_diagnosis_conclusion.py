@@ -63,8 +63,12 @@ def test_the_share_of_the_misfit_that_is_left_is_stated_with_its_stage() -> None
 @pytest.mark.parametrize(("share", "leads"), [(0.4, False), (0.98, True)])
 def test_a_remainder_of_more_than_half_of_the_misfit_leads_the_conclusion(share: float, leads: bool) -> None:
     rest = {"share": share, "stage": "drive", "channel": "sense_x"}
-    text = conclude_diagnosis({"verdict": "mismatch", "remainder": rest, "findings": [found("feedthrough", 0.999)]})
-    assert text.startswith("Most of the difference between recording and nominal device is not explained.") == leads
+    content = {"verdict": "mismatch", "remainder": rest, "findings": [found("feedthrough", 0.999)]}
+    above_noise = conclude_diagnosis({**content, "unexplained": "samples are missed by 4.8 times the noise"})
+    start = "Most of the difference between recording and nominal device"
+    assert above_noise.startswith(f"{start} is not explained.") == leads
+    near_noise = conclude_diagnosis({**content, "unexplained": None})
+    assert near_noise.startswith(f"{start} with fitted values, which is near the noise, is not explained.") == leads
 
 
 def test_hum_that_is_stronger_than_the_noise_is_stated() -> None:
