@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import ceil
+
 import numpy as np
 
 from estimation.device_fit.data import output_channels
@@ -14,23 +16,38 @@ MIN_EXPECTED_DECAY = 1.0
 Quality factors of a device file are known to a factor of a few."""
 
 MAX_STEADY_CHANGE = 0.9
-"""Amplitude at the end over that at the beginning from which a motion counts as steady."""
+"""Amplitude at the end over that at the beginning from which a motion counts as steady, and the reciprocal of the ratio
+from which it counts as growing."""
 
 LINE_WIDTH_BINS = 2
 """Frequency bins on either side of a line that contain it, with a Hann window."""
 
+PARTS = 10
+"""Number of parts of a recording whose amplitudes are compared."""
+
 
 def steady_without_drive(recording: Recording, device: Device) -> str | None:
-    """What is wrong with a recording whose motion persists without a drive of its axes; None if nothing is."""
+    """What is wrong with a recording whose motion persists without a drive of its axes; None if nothing is.
+
+    A drive that was recorded and is constant keeps up no motion either. Without one, the amplitude falls from the
+    beginning to the end, and does not grow after a time in which a free motion of the device decays.
+    """
     for name, (_, axes) in output_channels(recording, device).items():
-        if any(f"{kind}_{axis}" in recording for axis in axes for kind in ("drive", "bias")):
+        recorded = [f"{kind}_{axis}" for axis in axes for kind in ("drive", "bias") if f"{kind}_{axis}" in recording]
+        if any(np.ptp(recording[drive].read()) != 0.0 for drive in recorded):
             continue
-        channel, tenth = recording[name], recording[name].size // 10
+        channel = recording[name]
         rates = [np.pi * device.axis(axis).resonance / device.axis(axis).quality for axis in axes]
-        if min(rates) * channel.size / channel.sample_rate < MIN_EXPECTED_DECAY:
+        decay = min(rates) * channel.size / channel.sample_rate
+        if decay < MIN_EXPECTED_DECAY:
             continue
-        first, last = (_tone_amplitude(part) for part in (channel.read(0, tenth), channel.read(-tenth)))
-        if last > MAX_STEADY_CHANGE * first > 0.0:
+        part, lag = channel.size // PARTS, min(ceil(PARTS * MIN_EXPECTED_DECAY / decay), PARTS - 1)
+        amplitudes = np.array([_tone_amplitude(channel.read(i * part, (i + 1) * part)) for i in range(PARTS)])
+        steady = amplitudes[-1] > MAX_STEADY_CHANGE * amplitudes[0] > 0.0
+        before = np.maximum.accumulate(amplitudes)[:-lag]
+        if steady or np.any((MAX_STEADY_CHANGE * amplitudes[lag:] > before) & (before > 0.0)):
+            if recorded:
+                return f"{name} moves steadily or grows under a constant {' and '.join(recorded)}"
             return f"{name} moves steadily without {' and '.join(f'drive_{axis}' for axis in axes)}"
     return None
 

@@ -75,6 +75,27 @@ def test_a_motion_that_persists_without_a_recorded_drive_is_refused(shape: np.nd
             diagnose_with_optics([without_drive])
 
 
+@pytest.mark.parametrize(
+    ("voltage", "shape", "message"),
+    [
+        (np.zeros(TIME.size), np.exp(-(((TIME - 0.25) / 0.05) ** 2)) + 0.1, "under a constant drive_x"),
+        (np.full(TIME.size, 2.0), np.ones(TIME.size), "under a constant drive_x"),
+        (np.full(TIME.size, 2.0), np.exp(-0.5 * TIME), None),
+        (np.where(TIME < 0.1, np.nan, 0.0), np.ones(TIME.size), None),
+        (np.sin(2 * np.pi * 100.0 * TIME), np.ones(TIME.size), None),
+    ],
+    ids=["swept, recorded as zero", "steady, recorded as constant", "slow decay", "not finite", "driven"],
+)
+def test_a_motion_that_a_constant_drive_cannot_keep_up_is_refused(
+    voltage: np.ndarray, shape: np.ndarray, message: str | None
+) -> None:
+    sense = shape * np.cos(2 * np.pi * 100.0 * TIME) + 0.01 * np.random.default_rng(2).normal(size=TIME.size)
+    of = device(100.0, driven=True)
+    made = Recording.from_arrays({"sense_x": (sense, "V", 1e4), "drive_x": (voltage, "V", 1e4)}, of)
+    found = steady_without_drive(made, of)
+    assert found is None if message is None else found == f"sense_x moves steadily or grows {message}"
+
+
 def test_a_drive_that_starts_later_is_refused_by_filters_with_the_time_to_cut_out() -> None:
     recording, _ = imaging()
     drive = recording["drive_x"]
