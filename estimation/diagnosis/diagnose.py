@@ -17,6 +17,7 @@ from estimation.diagnosis.held_drive import with_held_drives
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
 from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
+from estimation.diagnosis.unit_check import check_units_and_signs
 from estimation.parallel import map_fits
 from estimation.signals import require_device
 from scanner.device import Device
@@ -101,10 +102,11 @@ def diagnose(
         excluded: effects that are no candidates.
 
     Raises:
-        BadInput: no device, or a recording that cannot be compared with it.
+        BadInput: no device, a recording that cannot be compared with it, or one in another unit or with another sign.
     """
     nominal = require_device(recordings[0], device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
+    check_units_and_signs(recordings, runs, nominal)
     diagnosis = _diagnose_with_modes(runs, nominal, progress, excluded)
     return replace(diagnosis, findings=with_held_drives(diagnosis.findings, recordings))
 
