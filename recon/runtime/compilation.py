@@ -1,4 +1,4 @@
-"""A message while numerical code is compiled, which happens at the first run of a command and takes about a minute."""
+"""A message while numerical code is compiled, at the first run of a command, which takes one to three minutes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def announce_compilation() -> None:
             if isinstance(getattr(started.data.get("dispatcher"), "_cache", None), NullCache):
                 return
             if self.functions == 0:
-                print("compiling, once (about a minute)", file=sys.stderr, flush=True)
+                print("compiling, once (one to three minutes)", file=sys.stderr, flush=True)
             self.functions += 1
             if sys.stderr.isatty():
                 self.count = f"functions: {self.functions}"

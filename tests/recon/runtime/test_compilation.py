@@ -47,7 +47,7 @@ def _messages_of_two_runs(script: Path, code: str, **environment: str) -> list[s
 
 def test_compilation_is_announced_once(tmp_path: Path) -> None:
     messages = _messages_of_two_runs(tmp_path / "script.py", CODE, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
-    assert messages == ["compiling, once (about a minute)\n", ""]
+    assert messages == ["compiling, once (one to three minutes)\n", ""]
 
 
 def test_the_count_of_functions_leaves_the_line_empty(tmp_path: Path) -> None:
