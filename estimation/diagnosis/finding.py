@@ -51,11 +51,13 @@ class Rival:
         probability: posterior probability that it is the true effect.
         distance: norm of the finding's signal that remains if the rival is fitted to it [sigma]; None for an effect
             without a law and for the optics, where it is not computed.
+        stage: of an ``unknown`` rival of an ``unknown`` finding; None for others.
     """
 
     effect: str
     probability: float
     distance: float | None = None
+    stage: str | None = None
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def find_effect(
     has_law = not is_discrepancy(candidate)
     effect = _name(candidate)
     probabilities = find_probabilities(step, correction.predicted_gain if correction else 0.0)
+    elsewhere = () if has_law else _in_other_stages(step)
     distance = _distances(result, step) if has_law else {}
     comparable = [rival for rival in step.rivals if rival.candidate.key in distance]
     distance_of = {_name(rival.candidate): distance[rival.candidate.key] for rival in reversed(comparable)}
@@ -117,14 +120,26 @@ def find_effect(
         equation=candidate.term.equation,
         parameters=parameter_estimates(result.likelihood, result.final, candidate, corrected) if has_law else (),
         where=describe_localisation(result.likelihood, candidate, step.before, step.after),
-        probability=probabilities[effect],
+        probability=probabilities[effect] * (1.0 - sum(rival.probability for rival in elsewhere)),
         share=share_of_finding(result, step),
-        rivals=rivals,
+        rivals=(*(rival for rival in elsewhere if rival.probability > 1e-4), *rivals),
         heldout={"metric": METRIC, "before": step.before.validation_chi2, "after": result.final.validation_chi2},
         channel=candidate.channel,
         source=candidate.term.source,
         advice=advice,
         curve=None if has_law else correction_curve(step.after),
+    )
+
+
+def _in_other_stages(step: SelectionStep) -> tuple[Rival, ...]:
+    """The rival of an ``unknown`` finding: the corrections of all other stages together, in its place.
+
+    It has the stage of the one among them that is needed most.
+    """
+    return tuple(
+        Rival("unknown", 1.0 / (1.0 + float(np.exp(0.5 * np.clip(rival.evidence_gap, -1400.0, 1400.0)))), stage=stage)
+        for rival in step.rivals
+        if is_discrepancy(rival.candidate) and (stage := rival.candidate.term.stage)
     )
 
 

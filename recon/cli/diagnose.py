@@ -119,6 +119,7 @@ def _format_plan(summary: dict[str, Any]) -> str:
 
 
 def _format_diagnosis(summary: dict[str, Any]) -> str:
+    from recon.report.conclusions import name_rival
     from recon.report.numbers import format_interval, format_probability
 
     lines = [summary["conclusion"], f"{summary['output']}: {summary['verdict']}"]
@@ -135,7 +136,10 @@ def _format_diagnosis(summary: dict[str, Any]) -> str:
             for p in finding["parameters"]
         ]
         if finding["rivals"]:
-            rivals = [f"{r['effect']} ({format_probability(r['probability'])})" for r in finding["rivals"]]
+            rivals = [
+                f"{name_rival(r['effect'], r.get('stage'))} ({format_probability(r['probability'])})"
+                for r in finding["rivals"]
+            ]
             lines.append(f"    alternative: {', '.join(rivals)}")
         if "advice" in finding:
             lines.append(f"    to distinguish them: {finding['advice']}")

@@ -160,11 +160,17 @@ def _describe_findings(findings: Sequence[Mapping[str, Any]]) -> str:
     parts = ["The nominal device lacks " + "; and ".join(map(_describe_finding, certain)) + "."] if certain else []
     for finding in findings:
         if finding not in certain:
-            others = "".join(f" ({rival['effect']}: {rival['probability']:.0%})" for rival in finding["rivals"][:1])
+            rivals = [(name_rival(r["effect"], r.get("stage")), r["probability"]) for r in finding["rivals"][:1]]
+            others = "".join(f" ({name}: {probability:.0%})" for name, probability in rivals)
             verb = "probably lacks" if finding["probability"] >= 0.5 else "may lack"
             what = f"{verb} {_describe_finding(finding)}, with a probability of {finding['probability']:.0%}{others}."
             parts.append(f"{'It' if parts else 'The nominal device'} {what}")
     return " ".join(parts)
+
+
+def name_rival(effect: str, stage: str | None) -> str:
+    """Name of a rival, with its stage where that is the difference to the finding."""
+    return f"{effect} in the {stage}" if stage else effect
 
 
 def _describe_finding(finding: Mapping[str, Any]) -> str:

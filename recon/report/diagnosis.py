@@ -18,7 +18,7 @@ from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability, detectability
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from recon.report.conclusions import conclude_diagnosis, conclude_plan
+from recon.report.conclusions import conclude_diagnosis, conclude_plan, name_rival
 from recon.report.diagnosis_figures import (
     detectability_figure,
     effect_figure,
@@ -111,7 +111,8 @@ def _finding_section(finding: Finding, index: int, search: SelectionResult | Non
     for rival in finding.rivals:
         distance = "" if rival.distance is None else f"; differs from it by {rival.distance:.1f} σ at most"
         probability = f"probability {format_probability(rival.probability)}" if rival.probability > 1e-4 else ""
-        rows.append([f"alternative: {rival.effect}", (probability or "not excluded by this recording") + distance])
+        name = f"alternative: {name_rival(rival.effect, rival.stage)}"
+        rows.append([name, (probability or "not excluded by this recording") + distance])
     figures = [measured_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []
     if search is not None:
         figures += _effect_figures(finding, search)

@@ -39,6 +39,17 @@ def test_a_law_that_explains_a_hundredth_of_what_it_leaves_is_improbable() -> No
     assert sum(found.values()) == pytest.approx(1.0)
 
 
+def test_an_unknown_finding_is_as_probable_as_its_stage_beside_all_others_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(finding, "is_discrepancy", lambda candidate: True)
+    unknown = step("free-stiffness", ("free-timing", -2.0))
+    unknown.rivals[0].candidate.term.stage = "timing"
+    (rival,) = finding._in_other_stages(unknown)  # type: ignore[arg-type]
+    assert (rival.effect, rival.stage) == ("unknown", "timing")
+    assert rival.probability == pytest.approx(0.7311, rel=1e-3)
+
+
 def test_what_is_certain_without_a_fit_stays_certain_beside_a_remainder() -> None:
     clipped = step("saturation")
     clipped.candidate.term.free_parameters = ()

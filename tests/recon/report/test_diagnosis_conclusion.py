@@ -86,6 +86,12 @@ def test_an_effect_that_is_less_probable_than_another_explanation_is_not_asserte
     assert alone.startswith("The nominal device may lack second-mode")
 
 
+def test_the_stage_in_which_an_unknown_effect_may_be_instead_is_named() -> None:
+    rival = {"effect": "unknown", "probability": 0.2, "stage": "timing"}
+    text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("unknown", 0.8) | {"rivals": [rival]}]})
+    assert "with a probability of 80% (unknown in the timing: 20%)." in text
+
+
 @pytest.mark.parametrize(("blur_px", "stated"), [((3.0, 0.1), True), ((0.05, 2.0), False)])
 def test_a_blur_within_its_uncertainty_is_not_stated(blur_px: tuple[float, float], stated: bool) -> None:
     content = {"verdict": "mismatch", "findings": [found("second-mode", 0.98)]}
