@@ -160,17 +160,27 @@ def _describe_findings(findings: Sequence[Mapping[str, Any]]) -> str:
     parts = ["The nominal device lacks " + "; and ".join(map(_describe_finding, certain)) + "."] if certain else []
     for finding in findings:
         if finding not in certain:
-            rivals = [(name_rival(r["effect"], r.get("stage")), r["probability"]) for r in finding["rivals"][:1]]
-            others = "".join(f" ({name}: {probability:.0%})" for name, probability in rivals)
-            verb = "probably lacks" if finding["probability"] >= 0.5 else "may lack"
-            what = f"{verb} {_describe_finding(finding)}, with a probability of {finding['probability']:.0%}{others}."
-            parts.append(f"{'It' if parts else 'The nominal device'} {what}")
+            parts.append(f"{'It' if parts else 'The nominal device'} {_describe_uncertain_finding(finding)}")
     return " ".join(parts)
 
 
+def _describe_uncertain_finding(finding: Mapping[str, Any]) -> str:
+    """What the device may lack, with its probability and the most probable alternative; the subject is left out."""
+    probability, rivals = finding["probability"], finding["rivals"][:1]
+    if probability < 0.5 and any(rival.get("stage") for rival in rivals):
+        return (
+            f"probably lacks several effects that are not in the catalogue, in the {rivals[0]['stage']} above all "
+            f"({rivals[0]['probability']:.0%}); a single one in the {finding['stage']} of axis {finding['axis']} is "
+            f"less probable ({probability:.0%})."
+        )
+    others = "".join(f" ({name_rival(r['effect'], r.get('stage'))}: {r['probability']:.0%})" for r in rivals)
+    verb = "probably lacks" if probability >= 0.5 else "may lack"
+    return f"{verb} {_describe_finding(finding)}, with a probability of {probability:.0%}{others}."
+
+
 def name_rival(effect: str, stage: str | None) -> str:
-    """Name of a rival, with its stage where that is the difference to the finding."""
-    return f"{effect} in the {stage}" if stage else effect
+    """Name of a rival; one with a stage stands for all other stages together, of which it needs this one most."""
+    return f"{effect} in other stages, the {stage} above all" if stage else effect
 
 
 def _describe_finding(finding: Mapping[str, Any]) -> str:

@@ -89,7 +89,10 @@ def test_an_effect_that_is_less_probable_than_another_explanation_is_not_asserte
 def test_the_stage_in_which_an_unknown_effect_may_be_instead_is_named() -> None:
     rival = {"effect": "unknown", "probability": 0.2, "stage": "timing"}
     text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("unknown", 0.8) | {"rivals": [rival]}]})
-    assert "with a probability of 80% (unknown in the timing: 20%)." in text
+    assert "with a probability of 80% (unknown in other stages, the timing above all: 20%)." in text
+    unlikely = found("unknown", 0.01) | {"rivals": [rival | {"probability": 0.99}]}
+    text = conclude_diagnosis({"verdict": "mismatch", "findings": [unlikely]})
+    assert "lacks several effects that are not in the catalogue, in the timing above all (99%); a single one" in text
 
 
 @pytest.mark.parametrize(("blur_px", "stated"), [((3.0, 0.1), True), ((0.05, 2.0), False)])
