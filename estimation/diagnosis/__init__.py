@@ -4,11 +4,13 @@ The package contains the selection of terms by evidence among fits of ``estimati
 ``estimation.candidate_terms`` compares them; simulation of test data, pictures and reports do not belong here. Modules
 in the order of the computation:
 
-1. ``undriven``: recordings that no model predicts; ``clipping``: readouts that are clipped.
+1. ``undriven``: recordings that no model predicts; ``unit_check``: channels in another unit or with the wrong sign;
+   ``clipping``: readouts that are clipped.
 2. ``from_stated_values``: fits where nominal values have absorbed a misfit.
 3. ``law_selection``: laws selected, fitted and selected again; ``rival_laws``: laws to be fitted in their place;
-   ``necessity``: whether they are the answer; ``pruning``: terms and amplitudes that are not required; ``selection``:
-   named laws, else a discrepancy, else nothing.
+   ``necessity``: whether they are the answer; ``pruning``: terms and amplitudes that are not required;
+   ``rival_stages``: corrections of all other stages in the place of one; ``selection``: named laws, else a discrepancy,
+   else nothing.
 4. ``improvement``: the improved device; ``shares``: what each finding explains; ``corrected_parameters``: parameters
    beside a discrepancy; ``identifiability``: detectability of every effect; ``experiment_design``: further
    measurements; ``free_decay``: what a single decay cannot distinguish; ``held_drive``: a delay by half a sample;

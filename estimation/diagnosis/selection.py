@@ -47,6 +47,7 @@ from estimation.diagnosis.pruning import (
     refit_without,
     select_hum,
 )
+from estimation.diagnosis.rival_stages import find_rival_stages
 from estimation.parallel import map_fits
 from scanner.device import Device
 from scanner.terms import Term
@@ -291,25 +292,8 @@ def _choose_discrepancy(search: _Search, anchor: Fit, fitted: Sequence[Fit]) -> 
     before = fit_model(likelihood, search.nominal.model, search.nominal.x)
     if not evidence_gain(likelihood, before, best):
         return None
-    found = best.model.candidates[-1]
-    return SelectedTerms(likelihood, before, best, {found.key: _other_stages(search, likelihood, best, found)})
-
-
-def _other_stages(search: _Search, likelihood: Likelihood, fit: Fit, found: Candidate) -> tuple[RivalFit, ...]:
-    """The corrections of all other stages together in the place of those of a found stage, around its fit.
-
-    The rival stands for them; it is the one without which they would be worst.
-    """
-    linear = linear_model(likelihood, fit, search.discrepancies)
-    candidates = [term.candidate for term in linear.discrepancies]
-    own = [i for i, one in enumerate(candidates) if (one.axis, one.term.stage) == (found.axis, found.term.stage)]
-    others = [i for i in range(len(candidates)) if i not in own]
-    if not others:
-        return ()
-    alone, together = linear.hypothesis((), without=others), linear.hypothesis((), without=own)
-    needed = max(others, key=lambda i: linear.hypothesis((), without=[*own, i]).neg2_log_evidence)
-    gap = together.neg2_log_evidence - alone.neg2_log_evidence
-    return (RivalFit(gap, candidates[needed], together.misfit - alone.misfit),)
+    rivals = find_rival_stages(likelihood, best, search.discrepancies)
+    return SelectedTerms(likelihood, before, best, {best.model.candidates[-1].key: rivals})
 
 
 def _with_nonlinear_term(search: _Search, selected: SelectedTerms) -> SelectedTerms:
