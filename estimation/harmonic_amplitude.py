@@ -48,6 +48,10 @@ MIN_CONTRADICTION_SDS = 4.0
 numbers of a data sheet; a normal deviation exceeds it by chance once in 16 000 axes."""
 
 
+LARGEST_SIGNAL_AMPLITUDE = 1.8
+"""Amplitude at which the second harmonic of a Gaussian comb is largest, in units of theta0."""
+
+
 @dataclass(frozen=True)
 class HarmonicAmplitude:
     """Comparison of a harmonic with the one that the device gives at the estimated amplitude.
@@ -99,16 +103,15 @@ def check_amplitudes(recording: Recording, device: Device, motion: Motion) -> di
 
 
 def relative_signal_sizes(recording: Recording, device: Device, motion: Motion) -> dict[str, float]:
-    """Second harmonic of the signal of every axis over the one that the device gives at the estimated amplitude.
+    """Second harmonic of the signal of every axis over the largest one that its comb gives at any amplitude.
 
     Args and axes as for :func:`check_amplitudes`, from one block of ``BLOCK_PERIODS`` on.
     """
     sizes = {}
     for name, blocks, comb, readout in _capacitive_axes(recording, device, motion):
         measured = np.abs(blocks.second / readout_response(readout, 2 * blocks.frequency))
-        expected = float(np.sum([abs(capacitance_harmonics(each, comb)[2]) for each in blocks.amplitude]))
-        if expected > 0.0:
-            sizes[name] = float(measured.sum()) / expected
+        largest = abs(capacitance_harmonics(LARGEST_SIGNAL_AMPLITUDE * comb.theta0, comb)[2])
+        sizes[name] = float(np.median(measured)) / float(largest)
     return sizes
 
 

@@ -14,8 +14,8 @@ from scanner.motion import Motion
 from scanner.recording import Recording
 
 MAX_RELATIVE_SIGNAL = 30.0
-"""Size of a capacitive signal over that which the device gives at the estimated amplitude, above which its unit is
-wrong: units differ by a thousand, and a gain that is wrong by less is found by :func:`compare_with_signal`."""
+"""Size of a capacitive signal over the largest that the device gives at any amplitude, above which its unit is wrong:
+units differ by a thousand, and a gain that is wrong by less is found by :func:`compare_with_signal`."""
 
 
 def check_signal_units(recording: Recording, device: Device, motion: Motion) -> None:
@@ -30,7 +30,7 @@ def check_signal_units(recording: Recording, device: Device, motion: Motion) -> 
         return
     for name, size in relative_signal_sizes(recording, device, motion).items():
         if size > MAX_RELATIVE_SIGNAL:
-            what = f"the signal of {name} is {size:.0f} times what the device gives at the estimated amplitude"
+            what = f"the signal of {name} is {size:.0f} times the largest that the device gives"
             hint = f"check units, the gain of [{name}.readout], and C0 of [{name}.capacitance]"
             raise BadInput(what, file=recording.path, channel=name, hint=hint)
 

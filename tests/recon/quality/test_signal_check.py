@@ -122,5 +122,7 @@ def test_an_estimator_that_diverges_is_refused_in_one_line() -> None:
 def test_a_signal_of_both_axes_in_the_wrong_unit_is_refused_in_one_line() -> None:
     """The tracker either diverges or follows drive and picture without the signal, by errors of rounding."""
     millivolts = with_sense(imaging()[0], lambda values: 1000.0 * values)
-    with pytest.raises(BadInput, match=r"the signal of x (does not fit the device|is 9\d\d times what).*; check units"):
+    with pytest.raises(
+        BadInput, match=r"the signal of x (does not fit the device|is 6\d\d times the largest).*; check units"
+    ):
         reconstruct(millivolts, Options(), quiet=True)
