@@ -29,7 +29,7 @@ PARTS = 10
 def steady_without_drive(recording: Recording, device: Device) -> str | None:
     """What is wrong with a recording whose motion persists without a drive of its axes; None if nothing is.
 
-    A drive that was recorded and is constant keeps up no motion either. Without one, the amplitude falls from the
+    A drive that was recorded and is constant keeps up no motion either. Under it, the amplitude falls from the
     beginning to the end, and does not grow after a time in which a free motion of the device decays.
     """
     for name, (_, axes) in output_channels(recording, device).items():
@@ -45,9 +45,10 @@ def steady_without_drive(recording: Recording, device: Device) -> str | None:
         amplitudes = np.array([_tone_amplitude(channel.read(i * part, (i + 1) * part)) for i in range(PARTS)])
         steady = amplitudes[-1] > MAX_STEADY_CHANGE * amplitudes[0] > 0.0
         before = np.maximum.accumulate(amplitudes)[:-lag]
-        if steady or np.any((MAX_STEADY_CHANGE * amplitudes[lag:] > before) & (before > 0.0)):
-            if recorded:
-                return f"{name} moves steadily or grows under a constant {' and '.join(recorded)}"
+        grows = np.any((MAX_STEADY_CHANGE * amplitudes[lag:] > before) & (before > 0.0))
+        if recorded and (steady or grows):
+            return f"{name} moves steadily or grows under a constant {' and '.join(recorded)}"
+        if steady:
             return f"{name} moves steadily without {' and '.join(f'drive_{axis}' for axis in axes)}"
     return None
 

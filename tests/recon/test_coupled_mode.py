@@ -57,10 +57,10 @@ def test_phase_and_sign_are_followed_through_rest(scan: tuple[BlindRecording, Pa
 def test_a_wrong_sign_after_rest_is_no_motion_of_the_sample(scan: tuple[BlindRecording, Path]) -> None:
     with Recording.open(scan[1]) as recording:
         device, intensity = recording.device.with_terms(MODE), recording["intensity"]
-        sensed = estimate(recording, device)
-        axis = sensed.axes["x"]
+        right, _ = follow_signs(estimate(recording, device), device, intensity, recording.start)  # else by chance
+        axis = right.axes["x"]
         turned = axis.advanced(np.where(axis.time < find_rests(axis)[-1], 0.0, np.pi))
-        wrong = replace(sensed, axes={**sensed.axes, "x": turned})
+        wrong = replace(right, axes={**right.axes, "x": turned})
         followed, notes = follow_signs(wrong, device, intensity, recording.start)
         assert ["was changed" in note for note in notes] == [True]
         assert [finding.effect for finding in diagnose_optics(wrong, intensity, device).findings] == ["sample-motion"]
