@@ -39,18 +39,20 @@ def find_lost_position_signals(beam: Motion, intensity: Channel, grid: Grid) -> 
     """
     rests = {name: _rests(axis) for name, axis in beam.axes.items()}
     resting = to_sample_ranges((each for intervals in rests.values() for each in intervals), intensity)
-    moving = subtract_ranges([(0, intensity.size)], sorted(resting))
+    moving = subtract_ranges([(0, intensity.size)], resting)
     if not (resting and moving):
         return {}
     pixel, values = _read(beam, intensity, grid, max(moving, key=lambda part: part[1] - part[0]))
     noise = measure_sample_noise(pixel, values)
     if noise is None:
         return {}
-    of_scan = float(np.nanvar(values))
+    of_scan = float(values[np.isfinite(values)].var())
 
     def is_lost(interval: tuple[float, float]) -> bool:
-        pixel, values = _read(beam, intensity, grid, to_sample_ranges([interval], intensity)[0])
-        scatter, level, freedom = _scatter_in_pixels(pixel, values)
+        parts = to_sample_ranges([interval], intensity)
+        if not parts:  # the sensor was recorded longer than the intensity
+            return False
+        scatter, level, freedom = _scatter_in_pixels(*_read(beam, intensity, grid, parts[0]))
         if not freedom:
             return False
         between = np.sqrt(float(noise.variance(np.array(level))) * of_scan)

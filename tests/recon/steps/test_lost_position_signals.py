@@ -18,17 +18,20 @@ def scene(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.3 + 0.1 * x + sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * w * w)) for a, b, w in spots)
 
 
-def reconstruct(resting: str, lost: str) -> lissajous.Reconstruction:
-    """A scan of two position sensors; axes that start late, and axes whose signal is lost at the end."""
+def reconstruct(resting: str, lost: str, first: int = 0) -> lissajous.Reconstruction:
+    """A scan of two position sensors; axes that start late, and axes whose signal is lost at the end.
+
+    The intensity is recorded from sample ``first`` on.
+    """
     time, random = np.arange(round(RATE * DURATION)) / RATE, np.random.default_rng(2)
     swing = {name: np.sin(2 * np.pi * f * time) for name, f in (("x", 2011.0), ("y", 837.0))}
     for name in resting:
         swing[name] = swing[name] * np.clip((time - BEGIN) / 0.004, 0.0, 1.0)
     counts = random.poisson(200.0 * scene(swing["x"], swing["y"]))
-    channels = {"intensity": (counts, "counts", RATE)}
+    channels = {"intensity": (counts[first:], "counts", RATE, first / RATE)}
     for name, angle in swing.items():
         shown = np.where(time > LOST, 0.0, angle) if name in lost else angle
-        channels[f"angle_{name}"] = (HALF_ANGLE * shown + NOISE * random.normal(size=time.size), "rad", RATE)
+        channels[f"angle_{name}"] = (HALF_ANGLE * shown + NOISE * random.normal(size=time.size), "rad", RATE, 0.0)
     device = lissajous.Device.from_toml(
         "[x.mechanics]\nJ = 1e-10\nb = 1e-8\nk = 0.0158\n[y.mechanics]\nJ = 1e-10\nb = 1e-8\nk = 0.00275\n"
         f"[scan]\nhalf_angle_x = {HALF_ANGLE}\nhalf_angle_y = {HALF_ANGLE}\n"
@@ -45,6 +48,11 @@ def test_a_rest_before_the_start_is_no_blur() -> None:
         assert summary[name]["phase_sd_deg"] < 0.1
         assert summary[name]["amplitude_rad"] == pytest.approx(HALF_ANGLE, rel=0.03)
         assert summary[name]["frequency_hz"] == pytest.approx(frequency, rel=1e-3)
+
+
+def test_a_rest_before_the_intensity_is_recorded_is_no_lost_signal() -> None:
+    result = reconstruct(resting="xy", lost="x", first=round(1.5 * BEGIN * RATE))
+    assert result.unlocated_samples == pytest.approx((DURATION - LOST) * RATE, rel=0.1)
 
 
 @pytest.mark.parametrize("lost", ["x", "xy"])
