@@ -63,6 +63,9 @@ def check_writable(folder: Path) -> None:
 IS_REPLACING = threading.Event()
 """Set while a finished file takes its place, which cannot be undone: an interrupt has to wait for the end."""
 
+HAS_REPLACED = threading.Event()
+"""Set as soon as a finished file takes its place, usually the last work of a command."""
+
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
@@ -78,6 +81,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         yield beside
         IS_REPLACING.set()
+        HAS_REPLACED.set()
         beside.replace(path)
     except OSError as error:
         # The error names no file, or the temporary one, which the user does not know.

@@ -21,7 +21,7 @@ from recon.imaging.picture import Grid, Picture
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from scanner.channel import Channel
 from scanner.errors import BadInput
-from scanner.files import IS_REPLACING, check_no_input, check_writable
+from scanner.files import HAS_REPLACED, IS_REPLACING, check_no_input, check_writable
 from scanner.hdf5 import new_hdf5
 from scanner.motion import Motion
 
@@ -63,6 +63,7 @@ def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
         for path in temporary.iterdir():
             check_no_input(folder / path.name, *(Path(each) for each in inputs if isinstance(each, str | Path)))
         IS_REPLACING.set()
+        HAS_REPLACED.set()
         if not folder.exists():
             temporary.chmod(0o755)
             temporary.replace(folder)

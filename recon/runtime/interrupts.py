@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from scanner.files import IS_REPLACING
+from scanner.files import HAS_REPLACED, IS_REPLACING
 
 REPEAT_INTERVAL_S = 1.0
 """Time after which KeyboardInterrupt is raised again if the process still runs. Compiled code may discard the first
@@ -25,10 +25,12 @@ class StopRequest:
 
     Attributes:
         came: whether SIGINT or SIGTERM arrived before the work ended.
+        was_postponed: whether one arrived while a finished file took its place, or after it.
         ended: whether the work has ended, so that nothing is left to stop.
     """
 
     came = False
+    was_postponed = False
     ended = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
@@ -36,12 +38,15 @@ class StopRequest:
 
         Nothing is raised while another exception is handled, above all the first KeyboardInterrupt: its clean-up runs
         to the end. Nothing is raised either when the work has ended: its output is in place. While a finished file
-        takes its place, the interrupt waits for the next repetition.
+        takes its place, the interrupt waits for the next repetition; so does one after it, but only once: the command
+        has usually done its work, and ends before that.
         """
         if self.ended and not self.came:
             return
-        is_late = IS_REPLACING.is_set() and hasattr(signal, "setitimer")
+        may_be_done = HAS_REPLACED.is_set() and not self.was_postponed
+        is_late = (IS_REPLACING.is_set() or may_be_done) and hasattr(signal, "setitimer")
         self.came = self.came or not is_late
+        self.was_postponed = self.was_postponed or is_late
         if hasattr(signal, "setitimer"):
             signal.signal(signal.SIGALRM, self)
             signal.setitimer(signal.ITIMER_REAL, REPEAT_INTERVAL_S)
@@ -56,6 +61,7 @@ def handle_interrupts() -> Iterator[StopRequest]:
     Outside the main thread nothing is changed, because Python sets signal handlers there only.
     """
     stop = StopRequest()
+    HAS_REPLACED.clear()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return

@@ -260,6 +260,23 @@ def test_an_interrupt_waits_while_finished_output_takes_its_place(
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize("work_goes_on", [False, True])
+def test_an_interrupt_after_finished_output_took_its_place_waits_once(
+    work_goes_on: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A command that only returns then is not interrupted, one with several outputs is."""
+    monkeypatch.setattr("recon.runtime.interrupts.REPEAT_INTERVAL_S", 0.05)
+    with handle_interrupts() as stop:
+        with replacing(tmp_path / "out") as beside:
+            beside.write_text("done")
+        signal.raise_signal(signal.SIGINT)
+        if work_goes_on:
+            with pytest.raises(KeyboardInterrupt):
+                time.sleep(5.0)
+        stop.ended = True
+    assert stop.came == work_goes_on
+
+
 def test_an_interrupt_as_soon_as_the_temporary_folder_exists_leaves_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
