@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.knot_smoother import smooth_knots
 from estimation.short_tone import MIN_PERIODS, fit_short_tone
 from scanner.arrays import Array, Complex
 from scanner.channel import Channel
@@ -115,6 +116,9 @@ def drive_reference(
 ) -> PhaseReference:
     """The reference from a recorded drive voltage; the phase is interpolated linearly through gaps (NaN).
 
+    Noise of the voltage, and edges between coarse samples, would move the reference from block to block, which no
+    mirror follows: the phases of the blocks are smoothed as far as they have noise.
+
     Args:
         drive: its channel.
         kind: ``"half-drive"`` for a parametric drive, ``"drive"`` for a linear one.
@@ -137,7 +141,9 @@ def drive_reference(
     phase, size = np.angle(phasors), np.nan_to_num(np.abs(phasors))
     on = size > DRIVE_ON_RATIO * size.max()
     time, phase = (time[on], phase[on]) if on.sum() >= 2 else (time, phase)
-    time, slow = _with_steady_ends(time, unwrap_phase(phase), *(span or (drive.start, drive.end)))
+    slow = unwrap_phase(phase)
+    slow = smooth_knots(time, slow) if np.isfinite(slow).all() else slow
+    time, slow = _with_steady_ends(time, slow, *(span or (drive.start, drive.end)))
     ratio = 0.5 if kind == "half-drive" else 1.0
     return PhaseReference(kind, ratio * f, time, ratio * slow)
 
