@@ -54,6 +54,9 @@ CONVERSIONS = {
 AMPLITUDE_CHANNELS = ("amplitude_x", "amplitude_y")
 """Amplitudes of a lock-in amplifier or an envelope detector: an angle, or a voltage behind the device's readout."""
 
+USED_CHANNELS = (*CHANNEL_UNITS, *AMPLITUDE_CHANNELS, "intensity")
+"""Names of the channels that have a meaning. Others are kept and not used."""
+
 PHASE_CHANNELS = ("phase_x", "phase_y")
 """Phases of a lock-in amplifier, which belong to the amplitudes."""
 

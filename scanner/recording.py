@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scanner.channel import Channel, make_channel
+from scanner.channel import USED_CHANNELS, Channel, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Device
 from scanner.devices import find
@@ -236,20 +236,28 @@ class Recording:
 
     @property
     def start(self) -> float:
-        """Time of the first sample of any channel [s]; of the first edge where there are edges only."""
-        starts = [channel.start for channel in self.channels.values()]
+        """Time of the first sample of any channel in use [s]; of the first edge where there are edges only."""
+        starts = [channel.start for channel in self._channels_in_use()]
         return min(starts or [float(edges.times[0]) for edges in self.edges.values() if edges.times.size])
 
     @property
     def end(self) -> float:
-        """Time one sample after the last sample of any channel [s]; of the last edge where there are edges only."""
-        ends = [channel.end for channel in self.channels.values()]
+        """Time one sample after the last sample of any channel in use [s]; of the last edge with edges only."""
+        ends = [channel.end for channel in self._channels_in_use()]
         return max(ends or [float(edges.times[-1]) for edges in self.edges.values() if edges.times.size])
 
     @property
     def duration(self) -> float:
-        """From the first sample of any channel to the end [s]."""
+        """From the first sample of any channel in use to the end [s]."""
         return self.end - self.start
+
+    def _channels_in_use(self) -> list[Channel]:
+        """The channels whose names have a meaning; all where there are no such channels and no edges.
+
+        A room's temperature or a trigger may be recorded for longer than the scan.
+        """
+        known = [channel for name, channel in self.channels.items() if name in USED_CHANNELS]
+        return known if known or self.edges else list(self.channels.values())
 
     def slice(self, t0: float, t1: float) -> Recording:
         """Return the samples with ``t0 <= t < t1`` [s], on the same clock, without channels that have none.

@@ -16,7 +16,7 @@ from recon.quality.drive_check import check_drives, check_rates, check_signals
 from recon.quality.duration_check import check_duration
 from recon.quality.sensor_sign import describe_inverted_sensors
 from scanner import devices
-from scanner.channel import AMPLITUDE_CHANNELS, CHANNEL_UNITS, Channel, check_signal
+from scanner.channel import USED_CHANNELS, Channel, check_signal
 from scanner.channel_names import suggest_name
 from scanner.device import AXES, VALUES, Device
 from scanner.errors import BadInput
@@ -177,7 +177,7 @@ def _unknown_entries(recording: Recording, device: Device) -> Iterator[str]:
     """A line for every unknown channel and device key, and every inverted sensor."""
     references = {channel.reference for channel in recording.channels.values()}
     for name in recording.channels:
-        if name not in (*CHANNEL_UNITS, *AMPLITUDE_CHANNELS, "intensity") and name not in references:
+        if name not in USED_CHANNELS and name not in references:
             yield f"{name}: a channel of this name is not used{suggest_name(name)}"
     yield from describe_inverted_sensors(recording, device)
     stated = {"": device.shared_tolerance, **{f"{name}.": axis.tolerance for name, axis in device.axes.items()}}

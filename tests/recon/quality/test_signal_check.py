@@ -55,6 +55,14 @@ def test_an_intensity_that_covers_half_the_recording_is_noted() -> None:
     assert "intensity: covers 50% of the recording" in note
 
 
+def test_a_channel_without_meaning_changes_neither_duration_nor_clock() -> None:
+    recording = scan(2000.0, 835.0)
+    channels = {name: (each.read(), each.unit, RATE) for name, each in recording.channels.items()}
+    longer = Recording.from_arrays(channels | {"temperature": (np.full(90, 21.0), "degC", 1.0, -30.0)}, DEVICE)
+    assert (longer.start, longer.end) == (recording.start, recording.end)
+    assert not prepare(longer).clock_notes
+
+
 def driven_scan(gain: float = 1.0, rate: float = RATE, dead_from: int = TIME.size) -> Recording:
     """A scan whose x axis lags its drive by 90 degrees, with a sensor of ``gain`` recorded at ``rate``."""
     recording = scan(2000.0, 835.0)
