@@ -18,7 +18,12 @@ from recon.imaging.intensity_correction import (
 from recon.imaging.intensity_drift import IntensityDrift
 from recon.imaging.intensity_drift_equations import DriftKind
 from recon.imaging.scan_phase.bidirectional_phase import measure_motion_phase_errors
-from recon.imaging.scan_phase.clock_rate import describe_clock_error, find_clock_error
+from recon.imaging.scan_phase.clock_rate import (
+    converge_clock_error,
+    describe_clock_error,
+    find_clock_error,
+    include_clock_error,
+)
 from recon.imaging.scan_phase.contradicted_phase import include_contradictions
 from recon.imaging.scan_phase.detector_offset import (
     describe_unstated_place,
@@ -28,7 +33,12 @@ from recon.imaging.scan_phase.detector_offset import (
 )
 from recon.imaging.scan_phase.phase_agreement import Contradiction, find_contradictions
 from recon.imaging.scan_phase.phase_error import PhaseError
-from recon.imaging.scan_phase.readout_phase import describe_readout_phase, remove_readout_phase, widen_undetermined
+from recon.imaging.scan_phase.readout_phase import (
+    MIN_DRIFT_SLICES,
+    describe_readout_phase,
+    remove_readout_phase,
+    widen_undetermined,
+)
 from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.imaging.scan_phase.searched_phase import SearchedPhase, search_phase_of
@@ -142,19 +152,26 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         notes += [describe_unstated_place(name, stated_event(motion, name)) for name in sorted(undetermined)]
         notes += describe_readout_phase(motion, readout_phase, contradicted | undetermined)
     clock_error = find_clock_error(sensed, motion, errors) or find_clock_error(sensed, motion, searched.errors)
+    constant = clock_error is not None and len(errors) < MIN_DRIFT_SLICES  # of few slices a constant was removed
+    if clock_error is not None and constant:
+        clock_error = converge_clock_error(sensed, motion, clock_error, register)
     clock = describe_clock_error(clock_error, estimated.prepared.intensity)
-    motion, remaining_notes = include_remaining_errors(motion, errors, beyond)
+    settled = motion
+    motion, remaining_notes = include_remaining_errors(settled, errors, beyond)
     without_readout, _ = include_remaining_errors(sensed, errors, beyond)
+    if clock_error is not None and constant:
+        motion = include_clock_error(motion, clock_error, set(motion.axes) - _replaced_axes(settled, motion))
+    is_left = constant or bool(remaining_notes)
     without_readout = include_contradictions(without_readout, contradictions)
     return replace(
         estimated,
         motion=include_contradictions(motion, contradictions),
         phase_errors=errors,
         contradictions=contradictions,
-        clock_limits=clock if remaining_notes else (),
+        clock_limits=clock if is_left else (),
         readout_phase=readout_phase,
         estimator_phase_sd={name: axis.phase_sd for name, axis in without_readout.axes.items()},
-        motion_notes=[*notes, *([] if remaining_notes else clock), *remaining_notes, *estimated.motion_notes],
+        motion_notes=[*notes, *([] if is_left else clock), *remaining_notes, *estimated.motion_notes],
     )
 
 

@@ -13,17 +13,17 @@ from recon.report.summary import summarise
 RATE, DURATION, HALF_ANGLE, PIXELS = 1e6, 0.1, 0.08, 200
 
 
-def reconstruct(ppm: float, drift_x_rad: float = 0.0) -> Reconstruction:
+def reconstruct(ppm: float, drift_x_rad: float = 0.0, duration: float = DURATION) -> Reconstruction:
     """A recording with angle channels whose intensity has a stated rate that is ``ppm`` too high.
 
     ``drift_x_rad`` is a phase by which the sensor of x alone is late at the end.
     """
-    time = np.arange(round(RATE * DURATION)) / RATE
+    time = np.arange(round(RATE * duration)) / RATE
     x, y = 1.06 * np.sin(2 * np.pi * 2000.0 * time), 1.06 * np.sin(2 * np.pi * 835.0 * time + 1.0)
     spots = np.random.default_rng(1).uniform([-0.9, -0.9, 0.04], [0.9, 0.9, 0.12], (40, 3))
     scene = 0.3 + 0.1 * x + sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * w * w)) for a, b, w in spots)
     counts = np.random.default_rng(2).poisson(100.0 * scene)
-    x = 1.06 * np.sin(2 * np.pi * 2000.0 * time - drift_x_rad * time / DURATION)
+    x = 1.06 * np.sin(2 * np.pi * 2000.0 * time - drift_x_rad * time / duration)
     angles = {f"angle_{name}": (HALF_ANGLE * u, "rad", RATE) for name, u in (("x", x), ("y", y))}
     device = lissajous.Device.from_toml(
         "[x.mechanics]\nJ = 1e-10\nb = 1e-8\nk = 0.0158\n[y.mechanics]\nJ = 1e-10\nb = 1e-8\nk = 0.00275\n"
@@ -63,3 +63,22 @@ def test_the_conclusion_begins_with_a_clock_error_that_blurs_and_does_not_blame_
 def test_a_right_clock_and_a_sensor_that_drifts_are_not_reported(drift_x_rad: float) -> None:
     result = reconstruct(0.0, drift_x_rad)
     assert not [each for each in (*result.limits, *result.notes) if "ppm" in each]
+
+
+@pytest.mark.parametrize("duration", [0.04, 0.06])
+def test_a_scan_of_one_or_two_slices_shows_it_in_their_parts(duration: float) -> None:
+    result = reconstruct(80.0, duration=duration)
+    [line] = [each for each in result.limits if "ppm" in each]
+    value, sd = (float(each) for each in re.findall(r"\((\S+) ± (\S+)\) ppm", line)[0])
+    assert value == pytest.approx(80.0, abs=3 * sd)
+    for name, frequency in (("x", 2000.0), ("y", 835.0)):
+        wrong = 360.0 * frequency * 80e-6 * duration / np.sqrt(12.0)
+        stated = np.degrees(np.sqrt(np.mean(result.motion.axes[name].phase_sd ** 2)))
+        assert 0.7 * wrong < stated < 2.0 * wrong
+
+
+@pytest.mark.parametrize("duration", [0.02, 0.04, 0.06])
+def test_a_short_scan_with_a_right_clock_or_a_sensor_that_drifts_is_not_reported(duration: float) -> None:
+    for drift_x_rad in (0.0, 0.03):
+        result = reconstruct(0.0, drift_x_rad, duration)
+        assert not [each for each in (*result.limits, *result.notes) if "ppm" in each]
