@@ -41,6 +41,7 @@ from recon.quality.dropped_samples import (
     restore_timing,
     slices_aligned,
 )
+from recon.quality.gain_steps import describe_gain_steps
 from recon.quality.overflow import describe_overflows
 from recon.quality.resonance_check import describe_resonance_mismatch
 from recon.quality.sensor_noise import check_sensor_noise
@@ -255,6 +256,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
         affected=gridded.affected,
         limits=[
             *describe_overflows(prepared.uncorrected),
+            *describe_gain_steps(prepared.uncorrected, prepared.device),
             *describe_limits(*samples, prepared.defects),
             *describe_start_shift(prepared.uncorrected, motion, estimated.contradictions),
             *describe_centre_motion(prepared.recording, prepared.device, motion, estimated.grid, options.p),
