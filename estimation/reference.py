@@ -9,7 +9,7 @@ import numpy as np
 from estimation.knot_smoother import smooth_knots
 from estimation.short_tone import MIN_PERIODS, fit_short_tone
 from scanner.arrays import Array, Complex
-from scanner.channel import Channel
+from scanner.channel import Channel, hint_of_dead
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block, unwrap_phase
 
@@ -270,7 +270,7 @@ def not_covered(channel: Channel, what: str, start: float, end: float, remedy: s
 
 def _no_oscillation(channel: Channel) -> BadInput:
     """The error for a channel without a line."""
-    hint = "check that it was recorded"
+    hint = hint_of_dead(channel.name, "recorded")
     return BadInput("holds no oscillation", file=channel.file, channel=channel.name, hint=hint)
 
 

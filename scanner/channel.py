@@ -314,7 +314,19 @@ def check_signal(signal: Channel, *, constant_ok: bool = False, gaps_ok: bool = 
         raise BadInput(what, file=signal.file, channel=signal.name, hint="check its type, gain and offset")
     if low == high and not constant_ok:
         what = f"is constant, {low:.9g} {signal.unit}"
-        raise BadInput(what, file=signal.file, channel=signal.name, hint="check that it was connected")
+        raise BadInput(what, file=signal.file, channel=signal.name, hint=hint_of_dead(signal.name, "connected"))
+
+
+def hint_of_dead(name: str, expected: str) -> str:
+    """What to check where a channel shows nothing, as text.
+
+    Args:
+        name: of the channel; a drive may be off on purpose.
+        expected: what it should have been, such as ``"connected"``.
+    """
+    is_drive = name.startswith("drive_")
+    off = f"; if the drive was off, as in a free decay, name the channel {name.replace('drive', 'bias')}"
+    return f"check that it was {expected}" + off * is_drive
 
 
 def _dead_columns(signal: Channel) -> list[str]:

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from estimation.estimate import check_finite, estimate
+from estimation.signals import phase_reference
 from recon.pipeline import reconstruct
 from recon.steps.preparation import prepare
 from recon.steps.reconstruction import Options
 from scanner.angle_tracks import SampledAngle
+from scanner.channel import make_channel
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.errors import BadInput
@@ -70,6 +72,18 @@ def driven_scan(gain: float = 1.0, rate: float = RATE, dead_from: int = TIME.siz
     channels = {name: (recording[name].read(), recording[name].unit, RATE) for name in ("sense_y", "intensity")}
     channels |= {"drive_x": (np.sin(2 * np.pi * 2000.0 * TIME), "V", RATE), "sense_x": (x, "V", rate)}
     return Recording.from_arrays(channels, DEVICE)
+
+
+@pytest.mark.parametrize("noise", [0.0, 5e-3])
+def test_a_drive_that_was_off_is_refused_with_its_other_name(noise: float) -> None:
+    decay = driven_scan()
+    volts = noise * np.random.default_rng(1).standard_normal(TIME.size)
+    dead = decay.with_channel(make_channel("drive_x", volts, unit="V", sample_rate=RATE))
+    with pytest.raises(BadInput, match="if the drive was off, as in a free decay, name the channel bias_x"):
+        phase_reference(dead, DEVICE, "x")
+    channels = {each: (decay[each].read(), decay[each].unit, RATE) for each in ("sense_x", "sense_y", "intensity")}
+    free = Recording.from_arrays(channels | {"bias_x": (volts, "V", RATE)}, DEVICE)
+    assert phase_reference(free, DEVICE, "x", free["sense_x"]).kind == "absolute"
 
 
 def test_an_inverted_sensor_is_noted_where_the_drive_shows_it() -> None:
