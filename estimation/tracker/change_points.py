@@ -7,7 +7,7 @@ at that time (``state_space``).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -45,33 +45,73 @@ def find_switch_times(
 ) -> Array:
     """Times at which a drive switched, at most one a block, shape (switches,) [s].
 
-    Searched in blocks whose residual variance is high. The drive of the preceding block and the drive of the next one
+    Searched in blocks whose residual variance is high, and in those half a block earlier and later: of a switch between
+    two blocks the reference alone is wrong in either. The drive of the preceding block and the drive of the next one
     are continued through the block; the switch is where the first followed by the second has the least squared
-    residuals. It is accepted if these are below MAX_RESIDUAL_RATIO of the residuals of the block's own fit.
+    residuals. It is accepted if these are below MAX_RESIDUAL_RATIO of those without a switch.
 
     Args:
         starts: first sample of every block, shape (blocks,). length: of a block [samples].
         fitted: projections of the drive in all blocks. orders: harmonics of the reference in the drive.
         square: whether the force is the square of the drive's voltage.
     """
-    variance, times = residual_variance(fitted), []
+    variance, found = residual_variance(fitted), []
     min_power = MIN_SWITCH_VARIANCE_RATIO * float(fitted.squares.max()) / length
     for k in np.flatnonzero(variance > max(SWITCH_VARIANCE_RATIO * float(np.nanmedian(variance)), min_power)):
-        if not 0 < k < starts.size - 1:
-            continue
-        low, high = (channel.start + s / channel.sample_rate for s in (starts[k], starts[k] + length))
-        sides = (starts[k - 1], _phase_before(reference, low)), (starts[k + 1], _phase_after(reference, high))
-        before, after = (
-            np.cumsum(
-                _squared_residuals(channel, side or reference.phase, int(near), int(starts[k]), length, orders, square)
-            )
-            for near, side in sides
-        )
-        residuals = before + after[-1] - after
-        at = int(residuals.argmin())
-        if 0 < at < length - 1 and residuals[at] < MAX_RESIDUAL_RATIO * variance[k] * fitted.counts[k]:
-            times.append(low + (at + 0.5) / channel.sample_rate)
-    return np.array(times)
+        if 0 < k < starts.size - 1:
+            windows = [int(starts[k]) + shift for shift in (-length // 2, 0, length // 2)]
+            searched = [_find_switch(channel, reference, first, length, orders, square, min_power) for first in windows]
+            ratio, time = min(searched, key=lambda each: each[0])
+            if ratio < MAX_RESIDUAL_RATIO:
+                found.append((ratio, time))
+    return _distinct_times(found, length / channel.sample_rate)
+
+
+def _distinct_times(found: Sequence[tuple[float, float]], width: float) -> Array:
+    """Times of switches, increasing; of those within half a block, the one of the best fit.
+
+    Args:
+        found: ratio of the squared residuals and time of each. width: of a block [s].
+    """
+    times: list[float] = []
+    for _, time in sorted(found):
+        if all(abs(other - time) > 0.5 * width for other in times):
+            times.append(time)
+    return np.array(sorted(times))
+
+
+def _find_switch(
+    channel: Channel,
+    reference: PhaseReference,
+    first: int,
+    length: int,
+    orders: Index,
+    square: bool,
+    min_power: float,
+) -> tuple[float, float]:
+    """Squared residuals with a switch over those without, and its time [s]; (inf, nan) where there is no switch.
+
+    Without a switch, the block has a drive of its own, or that of the block on one side.
+
+    Args:
+        first: first sample of the block; the others as for :func:`find_switch_times`.
+        min_power: residual power below which a drive is exact.
+    """
+    if first < length or first + 2 * length > channel.size:
+        return np.inf, np.nan
+    low, high = (channel.start + sample / channel.sample_rate for sample in (first, first + length))
+    sides = (first - length, _phase_before(reference, low)), (first + length, _phase_after(reference, high))
+    before, after = (
+        np.cumsum(_squared_residuals(channel, side or reference.phase, near, first, length, orders, square))
+        for near, side in sides
+    )
+    own = float(_squared_residuals(channel, reference.phase, first, first, length, orders, square).sum())
+    residuals = before + after[-1] - after
+    at = int(residuals.argmin())
+    without = min(own, float(before[-1]), float(after[-1]))
+    if not (0 < at < length - 1 and without > min_power * length):
+        return np.inf, np.nan
+    return float(residuals[at]) / without, low + (at + 0.5) / channel.sample_rate
 
 
 def _squared_residuals(

@@ -7,12 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.short_recordings import linear_device
 from benchmarks.switches import phase_errors_at_blocks
-from estimation.reference import PhaseReference
+from estimation.reference import PhaseReference, drive_reference
 from estimation.tracker import track
+from estimation.tracker.averaged_dynamics import axis_parameters
 from estimation.tracker.change_points import block_pieces, drive_shares, with_switches
+from estimation.tracker.drive_blocks import demodulate_drive
 from phantoms.forward import Plan, simulate
 from phantoms.waveforms import Constant, Sequence, Waveform
+from scanner.channel import make_channel
 from scanner.stages import Amdm
 from tests.support.simulated import DRIVES, own_electrodes, with_sense
 
@@ -47,6 +51,20 @@ def test_reference_has_the_frequency_step_and_phase_jump_of_the_drive() -> None:
     time = np.array([0.0099, 0.00996, 0.00998, 0.0102])
     slow = reference.phase(time) - 2 * np.pi * 1e3 * time
     assert np.allclose(slow, np.where(time < 0.00997, 0.0, 1.0 + 30.0 * (time - 0.01)), atol=1e-6)
+
+
+@pytest.mark.parametrize("at", [0.0155, 0.0158, 0.016, 0.017])
+def test_a_phase_jump_is_found_within_and_between_blocks(at: float) -> None:
+    rate, width = 1e6, 1e-3
+    time = np.arange(40_000) / rate
+    volts = np.sin(2 * np.pi * 2000.0 * time + (time >= at))
+    drive = make_channel("drive_x", volts, unit="V", sample_rate=rate)
+    axis = linear_device().axis("x")
+    law = axis_parameters(axis, axis.require_readout())
+    found = demodulate_drive(drive, drive_reference(drive, "drive"), width * (np.arange(40) + 0.5), width, law)
+    assert np.abs(found.switches - at).min() < 2e-6
+    error = found.reference.phase(time) - 2 * np.pi * 2000.0 * time - (time >= at)
+    assert np.abs(error[np.abs(time - at) > 2e-6]).max() < 1e-3
 
 
 def test_block_with_a_switch_uses_the_piece_with_its_middle() -> None:
