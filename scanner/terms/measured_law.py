@@ -11,11 +11,17 @@ A device file states it under ``[x.terms.measured-law]``:
     coefficients = [1e-9, 2e-9]          # SI units: N m / (rad^i (rad/s)^j)
     coefficients_sd = [1e-11, 3e-11]     # standard deviations; no law uses them
 
+A law of one variable may also have a table, straight between its knots, that adds to the polynomial:
+
+    knots = [-0.2, 0.0, 0.2]             # of the variable
+    knot_values = [1e-3, 0.0, -2e-3]
+    knot_values_sd = [1e-4, 1e-4, 1e-4]
+
 Other stages have one variable. ``readout`` adds to the signal [V] a law of the signal [V], ``drive`` adds to the
 voltage a law of the voltage [V], ``optics`` adds to the reference angle a law of the angle [rad]. The range of two
 variables is the ellipse between ``lower`` and ``upper``: an oscillation reaches its largest angle and its largest rate
 at different times, so no sample was measured in the corners. Beyond its range a law continues along the radius with the
-slope at the edge. It is not part of the catalogue that a diagnosis searches.
+slope at the edge, and so does a table beyond its knots. It is not part of the catalogue that a diagnosis searches.
 """
 
 from __future__ import annotations
@@ -45,8 +51,8 @@ VARIABLES = {
 def polynomial(p, first, second):  # type: ignore[no-untyped-def]
     """Value of a packed law at two variables: a polynomial within its range, straight along the radius beyond it.
 
-    ``p`` holds the number of coefficients; centre, lower and upper end, each of both variables; and for each
-    coefficient the powers of both variables and its value.
+    ``p`` holds the number of coefficients; centre, lower and upper end, each of both variables; for each coefficient
+    the powers of both variables and its value; and the knots of a table and its values, which are not used here.
     """
     middle_a, middle_b = 0.5 * (p[3] + p[5]), 0.5 * (p[4] + p[6])
     half_a, half_b = 0.5 * (p[5] - p[3]), 0.5 * (p[6] - p[4])
@@ -86,7 +92,18 @@ def _along(p, values):  # type: ignore[no-untyped-def]
 
 def added(values: Array, p: Sequence[float]) -> Array:
     """What a law of one variable adds at ``values``, of their shape."""
-    return np.asarray(_along(np.asarray(p, float), np.ascontiguousarray(values, float).ravel()).reshape(values.shape))
+    polynomial_part = _along(np.asarray(p, float), np.ascontiguousarray(values, float).ravel()).reshape(values.shape)
+    knots, knot_values = np.reshape(p[7 + 3 * int(p[0]) :], (2, -1))
+    return np.asarray(polynomial_part + _straight_between(values, knots, knot_values))
+
+
+def _straight_between(values: Array, knots: Array, knot_values: Array) -> Array:
+    """Piecewise linear interpolation, continued with the slope of the first and the last piece; 0 without knots."""
+    if not knots.size:
+        return np.zeros(np.shape(values))
+    slopes = np.diff(knot_values) / np.diff(knots)
+    below, above = np.minimum(values - knots[0], 0.0), np.maximum(values - knots[-1], 0.0)
+    return np.asarray(np.interp(values, knots, knot_values) + slopes[0] * below + slopes[-1] * above)
 
 
 def _output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
@@ -109,7 +126,8 @@ def measured_law(table: Mapping[str, Any]) -> tuple[Term, tuple[float, ...]]:
     """Return the term that a table of a device file states, and its packed values.
 
     Raises:
-        DeviceInvalid: a stage that has no measured law, a key missing, or lists of different lengths.
+        DeviceInvalid: a stage that has no measured law, a key missing, lists of different lengths, or a table that is
+            not ascending, has fewer than two knots, or is of two variables.
     """
     stage = table.get("stage")
     if stage not in VARIABLES:
@@ -130,8 +148,20 @@ def measured_law(table: Mapping[str, Any]) -> tuple[Term, tuple[float, ...]]:
     packed = [float(count), *centre, *lower, *upper]
     for each, coefficient in zip(powers, table["coefficients"], strict=True):
         packed += [*map(float, [*each, 0][:2]), float(coefficient)]
+    packed += _packed_table(table, width)
     names = [Parameter(f"p{i}", "SI", lambda scales: 0.0) for i in range(len(packed))]
     return Term(EFFECT, stage, "law as measured, no name", tuple(names), "a diagnosis", **_LAWS[stage]), tuple(packed)
+
+
+def _packed_table(table: Mapping[str, Any], width: int) -> list[float]:
+    """The knots of a law and its values at them; empty where it has no table."""
+    knots, values = (list(map(float, table.get(key, ()))) for key in ("knots", "knot_values"))
+    if not knots and not values:
+        return []
+    if width > 1 or len(knots) != len(values) or len(knots) < 2 or not np.all(np.diff(knots) > 0.0):
+        hint = "a law of one variable has two or more ascending knots, and one of knot_values for each"
+        raise DeviceInvalid("has a table that cannot be used", channel=EFFECT, hint=hint)
+    return [*knots, *values]
 
 
 def beyond(table: Mapping[str, Any], values: Sequence[Array]) -> float:

@@ -20,6 +20,10 @@ TABLE: dict[str, Any] = {
     "lower": [-1.0, -10.0], "upper": [1.0, 10.0],
     "powers": [[3, 0], [2, 1]], "coefficients": [-19.0, 0.05], "coefficients_sd": [0.1, 0.01],
 }  # fmt: skip
+READOUT: dict[str, Any] = {
+    "stage": "readout", "variables": ["signal"], "centre": [0.0], "lower": [0.0], "upper": [2.0],
+    "powers": [[2]], "coefficients": [0.1],
+}  # fmt: skip
 NAMED = {"cubic-stiffness": {"k3": -19.0}, "cubic-damping": {"b3": 0.05}}
 BARE = """
 name = "pendulum"
@@ -55,14 +59,23 @@ def test_a_measured_law_moves_the_mirror_as_the_named_laws_do() -> None:
 
 
 def test_beyond_its_range_a_measured_law_continues_with_the_slope_at_the_edge() -> None:
-    table = TABLE | {
-        "stage": "readout", "variables": ["signal"], "centre": [0.5], "lower": [0.0], "upper": [2.0],
-        "powers": [[2]], "coefficients": [0.1],
-    }  # fmt: skip
+    table = READOUT | {"centre": [0.5]}
     values = np.array([0.0, 0.5, 2.0, 3.0, -1.0])
     _, packed = measured_law(table)
     assert added(values, packed) == pytest.approx([0.025, 0.0, 0.225, 0.225 + 0.3, 0.025 + 0.1])
     assert beyond(table, [values]) == pytest.approx(0.4)
+
+
+def test_a_table_adds_to_the_polynomial_and_continues_with_the_slope_of_its_last_piece() -> None:
+    table = TABLE | {
+        "stage": "drive", "variables": ["voltage"], "centre": [0.0], "lower": [-2.0], "upper": [2.0],
+        "powers": [[1]], "coefficients": [-0.1], "knots": [-2.0, -0.5, 0.5, 2.0], "knot_values": [0.4, 0.1, -0.1, -0.1],
+    }  # fmt: skip
+    values = np.array([-3.0, -2.0, 0.0, 1.0, 3.0])
+    _, packed = measured_law(table)
+    assert added(values, packed) == pytest.approx(-0.1 * values + np.array([0.6, 0.4, 0.0, -0.1, -0.1]))
+    made = device({"measured-law": table})
+    assert Device.from_toml(made.to_toml()) == made
 
 
 def test_beyond_the_ellipse_of_its_range_a_law_of_two_variables_continues_along_the_radius() -> None:
@@ -96,6 +109,10 @@ def test_a_law_that_does_no_work_over_a_turn_does_none_beyond_its_range() -> Non
         ({"stage": "timing"}, "stage 'timing'"),
         ({"powers": [[3, 0]]}, "wrong length"),
         ({"coefficients": None}, "lacks"),
+        ({"knots": [0.0, 1.0], "knot_values": [0.0, 1.0]}, "table"),
+        (READOUT | {"knots": [0.0, 1.0, 1.0], "knot_values": [0.0, 1.0, 2.0]}, "table"),
+        (READOUT | {"knots": [0.0, 1.0], "knot_values": [0.0]}, "table"),
+        (READOUT | {"knots": [0.0], "knot_values": [0.0]}, "table"),
     ],
 )
 def test_a_measured_law_that_cannot_be_used_is_refused(changed: dict[str, Any], what: str) -> None:
