@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimation.candidate_terms.discrepancy import (
+    CURVE_COLUMNS,
+    CURVE_KNOTS,
+    CURVE_NAMES,
     FORCE_DEGREE,
     FORCE_POWERS,
     GAIN_COSINES,
@@ -126,6 +130,12 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
                 Section(waves("g"), "gain error", "1", time, "time (s)"),
                 Section(waves("o"), "offset / rms", "1", time, "time (s)"),
             ]
+        case "free-readout-curve" | "free-drive-curve":
+            signal = 2.0 * u  # a sine reaches 1.4 standard deviations
+            table = [np.interp(signal, CURVE_KNOTS, column) for column in CURVE_COLUMNS.T]
+            curve = {"c2": signal**2, "c3": signal**3} | dict(zip(CURVE_NAMES, table, strict=True))
+            name = effect.split("-")[1]
+            return [Section(curve, f"{name} error / rms", "1", signal, f"{name} / rms")]
         case "free-timing":
             r = 0.5 * (u + 1.0)
             steady_oscillation = Section({"r2": r**2, "r4": r**4}, "delay", "s", s.amplitude * r, "amplitude (rad)")
@@ -142,6 +152,8 @@ STATIC_PARAMETERS = {
     "free-mechanics": tuple(f"f{i}{j}" for i, j in FORCE_POWERS),
     "free-readout": ("y0", "y1"),
     "free-drive": ("v0", "v2", "v3"),
+    "free-readout-curve": ("c2", "c3", *CURVE_NAMES),
+    "free-drive-curve": ("c2", "c3", *CURVE_NAMES),
 }
 """Parameters of a discrepancy term that depend on the present state only, not on time or on previous states."""
 
@@ -155,12 +167,8 @@ def measured_law_table(fit: Fit) -> dict[str, Any] | None:
     model, candidate = fit.model, fit.model.candidates[-1]
     term, scales = candidate.term, model.scales(candidate.axis)
     static = STATIC_PARAMETERS.get(term.effect, ())
-    deviations, value, sd = np.sqrt(np.diag(fit.covariance)), dict.fromkeys(static, 0.0), dict.fromkeys(static, 0.0)
-    for i, parameter in zip(model.indices("term", candidate.key), term.free_parameters, strict=True):
-        if parameter.name in static:
-            size = parameter.value(1.0, scales)
-            value[parameter.name], sd[parameter.name] = size * float(fit.x[i]), abs(size) * float(deviations[i])
-    run = next(run for run in model.runs if candidate.axis in run.inputs)
+    value, covariance = _static_parameters(fit, static)
+    sd = np.sqrt(np.diag(covariance))
     if term.effect == "free-mechanics":
         angle, rate = scales.amplitude, scales.amplitude * scales.rate
         powers = [list(exponents) for exponents in FORCE_POWERS]
@@ -169,26 +177,60 @@ def measured_law_table(fit: Fit) -> dict[str, Any] | None:
         radius = max(float(np.hypot(theta / angle, omega / rate).max()) for theta, omega in motions)
         variables, centre, half_width = ["angle", "rate"], [0.0, 0.0], [radius * angle, radius * rate]
     elif static:
-        if term.effect == "free-readout":
-            output = next(o for o in run.outputs if o.kind == "sense" and candidate.axis in o.axes)
-            variables, signal, rms, powers = ["signal"], output.data, scales.sense_rms, [[2], [3]]
+        powers = [[1], [2], [3]] if term.effect == "free-drive" else [[2], [3]]
+        if term.stage == "readout":
+            variables, signal, rms = ["signal"], _signal_before_law(fit), scales.sense_rms
         else:
-            signal = run.inputs[candidate.axis].voltage
-            variables, rms, powers = ["voltage"], scales.voltage_rms, [[1], [2], [3]]
+            run = next(run for run in model.runs if candidate.axis in run.inputs)
+            variables, signal, rms = ["voltage"], run.inputs[candidate.axis].voltage, scales.voltage_rms
         factors = [1.0 / rms ** (power - 1) for (power,) in powers]
         centre, half_width = [float(signal.mean())], [float(np.abs(signal - signal.mean()).max())]
     else:
         return None
-    return {
+    n = len(powers)
+    law = {
         "stage": term.stage,
         "variables": variables,
         "centre": centre,
         "lower": [c - r for c, r in zip(centre, half_width, strict=True)],
         "upper": [c + r for c, r in zip(centre, half_width, strict=True)],
         "powers": powers,
-        "coefficients": [value[name] * factor for name, factor in zip(static, factors, strict=True)],
-        "coefficients_sd": [sd[name] * factor for name, factor in zip(static, factors, strict=True)],
+        "coefficients": (value[:n] * factors).tolist(),
+        "coefficients_sd": (sd[:n] * factors).tolist(),
     }
+    if len(static) > n:
+        reach = half_width[0] / rms
+        at = np.unique([-reach, *np.clip(CURVE_KNOTS, -reach, reach), reach])
+        columns = np.stack([np.interp(at, CURVE_KNOTS, column) for column in CURVE_COLUMNS.T], axis=1)
+        variance = np.einsum("ij,jk,ik->i", columns, covariance[n:, n:], columns)
+        law["knots"] = (centre[0] + rms * at).tolist()
+        law["knot_values"] = (rms * columns @ value[n:]).tolist()
+        law["knot_values_sd"] = (rms * np.sqrt(np.maximum(variance, 0.0))).tolist()
+    return law
+
+
+def _static_parameters(fit: Fit, names: Sequence[str]) -> tuple[Array, Array]:
+    """Values of parameters of the last term of a fit in its units, and their covariance; 0 for those not fitted."""
+    candidate, scales = fit.model.candidates[-1], fit.model.scales(fit.model.candidates[-1].axis)
+    indices = fit.model.indices("term", candidate.key)
+    units = {p.name: (i, p.value(1.0, scales)) for i, p in zip(indices, candidate.term.free_parameters, strict=True)}
+    at = [j for j, name in enumerate(names) if name in units]
+    index, unit = (list(each) for each in zip(*(units[names[j]] for j in at), strict=True)) if at else ([], [])
+    value, covariance = np.zeros(len(names)), np.zeros((len(names), len(names)))
+    value[at] = fit.x[index] * unit
+    covariance[np.ix_(at, at)] = fit.covariance[np.ix_(index, index)] * np.outer(unit, unit)
+    return value, covariance
+
+
+def _signal_before_law(fit: Fit) -> Array:
+    """Sense signal [V] of the first run to which the last term of a fit, a law of the readout, adds, shape (n + 1,).
+
+    A law that folds a signal reaches larger values of it than the recording shows.
+    """
+    model, candidate = fit.model, fit.model.candidates[-1]
+    without = model.with_candidates(model.candidates[:-1])
+    signals = zip(model.runs[0].outputs, without.full_signals(without.map_parameters_from(model, fit.x)), strict=True)
+    return next(signal for output, signal in signals if output.kind == "sense" and candidate.axis in output.axes)
 
 
 def _motions(fit: Fit, axis: str) -> list[tuple[Array, Array]]:

@@ -6,7 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from estimation.candidate_terms.linear_model import LinearModel
+from estimation.candidate_terms.linearisation import linear_model
 from estimation.candidate_terms.significance import DETECTION_THRESHOLD
+from estimation.device_fit.fit import Fit, Likelihood
+from estimation.device_fit.parameters import Candidate
 
 MIN_EXPLAINED_RATIO = 0.1
 """Fall of the misfit by laws over that by free corrections beside them, from which laws may be the answer. Nominal
@@ -84,3 +87,17 @@ def need_of_laws(linear: LinearModel, laws: Sequence[int], explained: float, alo
     )
     certain = possible and (takes_bulk or advantage > MIN_ADVANTAGE_RATIO * remainder)
     return Need(possible, certain, takes_bulk, remaining)
+
+
+def need_beside(
+    likelihood: Likelihood, base: Fit, with_laws: Fit, discrepancies: Sequence[Candidate], explained: float
+) -> Need:
+    """Whether free corrections beside a fit need the laws that it has beyond another one.
+
+    Args:
+        base, with_laws: fits under ``likelihood``.
+        explained: fall of the misfit by these laws.
+    """
+    without, beside = (linear_model(likelihood, fit, discrepancies) for fit in (base, with_laws))
+    alone = without.hypothesis(range(len(without.laws))).neg2_log_evidence
+    return need_of_laws(beside, range(len(beside.laws)), explained, alone)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from estimation.candidate_terms.anchor import fit_anchor, fit_growing, follow_motion, max_residual_ratio, residual_ratio
-from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, is_discrepancy
+from estimation.candidate_terms.discrepancy import CURVE_TERMS, DISCREPANCY_TERMS, REFINED_CURVES, is_discrepancy
 from estimation.candidate_terms.linear_model import RivalFit
 from estimation.candidate_terms.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.candidate_terms.screening import all_candidates, damped_start
@@ -39,7 +39,7 @@ from estimation.diagnosis.from_stated_values import (
     nonlinear_starts,
 )
 from estimation.diagnosis.law_selection import SelectedTerms, choose_laws
-from estimation.diagnosis.necessity import least_explained, need_of_laws
+from estimation.diagnosis.necessity import least_explained, need_beside
 from estimation.diagnosis.pruning import (
     drop_redundant,
     fit_to_convergence,
@@ -122,6 +122,7 @@ class _Search:
         early: fits of the nominal device over the windows ``stops``.
         stops: ends of growing windows as fractions of the recordings.
         pool: named laws and discrepancy terms on all axes and channels.
+        curves: further discrepancy terms, beside which no laws are selected.
         progress: called with one line of text at every step.
     """
 
@@ -130,6 +131,7 @@ class _Search:
     early: Sequence[Fit]
     stops: Sequence[float]
     pool: Sequence[Candidate]
+    curves: Sequence[Candidate]
     progress: Progress
 
     @property
@@ -168,7 +170,8 @@ def select_terms(
     named = [term for term in terms.values() if term.effect not in certain]
     pool = all_candidates(nominal.model, [*named, *DISCREPANCY_TERMS.values()])
     progress(counted(len(pool), "candidate"))
-    selected = _choose_terms(_Search(likelihood, nominal, early, stops, pool, progress))
+    curves = all_candidates(nominal.model, CURVE_TERMS.values())
+    selected = _choose_terms(_Search(likelihood, nominal, early, stops, pool, curves, progress))
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
     return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps, selected.need.remaining)
 
@@ -191,17 +194,31 @@ def _choose_terms(search: _Search) -> SelectedTerms:
         if anchor is nominal:
             anchor, others = fit_anchor(likelihood, nominal, search.early, search.stops, groups[1:])
             tried += others
-    selected = _choose_laws(search, anchor)
-    if selected is not None:
-        selected = _with_nonlinear_term(search, selected)
-        if selected.need.certain:
-            return selected
+    laws = _choose_laws(search, anchor)
+    if laws is not None:
+        laws = _with_nonlinear_term(search, laws)
+        if laws.need.certain and (laws.need.takes_bulk or not nominal_values_are_improbable(laws.fit)):
+            return laws
     search.progress("discrepancy terms")
     selected = _choose_discrepancy(search, anchor, [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])])
+    if laws is not None and laws.need.certain and (selected is None or _are_needed(search, laws, selected)):
+        return laws
     if selected is not None:
-        laws = _choose_laws(search, selected.fit)
-        selected = laws if laws and laws.need.certain else selected
+        around = _choose_laws(search, selected.fit)
+        selected = around if around and around.need.certain else selected
     return _with_nonlinear_term(search, selected or SelectedTerms(likelihood, nominal, nominal))
+
+
+def _are_needed(search: _Search, laws: SelectedTerms, discrepancy: SelectedTerms) -> bool:
+    """Whether laws are needed beside free corrections, where one of these follows the motion without them.
+
+    Nominal values that have absorbed a misfit are far from those with which a correction alone explains it, which the
+    linear model around the laws does not show.
+    """
+    likelihood = discrepancy.likelihood
+    fit = fit_model(likelihood, laws.fit.model, laws.fit.x)
+    explained = misfit(discrepancy.nominal) - misfit(fit)
+    return need_beside(likelihood, discrepancy.fit, fit, search.discrepancies, explained).certain
 
 
 def _fit_drifts_from_stated_values(search: _Search) -> list[Fit]:
@@ -274,7 +291,7 @@ def _choose_discrepancy(search: _Search, anchor: Fit, fitted: Sequence[Fit]) -> 
         fitted: fits of discrepancy terms that have been made.
     """
     likelihood, anchor = refit_under_own_noise(anchor)
-    linear = linear_model(likelihood, anchor, search.discrepancies)
+    linear = linear_model(likelihood, anchor, [*search.discrepancies, *search.curves])
     stages = range(len(linear.discrepancies))
     alone = {i: linear.hypothesis((), without=[j for j in stages if j != i]).neg2_log_evidence for i in stages}
     fits = map_fits(lambda fit: fit_model(likelihood, fit.model, fit.x), fitted, likelihood.steps)
@@ -283,17 +300,40 @@ def _choose_discrepancy(search: _Search, anchor: Fit, fitted: Sequence[Fit]) -> 
         sorted(stages, key=lambda i: alone[i])[:MAX_DISCREPANCY_FITS],
         likelihood.steps,
     )
+    if nominal_values_are_improbable(search.nominal):
+        search.progress("stated values, with curves of drive and readout")
+        fits += map_fits(
+            lambda curve: fit_from_stated_values(likelihood, search.nominal, [curve], search.stops[0]),
+            search.curves,
+            likelihood.steps,
+        )
     converged = [fit for fit in fits if fit.chi2 < MAX_CHI2_RATIO * anchor.chi2]
     reduced = map_fits(lambda fit: prune_by_evidence(likelihood, fit), converged, likelihood.steps)
     pruned = [fewer for fewer in reduced if fewer is not None]
     if not pruned:
         return None
-    likelihood, best = refit_under_own_noise(min(pruned, key=lambda fit: fit.neg2_log_evidence))
+    best = _with_refined_curve(likelihood, min(pruned, key=lambda fit: fit.neg2_log_evidence))
+    likelihood, best = refit_under_own_noise(best)
     before = fit_model(likelihood, search.nominal.model, search.nominal.x)
     if not evidence_gain(likelihood, before, best):
         return None
     rivals = find_rival_stages(likelihood, best, search.discrepancies)
     return SelectedTerms(likelihood, before, best, {best.model.candidates[-1].key: rivals})
+
+
+def _with_refined_curve(likelihood: Likelihood, fit: Fit) -> Fit:
+    """A fit whose last term is a curve, with those parameters of all levels of its table that the recording requires.
+
+    The fit itself if the curve has no better evidence then, or if its last term is another one.
+    """
+    *others, candidate = fit.model.candidates
+    if candidate.term.effect not in REFINED_CURVES:
+        return fit
+    finer = Candidate(REFINED_CURVES[candidate.term.effect], candidate.axis, candidate.channel)
+    model = fit.model.with_candidates([*others, finer])
+    refined = fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
+    pruned = prune_by_evidence(likelihood, refined)
+    return min((each for each in (fit, pruned) if each is not None), key=lambda each: each.neg2_log_evidence)
 
 
 def _with_nonlinear_term(search: _Search, selected: SelectedTerms) -> SelectedTerms:
@@ -339,9 +379,7 @@ def _choose_beside_nonlinear_term(
     Args:
         base, with_law: fits without and with it, under ``likelihood``.
     """
-    without, beside = (linear_model(likelihood, fit, search.discrepancies) for fit in (base, with_law))
-    laws, alone = range(len(beside.laws)), without.hypothesis(range(len(without.laws))).neg2_log_evidence
-    need = need_of_laws(beside, laws, misfit(base) - misfit(with_law), alone)
+    need = need_beside(likelihood, base, with_law, search.discrepancies, misfit(base) - misfit(with_law))
     if not need.possible:
         return None
     search.progress(f"laws beside {with_law.model.candidates[-1].key}")

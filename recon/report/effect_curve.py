@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
+from estimation.candidate_terms.discrepancy import is_discrepancy
 from estimation.device_fit.fit import Fit
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.posterior import draw_parameters
@@ -55,7 +55,7 @@ def effect_curve(fit: Fit, candidate: Candidate) -> EffectCurve | None:
     The fitted motion is used for all parameter values, so the band is that of the effect alone.
     """
     term = candidate.term
-    if term.effect in DISCREPANCY_TERMS or term.hidden_state_scales:
+    if is_discrepancy(candidate) or term.hidden_state_scales:
         return None
     scales = fit.model.scales(candidate.axis)
     indices = fit.model.indices("term", candidate.key)

@@ -75,6 +75,7 @@ def bench_recording(
     delay: float = 0.0,
     delay_time_constant: float = 0.0,
     backlash: float = 0.0,
+    dead_zone: float = 0.0,
     gain_drift: float = 0.0,
     offset_drift: float = 0.0,
     hum: float = 0.0,
@@ -89,6 +90,7 @@ def bench_recording(
         delay: delay of the readout at an amplitude of 1 mrad [s]; it is proportional to the squared amplitude.
         delay_time_constant: time constant with which that delay follows the amplitude [s].
         backlash: half-width of a backlash that acts on two fifths of the signal [rad].
+        dead_zone: half-width of the angles around 0 that the readout does not show, and by which others are less [rad].
         gain_drift: relative change of the readout's gain over the recording.
         offset_drift: amplitude of a half-wave of offset over the recording [V].
         hum: amplitude at 50 Hz [V].
@@ -107,6 +109,7 @@ def bench_recording(
             angle, lambda position, value: float(np.clip(position, value - backlash, value + backlash))
         )
         angle = 0.6 * angle + 0.4 * np.array(list(follower))
+    angle = angle - np.clip(angle, -dead_zone, dead_zone)
     rng = np.random.default_rng(seed)
     noise = rng.normal(0, 2e-3, SAMPLES)
     if coloured:

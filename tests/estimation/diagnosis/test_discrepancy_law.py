@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
+from estimation.candidate_terms.discrepancy import CURVE_TERMS, DISCREPANCY_TERMS
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Likelihood, fit_model
 from estimation.device_fit.initial import flat_whiteners
@@ -13,8 +15,9 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.discrepancy_law import measured_law_table
 from scanner.device import Axis, Device
+from scanner.forward_model import DriveInput, simulate_axis
 from scanner.recording import Recording
-from scanner.stages import Mechanics, Position
+from scanner.stages import Drive, Mechanics, Position
 from scanner.terms.measured_law import beyond
 
 
@@ -36,3 +39,35 @@ def test_the_range_of_a_measured_law_contains_the_whole_motion() -> None:
     assert table["upper"] == pytest.approx([0.1, 0.1 * resonance], rel=0.02)
     quadrature = 0.1 * np.exp(-50.0 * time) * np.sin(resonance * time)
     assert beyond(table, [decay, -resonance * quadrature]) < 0.01
+
+
+def test_the_table_of_a_readout_follows_a_fold_over_signals_that_the_recording_does_not_show() -> None:
+    """Above 1.05 V the recorded signal falls; the law is one of the signal before it, which reaches 1.4 V.
+
+    The error of a straight piece of length h is at most h² max |y''| / 8.
+    """
+    rate, resonance = 1e5, 2 * np.pi * 1e3
+    mechanics, driven = Mechanics(1.0, 60.0, resonance**2), Drive("linear", 90.0 * resonance)
+    axis = Axis(mechanics, drive=driven, readout=Position(1.0, 1e-3), name="x")
+    device = Device("mirror", {"x": axis})
+    time = np.arange(8000) / rate
+    drive = (0.2 + 1.2 * time / time[-1]) * np.sin(resonance * time)
+    between = (drive + np.append(drive[1:], drive[-1])) / 2.0
+    steps = np.stack([drive[:-1], between[:-1], drive[1:]], axis=1)
+    angle = simulate_axis(axis, (), DriveInput(steps, 1.0 / rate), (0.0, 0.0)).angle
+    folded = np.sin(1.5 * angle) / 1.5
+    measured = folded + 1e-3 * np.random.default_rng(2).normal(size=time.size)
+    channels = {"drive_x": (drive, "V", rate, 0.0), "sense_x": (measured, "V", rate, 0.0)}
+    run = prepare_run(Recording.from_arrays(channels, device), device)
+    model = Model([run], device, [Candidate(CURVE_TERMS["free-readout-curve"], "x", "sense")])
+    fit = fit_model(Likelihood([run], flat_whiteners(model)), model, np.zeros(len(model.parameters)))
+    table = measured_law_table(fit)
+    assert table is not None
+    improved = Device("mirror", {"x": replace(model.nominal("x", fit.x), terms={"measured-law": table})})
+    stated = Model([run], improved, [])
+    start = [spec.kind == "start" for spec in model.parameters]
+    x = np.zeros(len(stated.parameters))
+    x[stated.indices("start")] = fit.x[start]
+    (predicted,) = stated.full_signals(x)
+    assert np.std(predicted - folded) < np.diff(table["knots"]).max() ** 2 * 1.5 / 8.0
+    assert table["upper"][0] > 1.8 * folded.max()

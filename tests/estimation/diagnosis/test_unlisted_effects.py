@@ -7,6 +7,7 @@ import pytest
 
 from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.diagnose import Diagnosis, diagnose
+from scanner.terms.measured_law import added, measured_law
 from tests.support.bench import RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES, bench_recording
 
 
@@ -72,3 +73,19 @@ def test_a_stop_on_one_side_is_unknown_in_the_mechanics() -> None:
     assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "mechanics")]
     (candidate,) = diagnosis.search.final.model.candidates
     assert len(_free_parameters(diagnosis)) < len(DISCREPANCY_TERMS[candidate.term.effect].free_parameters)
+
+
+@pytest.mark.slow
+def test_a_dead_zone_is_unknown_in_the_readout_and_the_device_has_its_kinks() -> None:
+    """A polynomial does not follow it. With other nominal values a second mode explains a part of it."""
+    half_width = 3e-4
+    diagnosis = diagnose([bench_recording(dead_zone=half_width, seed=6)])
+    assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "readout")]
+    law = diagnosis.device.axis("x").terms["measured-law"]
+    _, packed = measured_law(law)
+    signal = np.linspace(law["lower"][0], law["upper"][0], 201)
+    shown = signal + added(signal, packed)
+    steep = np.abs(signal) > 2.0 * 20.0 * half_width
+    flat = np.abs(signal) < 0.5 * 20.0 * half_width
+    slope = np.gradient(shown, signal)
+    assert np.abs(slope[flat]).max() < 0.6 < slope[steep].min()
