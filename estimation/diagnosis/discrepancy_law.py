@@ -7,10 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from estimation.candidate_terms.curves import CURVE_COLUMNS, CURVE_KNOTS, CURVE_NAMES
 from estimation.candidate_terms.discrepancy import (
-    CURVE_COLUMNS,
-    CURVE_KNOTS,
-    CURVE_NAMES,
     FORCE_DEGREE,
     FORCE_POWERS,
     GAIN_COSINES,

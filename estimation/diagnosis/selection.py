@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from estimation.candidate_terms.anchor import fit_anchor, fit_growing, follow_motion, max_residual_ratio, residual_ratio
-from estimation.candidate_terms.discrepancy import CURVE_TERMS, DISCREPANCY_TERMS, REFINED_CURVES, is_discrepancy
+from estimation.candidate_terms.curves import CURVE_TERMS
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.candidate_terms.linear_model import RivalFit
-from estimation.candidate_terms.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
 from estimation.candidate_terms.screening import all_candidates, damped_start
 from estimation.candidate_terms.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
 from estimation.device_fit.data import Run
@@ -31,6 +31,7 @@ from estimation.device_fit.interference import with_interference_line
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.clipping import clipped_readouts
+from estimation.diagnosis.discrepancy_selection import choose_discrepancy
 from estimation.diagnosis.from_stated_values import (
     fit_from_stated_values,
     fit_in_another_minimum,
@@ -43,21 +44,14 @@ from estimation.diagnosis.necessity import least_explained, need_beside
 from estimation.diagnosis.pruning import (
     drop_redundant,
     fit_to_convergence,
-    prune_by_evidence,
     refit_without,
     select_hum,
 )
-from estimation.diagnosis.rival_stages import find_rival_stages
+from estimation.diagnosis.search import Progress, Search
 from estimation.parallel import map_fits
 from scanner.device import Device
 from scanner.terms import Term
 from scanner.wording import counted
-
-Progress = Callable[[str], None]
-"""Called with one line of text at every step."""
-
-MAX_DISCREPANCY_FITS = 3
-"""Number of discrepancy terms that are fitted, those with the best evidence in the linear model. Each costs a fit."""
 
 ANCHOR_EFFECTS = (("cubic-stiffness", "quadratic-drag"), ("free-stiffness",), ("free-mechanics",))
 """Terms that are fitted in this order, on all axes, where the nominal device does not follow the motion: a frequency
@@ -112,38 +106,6 @@ class SelectionResult:
     remaining: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Search:
-    """What terms are selected from.
-
-    Attributes:
-        likelihood: under the noise that the nominal device leaves.
-        nominal: fit of the nominal device over the whole recordings.
-        early: fits of the nominal device over the windows ``stops``.
-        stops: ends of growing windows as fractions of the recordings.
-        pool: named laws and discrepancy terms on all axes and channels.
-        curves: further discrepancy terms, beside which no laws are selected.
-        progress: called with one line of text at every step.
-    """
-
-    likelihood: Likelihood
-    nominal: Fit
-    early: Sequence[Fit]
-    stops: Sequence[float]
-    pool: Sequence[Candidate]
-    curves: Sequence[Candidate]
-    progress: Progress
-
-    @property
-    def discrepancies(self) -> list[Candidate]:
-        """The discrepancy terms among the candidates."""
-        return list(filter(is_discrepancy, self.pool))
-
-    def of_effects(self, effects: Collection[str]) -> list[Candidate]:
-        """The candidates with these effects."""
-        return [candidate for candidate in self.pool if candidate.term.effect in effects]
-
-
 def select_terms(
     runs: Sequence[Run], device: Device, terms: Mapping[str, Term], progress: Progress = lambda text: None
 ) -> SelectionResult:
@@ -171,12 +133,12 @@ def select_terms(
     pool = all_candidates(nominal.model, [*named, *DISCREPANCY_TERMS.values()])
     progress(counted(len(pool), "candidate"))
     curves = all_candidates(nominal.model, CURVE_TERMS.values())
-    selected = _choose_terms(_Search(likelihood, nominal, early, stops, pool, curves, progress))
+    selected = _choose_terms(Search(likelihood, nominal, early, stops, pool, curves, progress))
     steps = tuple(_step(selected, candidate) for candidate in selected.fit.model.candidates)
     return SelectionResult(selected.likelihood, selected.nominal, selected.fit, steps, selected.need.remaining)
 
 
-def _choose_terms(search: _Search) -> SelectedTerms:
+def _choose_terms(search: Search) -> SelectedTerms:
     """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
     likelihood, nominal = search.likelihood, search.nominal
     groups = [group for effects in ANCHOR_EFFECTS if (group := search.of_effects(effects))]
@@ -200,7 +162,7 @@ def _choose_terms(search: _Search) -> SelectedTerms:
         if laws.need.certain and (laws.need.takes_bulk or not nominal_values_are_improbable(laws.fit)):
             return laws
     search.progress("discrepancy terms")
-    selected = _choose_discrepancy(search, anchor, [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])])
+    selected = choose_discrepancy(search, anchor, [fit for fit in tried if is_discrepancy(fit.model.candidates[-1])])
     if laws is not None and laws.need.certain and (selected is None or _are_needed(search, laws, selected)):
         return laws
     if selected is not None:
@@ -209,7 +171,7 @@ def _choose_terms(search: _Search) -> SelectedTerms:
     return _with_nonlinear_term(search, selected or SelectedTerms(likelihood, nominal, nominal))
 
 
-def _are_needed(search: _Search, laws: SelectedTerms, discrepancy: SelectedTerms) -> bool:
+def _are_needed(search: Search, laws: SelectedTerms, discrepancy: SelectedTerms) -> bool:
     """Whether laws are needed beside free corrections, where one of these follows the motion without them.
 
     Nominal values that have absorbed a misfit are far from those with which a correction alone explains it, which the
@@ -221,7 +183,7 @@ def _are_needed(search: _Search, laws: SelectedTerms, discrepancy: SelectedTerms
     return need_beside(likelihood, discrepancy.fit, fit, search.discrepancies, explained).certain
 
 
-def _fit_drifts_from_stated_values(search: _Search) -> list[Fit]:
+def _fit_drifts_from_stated_values(search: Search) -> list[Fit]:
     """Fits from the stated values with the drifts of ``ABSORBED_EFFECTS``; none where nominal values are probable."""
     groups = [search.of_effects(effects) for effects in ABSORBED_EFFECTS]
     if not groups[0] or not nominal_values_are_improbable(search.nominal, MAX_ABSORBED_PROBABILITY):
@@ -234,7 +196,7 @@ def _fit_drifts_from_stated_values(search: _Search) -> list[Fit]:
     return map_fits(fit, groups, search.likelihood.steps)
 
 
-def _choose_from_stated_values(search: _Search, drifting: Sequence[Fit]) -> SelectedTerms | None:
+def _choose_from_stated_values(search: Search, drifting: Sequence[Fit]) -> SelectedTerms | None:
     """Named laws around a fit from the stated values, where nominal values have absorbed a misfit.
 
     It is that with the drifts that have the best evidence or, where all drifts leave more than noise, with a law that
@@ -273,7 +235,7 @@ def _is_answer(selected: SelectedTerms) -> bool:
     return selected.need.certain and not nominal_values_are_improbable(selected.fit)
 
 
-def _choose_laws(search: _Search, anchor: Fit) -> SelectedTerms | None:
+def _choose_laws(search: Search, anchor: Fit) -> SelectedTerms | None:
     """The named laws that take the bulk of the misfit of the nominal device; None where none are significant."""
     selected = choose_laws(anchor, search.nominal, search.pool, search.progress)
     if selected is None:
@@ -284,59 +246,7 @@ def _choose_laws(search: _Search, anchor: Fit) -> SelectedTerms | None:
     return replace(selected, fit=fit, without=without)
 
 
-def _choose_discrepancy(search: _Search, anchor: Fit, fitted: Sequence[Fit]) -> SelectedTerms | None:
-    """The discrepancy term with the best evidence, with the amplitudes that the recording requires; None if none is.
-
-    Args:
-        fitted: fits of discrepancy terms that have been made.
-    """
-    likelihood, anchor = refit_under_own_noise(anchor)
-    linear = linear_model(likelihood, anchor, [*search.discrepancies, *search.curves])
-    stages = range(len(linear.discrepancies))
-    alone = {i: linear.hypothesis((), without=[j for j in stages if j != i]).neg2_log_evidence for i in stages}
-    fits = map_fits(lambda fit: fit_model(likelihood, fit.model, fit.x), fitted, likelihood.steps)
-    fits += map_fits(
-        lambda i: fit_terms(linear, likelihood, anchor, [linear.discrepancies[i]]),
-        sorted(stages, key=lambda i: alone[i])[:MAX_DISCREPANCY_FITS],
-        likelihood.steps,
-    )
-    if nominal_values_are_improbable(search.nominal):
-        search.progress("stated values, with curves of drive and readout")
-        fits += map_fits(
-            lambda curve: fit_from_stated_values(likelihood, search.nominal, [curve], search.stops[0]),
-            search.curves,
-            likelihood.steps,
-        )
-    converged = [fit for fit in fits if fit.chi2 < MAX_CHI2_RATIO * anchor.chi2]
-    reduced = map_fits(lambda fit: prune_by_evidence(likelihood, fit), converged, likelihood.steps)
-    pruned = [fewer for fewer in reduced if fewer is not None]
-    if not pruned:
-        return None
-    best = _with_refined_curve(likelihood, min(pruned, key=lambda fit: fit.neg2_log_evidence))
-    likelihood, best = refit_under_own_noise(best)
-    before = fit_model(likelihood, search.nominal.model, search.nominal.x)
-    if not evidence_gain(likelihood, before, best):
-        return None
-    rivals = find_rival_stages(likelihood, best, search.discrepancies)
-    return SelectedTerms(likelihood, before, best, {best.model.candidates[-1].key: rivals})
-
-
-def _with_refined_curve(likelihood: Likelihood, fit: Fit) -> Fit:
-    """A fit whose last term is a curve, with those parameters of all levels of its table that the recording requires.
-
-    The fit itself if the curve has no better evidence then, or if its last term is another one.
-    """
-    *others, candidate = fit.model.candidates
-    if candidate.term.effect not in REFINED_CURVES:
-        return fit
-    finer = Candidate(REFINED_CURVES[candidate.term.effect], candidate.axis, candidate.channel)
-    model = fit.model.with_candidates([*others, finer])
-    refined = fit_model(likelihood, model, model.map_parameters_from(fit.model, fit.x))
-    pruned = prune_by_evidence(likelihood, refined)
-    return min((each for each in (fit, pruned) if each is not None), key=lambda each: each.neg2_log_evidence)
-
-
-def _with_nonlinear_term(search: _Search, selected: SelectedTerms) -> SelectedTerms:
+def _with_nonlinear_term(search: Search, selected: SelectedTerms) -> SelectedTerms:
     """The selection with a law that is linear in no amplitude, as a clip level or a mode that grows, where one gains.
 
     The named laws are chosen again beside it. Where free corrections beside the selected laws have no evidence, such a
@@ -372,7 +282,7 @@ def _with_nonlinear_term(search: _Search, selected: SelectedTerms) -> SelectedTe
 
 
 def _choose_beside_nonlinear_term(
-    search: _Search, likelihood: Likelihood, base: Fit, with_law: Fit
+    search: Search, likelihood: Likelihood, base: Fit, with_law: Fit
 ) -> SelectedTerms | None:
     """A law that is linear in no amplitude and named laws beside it; None where corrections do not need it.
 

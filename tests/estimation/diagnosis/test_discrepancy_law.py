@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimation.candidate_terms.discrepancy import CURVE_TERMS, DISCREPANCY_TERMS
+from estimation.candidate_terms.curves import CURVE_TERMS
+from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
 from estimation.device_fit.data import prepare_run
 from estimation.device_fit.fit import Likelihood, fit_model
 from estimation.device_fit.initial import flat_whiteners
