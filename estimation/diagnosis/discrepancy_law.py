@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimation.candidate_terms.curves import CURVE_COLUMNS, CURVE_KNOTS, CURVE_NAMES
+from estimation.candidate_terms.curves import CURVE_COLUMNS, CURVE_KNOTS, CURVE_NAMES, CURVE_TERMS
 from estimation.candidate_terms.discrepancy import (
     FORCE_DEGREE,
     FORCE_POWERS,
@@ -63,7 +63,8 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
         largest = max(np.abs(column).max() for column in section.columns.values())
         return float(np.mean((basis(section) @ fit.x[indices] / largest) ** 2))
 
-    section = max(_sections(candidate.term.effect, scales), key=share)
+    is_curve = candidate.term.effect in CURVE_TERMS
+    section = _curve_section(fit) if is_curve else max(_sections(candidate.term.effect, scales), key=share)
     columns = basis(section)
     value = columns @ fit.x[indices]
     band = np.sqrt(
@@ -128,12 +129,6 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
                 Section(waves("g"), "gain error", "1", time, "time (s)"),
                 Section(waves("o"), "offset / rms", "1", time, "time (s)"),
             ]
-        case "free-readout-curve" | "free-drive-curve":
-            signal = 2.0 * u  # a sine reaches 1.4 standard deviations
-            table = [np.interp(signal, CURVE_KNOTS, column) for column in CURVE_COLUMNS.T]
-            curve = {"c2": signal**2, "c3": signal**3} | dict(zip(CURVE_NAMES, table, strict=True))
-            name = effect.split("-")[1]
-            return [Section(curve, f"{name} error / rms", "1", signal, f"{name} / rms")]
         case "free-timing":
             r = 0.5 * (u + 1.0)
             steady_oscillation = Section({"r2": r**2, "r4": r**4}, "delay", "s", s.amplitude * r, "amplitude (rad)")
@@ -144,6 +139,16 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
                 for i, hat in enumerate(np.eye(MAPPING_KNOTS.size))
             }
             return [Section(hats, "angle error", "rad", s.amplitude * u, "angle (rad)")]
+
+
+def _curve_section(fit: Fit) -> Section:
+    """The whole range of the signal of a curve, the last term of a fit."""
+    signal, rms = _signal_before_law(fit)
+    u = np.linspace(-1.0, 1.0, 121) * np.abs(signal - signal.mean()).max() / rms
+    table = [np.interp(u, CURVE_KNOTS, column) for column in CURVE_COLUMNS.T]
+    name = "signal" if fit.model.candidates[-1].term.stage == "readout" else "drive"
+    columns = {"c2": u**2, "c3": u**3} | dict(zip(CURVE_NAMES, table, strict=True))
+    return Section(columns, f"{name} error / rms", "1", u, f"{name} / rms")
 
 
 STATIC_PARAMETERS = {
@@ -176,11 +181,7 @@ def measured_law_table(fit: Fit) -> dict[str, Any] | None:
         variables, centre, half_width = ["angle", "rate"], [0.0, 0.0], [radius * angle, radius * rate]
     elif static:
         powers = [[1], [2], [3]] if term.effect == "free-drive" else [[2], [3]]
-        if term.stage == "readout":
-            variables, signal, rms = ["signal"], _signal_before_law(fit), scales.sense_rms
-        else:
-            run = next(run for run in model.runs if candidate.axis in run.inputs)
-            variables, signal, rms = ["voltage"], run.inputs[candidate.axis].voltage, scales.voltage_rms
+        variables, (signal, rms) = ["signal" if term.stage == "readout" else "voltage"], _signal_before_law(fit)
         factors = [1.0 / rms ** (power - 1) for (power,) in powers]
         centre, half_width = [float(signal.mean())], [float(np.abs(signal - signal.mean()).max())]
     else:
@@ -220,15 +221,20 @@ def _static_parameters(fit: Fit, names: Sequence[str]) -> tuple[Array, Array]:
     return value, covariance
 
 
-def _signal_before_law(fit: Fit) -> Array:
-    """Sense signal [V] of the first run to which the last term of a fit, a law of the readout, adds, shape (n + 1,).
+def _signal_before_law(fit: Fit) -> tuple[Array, float]:
+    """Signal of the first run to which the last term of a fit, a law of drive or readout, adds, and its rms [V].
 
-    A law that folds a signal reaches larger values of it than the recording shows.
+    A readout that folds a signal reaches larger values of it than the recording shows.
     """
     model, candidate = fit.model, fit.model.candidates[-1]
+    scales = model.scales(candidate.axis)
+    if candidate.term.stage == "drive":
+        run = next(run for run in model.runs if candidate.axis in run.inputs)
+        return run.inputs[candidate.axis].voltage, scales.voltage_rms
     without = model.with_candidates(model.candidates[:-1])
     signals = zip(model.runs[0].outputs, without.full_signals(without.map_parameters_from(model, fit.x)), strict=True)
-    return next(signal for output, signal in signals if output.kind == "sense" and candidate.axis in output.axes)
+    signal = next(each for output, each in signals if output.kind == "sense" and candidate.axis in output.axes)
+    return signal, scales.sense_rms
 
 
 def _motions(fit: Fit, axis: str) -> list[tuple[Array, Array]]:

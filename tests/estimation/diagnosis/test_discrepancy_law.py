@@ -14,12 +14,12 @@ from estimation.device_fit.fit import Likelihood, fit_model
 from estimation.device_fit.initial import flat_whiteners
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
-from estimation.diagnosis.discrepancy_law import measured_law_table
+from estimation.diagnosis.discrepancy_law import correction_curve, measured_law_table
 from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, simulate_axis
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
-from scanner.terms.measured_law import beyond
+from scanner.terms.measured_law import added, beyond, measured_law
 
 
 def test_the_range_of_a_measured_law_contains_the_whole_motion() -> None:
@@ -72,3 +72,7 @@ def test_the_table_of_a_readout_follows_a_fold_over_signals_that_the_recording_d
     (predicted,) = stated.full_signals(x)
     assert np.std(predicted - folded) < np.diff(table["knots"]).max() ** 2 * 1.5 / 8.0
     assert table["upper"][0] > 1.8 * folded.max()
+    curve = correction_curve(fit)
+    signal, error, _ = np.array(curve["points"]).T * run.scales["x"].sense_rms
+    assert np.allclose(signal[[0, -1]], np.array([table["lower"][0], table["upper"][0]]) - table["centre"][0])
+    assert np.allclose(error, added(signal + table["centre"][0], measured_law(table)[1]), atol=1e-9)
