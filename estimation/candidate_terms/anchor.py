@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimation.device_fit.fit import TIME_BLOCKS, Fit, Likelihood, fit_model
+from estimation.device_fit.fit import TIME_BLOCKS, Fit, Likelihood, fit_model, held_out_samples
 from estimation.device_fit.initial import window_schedule
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
@@ -49,8 +49,12 @@ def residual_ratio(likelihood: Likelihood, fit: Fit, stop: float = 1.0) -> float
     return float(_residual_ratios(likelihood, fit, stop).max())
 
 
-def _residual_ratios(likelihood: Likelihood, fit: Fit, stop: float) -> Array:
-    """The ratio in each part of a window, shape (parts,), in the channel where it is largest."""
+def _residual_ratios(likelihood: Likelihood, fit: Fit, stop: float, fitted: bool = False) -> Array:
+    """The ratio in each part of a window, shape (parts,), in the channel where it is largest.
+
+    Args:
+        fitted: leave out the samples that no fit uses; a part with no others has the ratio 0.
+    """
     parts = int(np.clip(round(stop / window_schedule(fit.model)[0]), 1, TIME_BLOCKS))
     largest = np.zeros(parts)
     for run, whiteners, signals in zip(
@@ -58,7 +62,11 @@ def _residual_ratios(likelihood: Likelihood, fit: Fit, stop: float) -> Array:
     ):
         for output, whitener, signal in zip(run.outputs, whiteners, signals, strict=True):
             data, noise = output.data[: signal.size], whitener.noise_variance
-            for i, rows in enumerate(np.array_split(np.arange(signal.size), parts)):
+            used = ~held_out_samples(output.data.size)[: signal.size] if fitted else np.ones(signal.size, bool)
+            for i, part in enumerate(np.array_split(np.arange(signal.size), parts)):
+                rows = part[used[part]]
+                if rows.size == 0:
+                    continue
                 if not np.all(np.abs(signal[rows]) < MAX_SIGNAL):
                     largest[i] = np.inf
                 elif (motion := float(np.var(data[rows])) - noise) > noise:
@@ -139,7 +147,7 @@ def fit_growing(
     """Fit over windows that grow as fast as the motion is followed, from one of the length ``reached`` on.
 
     Each window is as long as the fit over the one before predicts the motion. Where even the fit over such a window
-    loses it, another effect is missing, and the whole recording is fitted from there.
+    loses it in samples that it uses, another effect is missing, and the whole recording is fitted from there.
 
     Args:
         x: start, shape (p,).
@@ -151,7 +159,7 @@ def fit_growing(
         fit = fit_window(likelihood, model, x, stop, fixed)
         if stop >= 1.0:
             return fit
-        lost = stop > reached and residual_ratio(likelihood, fit, stop) > limit
+        lost = stop > reached and _residual_ratios(likelihood, fit, stop, fitted=True).max() > limit
         x, stop = fit.x, 1.0 if lost else _next_window(likelihood, fit, stop, limit)
 
 

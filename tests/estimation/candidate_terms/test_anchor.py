@@ -23,7 +23,7 @@ from scanner.integrator.abi import Nominal
 from scanner.recording import Recording
 from scanner.stages import Mechanics
 from scanner.terms import catalogue
-from tests.support.bench import DEVICE, bench_recording
+from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
 
 
 def hardening_decay() -> tuple[Device, Recording]:
@@ -84,6 +84,19 @@ def test_a_drifting_stiffness_follows_the_motion_of_a_spring() -> None:
     assert [candidate.term.effect for candidate in choice.fit.model.candidates] == ["cubic-stiffness"]
     (size,) = choice.fit.model.values(choice.fit.model.candidates[0], choice.fit.x)
     assert size == pytest.approx(20.0 * (2 * np.pi * 50.0) ** 2, rel=0.1)  # the angle's gain is known to 2 %
+
+
+@pytest.mark.slow
+def test_a_motion_that_is_lost_in_held_out_samples_alone_is_followed() -> None:
+    """The fits over the second window predict the third twentieth, which none uses, with the opposite phase."""
+    size = np.abs(bench_signals(0.0, 0.0)[1]).max()
+    run = prepare_run(bench_recording(k3=0.3 * STIFFNESS / size**2, seed=6), DEVICE)
+    nominal = Model([run], DEVICE)
+    likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
+    early = fit_progressively(likelihood, nominal, stops)
+    terms = [Candidate(catalogue()[name], "x", "sense") for name in ("cubic-stiffness", "quadratic-drag")]
+    anchor, _ = fit_anchor(likelihood, early[-1], early, stops, [terms])
+    assert residual_ratio(likelihood, anchor) < MAX_RESIDUAL_RATIO
 
 
 def test_a_nominal_device_that_follows_the_motion_is_the_anchor() -> None:
