@@ -15,6 +15,7 @@ from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, beside_imperfections, find_effect
 from estimation.diagnosis.held_drive import with_held_drives
 from estimation.diagnosis.improvement import improve
+from estimation.diagnosis.remainder_law import with_remainder_law
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
 from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
 from estimation.diagnosis.unit_check import check_units_and_signs
@@ -155,6 +156,8 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
     result = improvement.search
     corrections = find_corrections(result)
     correction = best_correction(corrections) if corrections else None
+    if correction is not None:
+        improvement = with_remainder_law(improvement, correction.candidate)
     corrected = correct_parameters(result.final, corrections) if corrections else None
     findings = map_fits(
         lambda step: find_effect(result, step, correction, corrected), result.steps, result.likelihood.steps
@@ -171,7 +174,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
         improvement.device,
         result,
         {f"{axis}.{name}": {"pull": pull} for pull, axis, name in _pulls(result.final)},
-        find_remainder(result, correction),
+        find_remainder(result, correction, improvement.has_remainder_law),
         improvement.to_json(),
         hum=describe_strong_hum(result.final),
     )

@@ -49,7 +49,7 @@ def choose_discrepancy(search: Search, anchor: Fit, fitted: Sequence[Fit]) -> Se
     pruned = [fewer for fewer in reduced if fewer is not None]
     if not pruned:
         return None
-    best = _with_refined_curve(likelihood, min(pruned, key=lambda fit: fit.neg2_log_evidence))
+    best = with_refined_curve(likelihood, min(pruned, key=lambda fit: fit.neg2_log_evidence))
     likelihood, best = refit_under_own_noise(best)
     before = fit_model(likelihood, search.nominal.model, search.nominal.x)
     if not evidence_gain(likelihood, before, best):
@@ -58,7 +58,7 @@ def choose_discrepancy(search: Search, anchor: Fit, fitted: Sequence[Fit]) -> Se
     return SelectedTerms(likelihood, before, best, {best.model.candidates[-1].key: rivals})
 
 
-def _with_refined_curve(likelihood: Likelihood, fit: Fit) -> Fit:
+def with_refined_curve(likelihood: Likelihood, fit: Fit) -> Fit:
     """A fit whose last term is a curve, with those parameters of all levels of its table that the recording requires.
 
     The fit itself if the curve has no better evidence then, or if its last term is another one.

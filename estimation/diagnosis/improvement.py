@@ -32,12 +32,14 @@ class Improvement:
         search: result of the selection without the rejected findings.
         device: the improved device, or the nominal one if its open-loop error is not larger.
         nominal, improved: open-loop errors of the nominal and of the improved device, by channel.
+        has_remainder_law: whether the device holds a measured law of what the named laws leave.
     """
 
     search: SelectionResult
     device: Device
     nominal: Mapping[str, OpenLoop]
     improved: Mapping[str, OpenLoop]
+    has_remainder_law: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``open_loop`` in diagnosis.json."""
@@ -70,7 +72,7 @@ def improve(result: SelectionResult) -> Improvement:
             if unnamed and len(result.steps) > 1:  # the device with the named laws alone
                 *_, discrepancy = result.final.model.candidates
                 options.append(improved_device(refit_without(result.likelihood, result.final, discrepancy)))
-            better = next((one for one in options if all(_is_better(run, stated, one) for run in runs)), stated)
+            better = next((one for one in options if all(predicts_no_worse(run, stated, one) for run in runs)), stated)
             return Improvement(result, better, nominal, open_loop(runs, better))
         if residual_is_noise(result.final):
             if not is_worse(nominal, improved):
@@ -99,7 +101,7 @@ def _settled(result: SelectionResult) -> SelectionResult:
     return replace(result, final=fit, steps=tuple(replace(step, after=fit) for step in result.steps))
 
 
-def _is_better(run: Run, stated: Device, device: Device) -> bool:
+def predicts_no_worse(run: Run, stated: Device, device: Device) -> bool:
     """Whether ``device`` predicts every channel of a run with an error at most that of the stated device."""
     nominal, improved = open_loop([run], stated), open_loop([run], device)
     return all(improved[name].error <= loop.error for name, loop in nominal.items())

@@ -107,14 +107,19 @@ def best_correction(corrections: LinearModel) -> ScoreTest:
     return max(tests, key=lambda test: test.predicted_gain)
 
 
-def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dict[str, Any] | None:
+def find_remainder(
+    result: SelectionResult, correction: ScoreTest | None, in_device: bool = False
+) -> dict[str, Any] | None:
     """The unexplained share of a channel's misfit, and the stage of the correction that would reduce it most.
 
     The channel is the one whose residual exceeds its noise most. Near the noise a mean square does not determine the
     share: there it is that of the correction in the fall of the whitened misfit.
 
+    Args:
+        in_device: whether the improved device holds a measured law of it.
+
     Returns:
-        ``share``, ``stage`` and ``channel``; None if nothing but noise is left.
+        ``share``, ``stage``, ``channel`` and ``in_device``; None if nothing but noise is left.
     """
     if leaves_noise_alone(result):
         return None
@@ -130,7 +135,8 @@ def find_remainder(result: SelectionResult, correction: ScoreTest | None) -> dic
         share = left / max(explained + left, 1e-300)
     if share < MIN_SHARE:
         return None
-    return {"share": share, "stage": correction.candidate.term.stage if correction else "readout", "channel": name}
+    stage = correction.candidate.term.stage if correction else "readout"
+    return {"share": share, "stage": stage, "channel": name, "in_device": in_device}
 
 
 def describe_unexplained(result: SelectionResult) -> str | None:

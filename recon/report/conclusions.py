@@ -92,7 +92,9 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
     if loops and not in_picture and all(loop["improved"] == loop["nominal"] for loop in loops):
         text += " device.toml is the nominal device: a corrected one predicts the held-out samples no better."
     elif findings or modes:
-        text += f" Use the corrected device.toml in place of the nominal one.{_describe_open_loop(content)}"
+        rest = content.get("remainder") or {}
+        law = f" It also has a measured law of the {rest['stage']}." if rest.get("in_device") else ""
+        text += f" Use the corrected device.toml in place of the nominal one.{law}{_describe_open_loop(content)}"
     if content.get("unexplained"):
         text += f" Not explained: {content['unexplained']}{_describe_remainder(content)}."
     return text + remarks

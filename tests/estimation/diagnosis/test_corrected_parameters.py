@@ -6,37 +6,10 @@ import numpy as np
 import pytest
 
 from estimation.candidate_terms.linearisation import linear_model_of_corrections
-from estimation.device_fit.data import prepare_run
-from estimation.device_fit.fit import Fit, Likelihood, fit_model
-from estimation.device_fit.initial import (
-    estimate_whiteners,
-    fit_progressively,
-    flat_whiteners,
-    window_schedule,
-)
-from estimation.device_fit.model import Model
-from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import parameter_estimates
-from scanner.recording import Recording
-from scanner.terms import catalogue
-from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
-
-LARGEST_ANGLE = float(np.abs(bench_signals(0.0, 0.0)[1]).max())
-K3 = 0.06 * STIFFNESS / LARGEST_ANGLE**2
-LAW = Candidate(catalogue()["cubic-stiffness"], "x", "sense")
-
-
-def fit_cubic_stiffness(recording: Recording) -> tuple[Likelihood, Fit]:
-    """The fit of the nominal device with a cubic stiffness, under the noise that it leaves."""
-    run = prepare_run(recording, DEVICE)
-    nominal = Model([run], DEVICE)
-    likelihood, stops = Likelihood([run], flat_whiteners(nominal)), window_schedule(nominal)
-    early = fit_progressively(likelihood, nominal, stops)[-1]
-    model = Model([run], DEVICE, [LAW], nominal.mains)
-    fit = fit_model(likelihood, model, model.map_parameters_from(early.model, early.x))
-    likelihood = Likelihood([run], estimate_whiteners(fit.model, fit.x))
-    return likelihood, fit_model(likelihood, fit.model, fit.x)
+from tests.support.bench import bench_recording
+from tests.support.cubic_spring import K3, LARGEST_ANGLE, LAW, fit_cubic_stiffness
 
 
 @pytest.mark.slow

@@ -60,6 +60,14 @@ def test_the_share_of_the_misfit_that_is_left_is_stated_with_its_stage() -> None
     assert "nominal misfit of angle_x" not in conclude_diagnosis({**content, "findings": []})
 
 
+def test_a_measured_law_of_the_remainder_is_stated() -> None:
+    rest = {"share": 0.03, "stage": "readout", "channel": "sense_x"}
+    content = {"verdict": "mismatch", "unexplained": None, "findings": [found("cubic-stiffness", 0.97)]}
+    sentence = "It also has a measured law of the readout."
+    assert sentence in conclude_diagnosis({**content, "remainder": {**rest, "in_device": True}})
+    assert sentence not in conclude_diagnosis({**content, "remainder": {**rest, "in_device": False}})
+
+
 @pytest.mark.parametrize(("share", "leads"), [(0.4, False), (0.98, True)])
 def test_a_remainder_of_more_than_half_of_the_misfit_leads_the_conclusion(share: float, leads: bool) -> None:
     rest = {"share": share, "stage": "drive", "channel": "sense_x"}
