@@ -39,6 +39,12 @@ def _curve_columns() -> list[Array]:
 CURVE_COLUMNS = np.column_stack(_curve_columns())
 """Table of a curve at ``CURVE_KNOTS`` by each of its parameters, shape (knots, parameters)."""
 
+
+def table_columns(u: Array) -> Array:
+    """Table of a curve at signals ``u`` [standard deviations] by each of its parameters, shape (n, parameters)."""
+    return np.stack([np.interp(u, CURVE_KNOTS, column) for column in CURVE_COLUMNS.T], axis=1)
+
+
 CURVE_NAMES = tuple(f"s{i}" for i in range(CURVE_COLUMNS.shape[1]))
 """Names of the parameters of the table of a curve, of the first level first."""
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from estimation.candidate_terms.curves import CURVE_COLUMNS, CURVE_KNOTS, CURVE_NAMES, CURVE_TERMS
+from estimation.candidate_terms.curves import CURVE_KNOTS, CURVE_NAMES, CURVE_TERMS, table_columns
 from estimation.candidate_terms.discrepancy import (
     FORCE_DEGREE,
     FORCE_POWERS,
@@ -145,9 +145,8 @@ def _curve_section(fit: Fit) -> Section:
     """The whole range of the signal of a curve, the last term of a fit."""
     signal, rms = _signal_before_law(fit)
     u = np.linspace(-1.0, 1.0, 121) * np.abs(signal - signal.mean()).max() / rms
-    table = [np.interp(u, CURVE_KNOTS, column) for column in CURVE_COLUMNS.T]
     name = "signal" if fit.model.candidates[-1].term.stage == "readout" else "drive"
-    columns = {"c2": u**2, "c3": u**3} | dict(zip(CURVE_NAMES, table, strict=True))
+    columns = {"c2": u**2, "c3": u**3} | dict(zip(CURVE_NAMES, table_columns(u).T, strict=True))
     return Section(columns, f"{name} error / rms", "1", u, f"{name} / rms")
 
 
@@ -200,7 +199,7 @@ def measured_law_table(fit: Fit) -> dict[str, Any] | None:
     if len(static) > n:
         reach = half_width[0] / rms
         at = np.unique([-reach, *np.clip(CURVE_KNOTS, -reach, reach), reach])
-        columns = np.stack([np.interp(at, CURVE_KNOTS, column) for column in CURVE_COLUMNS.T], axis=1)
+        columns = table_columns(at)
         variance = np.einsum("ij,jk,ik->i", columns, covariance[n:, n:], columns)
         law["knots"] = (centre[0] + rms * at).tolist()
         law["knot_values"] = (rms * columns @ value[n:]).tolist()

@@ -152,16 +152,17 @@ def correct_readout_phase(estimated: EstimatedMotion, options: Options) -> Estim
         notes += [describe_unstated_place(name, stated_event(motion, name)) for name in sorted(undetermined)]
         notes += describe_readout_phase(motion, readout_phase, contradicted | undetermined)
     clock_error = find_clock_error(sensed, motion, errors) or find_clock_error(sensed, motion, searched.errors)
-    constant = clock_error is not None and len(errors) < MIN_DRIFT_SLICES  # of few slices a constant was removed
-    if clock_error is not None and constant:
+    # Of few slices only their mean error was removed, so the clock error is still in the motion.
+    still_in_motion = clock_error is not None and len(errors) < MIN_DRIFT_SLICES
+    if clock_error is not None and still_in_motion:
         clock_error = converge_clock_error(sensed, motion, clock_error, register)
     clock = describe_clock_error(clock_error, estimated.prepared.intensity)
     settled = motion
     motion, remaining_notes = include_remaining_errors(settled, errors, beyond)
     without_readout, _ = include_remaining_errors(sensed, errors, beyond)
-    if clock_error is not None and constant:
+    if clock_error is not None and still_in_motion:
         motion = include_clock_error(motion, clock_error, set(motion.axes) - _replaced_axes(settled, motion))
-    is_left = constant or bool(remaining_notes)
+    is_left = still_in_motion or bool(remaining_notes)
     without_readout = include_contradictions(without_readout, contradictions)
     return replace(
         estimated,
