@@ -196,7 +196,7 @@ def _band(run: Run, axis: Axis) -> _Band | None:
     power = np.abs(_transform(output.sampled(voltage))) ** 2
     frequency = np.arange(power.size) / (output.data.size * output.step)
     smooth = np.convolve(power, np.ones(9) / 9, "same")
-    total = np.cumsum(power) / power.sum()
+    total = np.cumsum(power) / max(power.sum(), 1e-300)
     middle = np.median(smooth[(total > 0.05) & (total < 0.95)]) if power.sum() else 0.0
     driven = (smooth > DRIVEN_POWER * middle) & (frequency > 0.0) & (total > 0.005) & (total < 0.995)
     if np.count_nonzero(driven) < 64:

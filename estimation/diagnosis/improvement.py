@@ -13,7 +13,7 @@ from estimation.candidate_terms.significance import DETECTION_THRESHOLD, held_ou
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import Fit, fit_model, held_out_samples, misfit, time_blocks
 from estimation.device_fit.noise import sample_times
-from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
+from estimation.device_fit.open_loop import DIVERGED_ERROR, OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
@@ -193,6 +193,8 @@ def _with_fitted_offset(fit: Fit, name: str, axis: Axis) -> Axis:
     for r, (run, signals) in enumerate(zip(model.runs, model.outputs(fit.x), strict=True)):
         for output, signal in zip(run.outputs, signals, strict=True):
             index = model.index("additive", output.name, "offset", r)
+            if not np.abs(signal).max() < DIVERGED_ERROR:
+                continue  # nothing follows from a trajectory that has diverged
             if output.kind == "sense" and output.axes == (name,) and index is not None:
                 fitted = float(fit.x[index] * model.additive_terms(output)["offset"][0])
                 values.append(fitted + remaining_offset(output.data - signal, output.guard))

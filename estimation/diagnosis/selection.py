@@ -53,9 +53,13 @@ from scanner.device import Device
 from scanner.terms import Term
 from scanner.wording import counted
 
-ANCHOR_EFFECTS = (("cubic-stiffness", "quadratic-drag"), ("free-stiffness",), ("free-mechanics",))
-"""Terms that are fitted in this order, on all axes, where the nominal device does not follow the motion: a frequency
-and a damping that depend on the amplitude, a stiffness and a damping that drift, a free torque."""
+AMPLITUDE_EFFECTS = (("cubic-stiffness", "quadratic-drag"), ("gravity-stiffness", "quadratic-drag"))
+"""Terms that are fitted first, on all axes, where the nominal device does not follow the motion: a frequency and a
+damping that depend on the amplitude. A polynomial is no spring at the swings of a pendulum above a right angle."""
+
+ANCHOR_EFFECTS = (("free-stiffness",), ("free-mechanics",))
+"""Terms that are fitted in this order where these do not follow it: a stiffness and a damping that drift, a free
+torque."""
 
 ABSORBED_EFFECTS = (("resonance-drift",), ("resonance-drift", "damping-drift"))
 """Effects that nominal values absorb most easily, together on all axes: amplitude and phase of the motion follow the
@@ -141,20 +145,19 @@ def select_terms(
 def _choose_terms(search: Search) -> SelectedTerms:
     """Named laws, else a discrepancy term, else nothing; beside each a law that is linear in no amplitude."""
     likelihood, nominal = search.likelihood, search.nominal
-    groups = [group for effects in ANCHOR_EFFECTS if (group := search.of_effects(effects))]
-    # Where the first group leaves only noise, it takes a thirtieth of the time of fits from the stated values.
-    anchor, tried = fit_anchor(likelihood, nominal, search.early, search.stops, groups[:1])
-    explained = anchor is not nominal and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)
-    if not explained:
+    anchor, tried = _fit_amplitude_effects(search)
+    if not _is_explained(anchor, nominal):
         drifting = _fit_drifts_from_stated_values(search)
         other = fit_in_another_minimum(likelihood, nominal, drifting)
         if other is not None:
             return SelectedTerms(likelihood, other, other)
-        from_stated_values = _choose_from_stated_values(search, drifting)
-        if from_stated_values is not None:
-            return _with_nonlinear_term(search, from_stated_values)
+        if anchor is nominal or nominal_values_are_improbable(anchor) or _has_less_evidence(anchor, drifting):
+            from_stated_values = _choose_from_stated_values(search, drifting)
+            if from_stated_values is not None:
+                return _with_nonlinear_term(search, from_stated_values)
         if anchor is nominal:
-            anchor, others = fit_anchor(likelihood, nominal, search.early, search.stops, groups[1:])
+            groups = [group for effects in ANCHOR_EFFECTS if (group := search.of_effects(effects))]
+            anchor, others = fit_anchor(likelihood, nominal, search.early, search.stops, groups)
             tried += others
     laws = _choose_laws(search, anchor)
     if laws is not None:
@@ -169,6 +172,36 @@ def _choose_terms(search: Search) -> SelectedTerms:
         around = _choose_laws(search, selected.fit)
         selected = around if around and around.need.certain else selected
     return _with_nonlinear_term(search, selected or SelectedTerms(likelihood, nominal, nominal))
+
+
+def _fit_amplitude_effects(search: Search) -> tuple[Fit, list[Fit]]:
+    """The fit with the best evidence of those with ``AMPLITUDE_EFFECTS`` that follow the motion, and all fits made.
+
+    It is the nominal fit if that follows the motion or none of them does. They take a thirtieth of the time of fits
+    from the stated values; the second one is not made where the first leaves only noise.
+    """
+    anchor, tried = search.nominal, list[Fit]()
+    for effects in AMPLITUDE_EFFECTS:
+        group = search.of_effects(effects)
+        if {candidate.term.effect for candidate in group} != set(effects):
+            continue
+        fit, made = fit_anchor(search.likelihood, search.nominal, search.early, search.stops, [group])
+        tried += made
+        if fit is not search.nominal and (anchor is search.nominal or _has_less_evidence(anchor, [fit])):
+            anchor = fit
+        if not made or _is_explained(anchor, search.nominal):
+            break
+    return anchor, tried
+
+
+def _is_explained(anchor: Fit, nominal: Fit) -> bool:
+    """Whether a fit with other terms than the nominal one leaves only noise, with probable nominal values."""
+    return anchor is not nominal and residual_is_noise(anchor) and not nominal_values_are_improbable(anchor)
+
+
+def _has_less_evidence(fit: Fit, others: Sequence[Fit]) -> bool:
+    """Whether one of other fits has better evidence."""
+    return any(other.neg2_log_evidence < fit.neg2_log_evidence for other in others)
 
 
 def _are_needed(search: Search, laws: SelectedTerms, discrepancy: SelectedTerms) -> bool:

@@ -55,19 +55,21 @@ def test_the_offset_of_a_position_sensor_is_part_of_the_improved_device() -> Non
     assert loop["improved"]["rmse"] < 1.2 * NOISE_SD < 4 * NOISE_SD < loop["nominal"]["rmse"]
 
 
-def test_a_constant_that_slow_noise_hides_from_the_fit_is_part_of_the_offset() -> None:
+@pytest.mark.parametrize(("signal", "offset"), [(0.0, 0.02), (np.nan, 0.0), (1e200, 0.0)])
+def test_a_constant_that_slow_noise_hides_from_the_fit_is_part_of_the_offset(signal: float, offset: float) -> None:
+    """Of a trajectory that has diverged, no offset follows."""
     residual = 0.02 + 3e-3 * np.random.default_rng(4).standard_normal(4000)
     output = SimpleNamespace(name="sense_x", kind="sense", axes=("x",), data=residual, guard=(10, 10))
     model = SimpleNamespace(
         runs=[SimpleNamespace(outputs=(output,))],
-        outputs=lambda x: [[np.zeros(4000)]],
+        outputs=lambda x: [[np.full(4000, signal)]],
         index=lambda *key: 0,
         additive_terms=lambda output: {"offset": np.full(4000, 1.0)},
     )
     fit = SimpleNamespace(model=model, x=np.zeros(1))  # the fit has left the constant in the residual
     readout = _with_fitted_offset(fit, "x", STAGE).readout  # type: ignore[arg-type]
     assert isinstance(readout, Position)
-    assert readout.offset == pytest.approx(0.02, rel=0.02)
+    assert readout.offset == pytest.approx(offset, rel=0.02)
 
 
 def test_the_mean_of_a_random_walk_is_no_offset() -> None:
