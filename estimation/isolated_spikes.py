@@ -1,4 +1,8 @@
-"""Single samples of a position signal far from their neighbours: a bit that flipped, or a spark in a cable."""
+"""Samples of a position signal far from those around: a bit that flipped, a spark in a cable, or a loose contact.
+
+Single ones are spikes, which :func:`find_spikes` replaces. Up to ``MAX_RUN_SAMPLES`` in a row are drop-outs, which
+:func:`find_dropouts` marks as missing.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +32,20 @@ NEIGHBOURS = {-2: FAR_WEIGHT, -1: NEAR_WEIGHT, 1: NEAR_WEIGHT, 2: FAR_WEIGHT}
 
 REACH = 2
 
+MAX_RUN_SAMPLES = 16
+"""Samples of the longest drop-out. A coarse converter at whose steps a signal stands still for as many changes in more
+than a tenth of the samples, so that ``SCALE_QUANTILE`` contains its steps."""
+
+SCALE_QUANTILE = 0.9
+"""Quantile of the second differences that scales the limit of a drop-out. It contains steps that come every 20 samples
+or more often, and no drop-outs, of four differences each, of up to 1 in 40 samples."""
+
+NORMAL_QUANTILE = 1.6449
+"""``SCALE_QUANTILE`` of the absolute values of a normal distribution, in standard deviations."""
+
+MAX_VALUE = 1e100
+"""Largest sample that is compared with others: no sensor gives larger ones, and their differences remain finite."""
+
 
 class Spikes(NamedTuple):
     """Isolated spikes of a signal.
@@ -53,6 +71,67 @@ def find_spikes(channel: Channel) -> Spikes:
     spikes = _find_far(channel, ())
     rails = _rails(channel, spikes.at) if spikes.at.size else []
     return _find_far(channel, rails) if rails else spikes  # clipped samples have no noise
+
+
+def find_dropouts(channel: Channel) -> list[tuple[int, int]]:
+    """Runs of 2 to ``MAX_RUN_SAMPLES`` samples, (first, stop), between which and both neighbours a signal jumps.
+
+    The straight lines through the two samples before and the two after a run meet in its middle to better than the
+    mean of both jumps: those of a step or of the flyback of a raster do not. A jump is larger than ``MIN_SPIKE_SDS``
+    standard deviations of the second difference, so that noise, a sine and coarse samples have none.
+
+    Args:
+        channel: of shape (n,).
+    """
+    step = max(1, channel.size // MAX_NOISE_SAMPLES)
+    typical = [np.abs(_second_differences(values))[::step] for _, values in _overlapping(channel)]
+    known = np.concatenate([np.zeros(0), *(each[np.isfinite(each)] for each in typical)])
+    limit = MIN_SPIKE_SDS / NORMAL_QUANTILE * float(np.quantile(known, SCALE_QUANTILE)) if known.size else 0.0
+    runs = list[tuple[int, int]]()
+    for begin, values in _overlapping(channel) if limit > 0.0 else ():
+        _add_dropouts(runs, begin, values, limit)
+    return [(first, stop) for first, stop in runs if stop - first > 1]
+
+
+def _overlapping(channel: Channel) -> Iterator[tuple[int, Array]]:
+    """Successive parts of a channel, NaN beyond ``MAX_VALUE``: number of the first sample, and the samples.
+
+    A part has ``REACH`` samples more than ``READ_CHUNK_SAMPLES`` before it, and ``MAX_RUN_SAMPLES`` + ``REACH`` after.
+    """
+    for first in range(0, channel.size, READ_CHUNK_SAMPLES):
+        begin = max(first - REACH, 0)
+        values = channel.read(begin, first + READ_CHUNK_SAMPLES + MAX_RUN_SAMPLES + REACH)
+        yield begin, np.where(np.abs(values) < MAX_VALUE, values, np.nan)
+
+
+def _second_differences(values: Array) -> Array:
+    """Of each sample and the two after it, shape (n - 2,)."""
+    return np.asarray(values[:-2] - 2.0 * values[1:-1] + values[2:])
+
+
+def _add_dropouts(runs: list[tuple[int, int]], begin: int, values: Array, limit: float) -> None:
+    """Add the drop-outs that begin in a part of a signal to those before, with single samples that are like these.
+
+    Args:
+        runs: ranges (first, stop), increasing.
+        begin: number of the first sample of the part.
+        values: of the part, shape (n,).
+        limit: second difference that is a jump.
+    """
+    bends = _second_differences(values)  # of each sample and the two after it
+    large = np.abs(bends) > limit
+    into, out_of = np.flatnonzero(large) + REACH, np.flatnonzero(large)
+    for first in into[into < READ_CHUNK_SAMPLES + REACH]:
+        if runs and begin + first - REACH < runs[-1][1]:  # it would be what lies between two runs
+            continue
+        low, high = np.searchsorted(out_of, [first, first + MAX_RUN_SAMPLES])
+        lasts = out_of[low:high]
+        reach = 0.5 * (lasts - first) + 1.0  # from the next samples on either side to the middle of the run
+        before = values[first - 1] + reach * (values[first - 1] - values[first - 2])
+        after = values[lasts + 1] + reach * (values[lasts + 1] - values[lasts + 2])
+        excess = np.abs(after - before) - 0.5 * (abs(bends[first - 2]) + np.abs(bends[lasts]))
+        if (excess < 0.0).any():  # the shortest, as a longer one holds good samples between two runs
+            runs.append((int(begin + first), int(begin + lasts[np.argmax(excess < 0.0)]) + 1))
 
 
 def _pieces(channel: Channel) -> Iterator[tuple[int, Array]]:

@@ -12,7 +12,7 @@ from estimation.filters.measured_motion import MIN_BLOCKS, axis_motion_from_angl
 from estimation.filters.to_motion import BLOCK_CYCLES
 from estimation.held_samples import find_held_runs
 from estimation.initial import fit_initial_motion
-from estimation.isolated_spikes import find_spikes
+from estimation.isolated_spikes import find_dropouts, find_spikes
 from estimation.lock_in_channels import lock_in_angle
 from estimation.missing_samples import MAX_FILLED_GAP_PERIODS, Filled, fill_missing
 from estimation.reference import (
@@ -101,6 +101,8 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel, gaps_ok=True)
     channel = replace(channel, raw=channel.stored(), first=0, stop=channel.size)  # the file may be closed later
+    dropouts = find_dropouts(channel)
+    channel = _without(channel, dropouts)
     straight = fill_missing(channel, 0)
     whole = with_replaced(channel, straight.at, straight.values)
     reference = reference_of_any_waveform(recording, device, name, whole)
@@ -117,6 +119,7 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     motion = axis_motion_from_angle(angle, reference, noise_sd, clock, unknown)
     notes = [
         *_describe_held(channel, held),
+        *_describe_dropouts(channel, dropouts),
         *_describe_missing(channel, filled),
         *_describe_spikes(channel, spikes.at),
     ]
@@ -136,6 +139,26 @@ def _describe_noise(channel: Channel, gain: float, stated: float | None, found: 
     return [
         f"{channel.name}: the noise in single samples is {found * gain:.3g} {channel.unit} (1 sd), and the device file "
         f"states noise_sd = {stated * gain:.3g}; the measured noise is used"
+    ]
+
+
+def _without(channel: Channel, runs: Sequence[tuple[int, int]]) -> Channel:
+    """The channel with NaN in ``runs`` of samples (first, stop), increasing."""
+    at = np.concatenate([np.zeros(0, np.int64), *(np.arange(*run) for run in runs)])
+    return with_replaced(channel, at, np.full(at.size, np.nan))
+
+
+def _describe_dropouts(channel: Channel, runs: Sequence[tuple[int, int]]) -> list[str]:
+    """A line on short ``runs`` of samples (first, stop) that were far from those around, if there are any."""
+    if not runs:
+        return []
+    lengths = [stop - first for first, stop in runs]
+    short, long = min(lengths), max(lengths)
+    size = f"{long}" if short == long else f"{short} to {long}"
+    return [
+        f"{channel.name}: {counted(len(runs), 'run')} of {size} samples far from the samples around, the first at "
+        f"{channel.start + runs[0][0] / channel.sample_rate:.6g} s, count as missing: drop-outs; check the cable and "
+        "the converter"
     ]
 
 

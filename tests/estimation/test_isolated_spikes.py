@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimation.filters.baselines import estimate_from_sensor
-from estimation.isolated_spikes import find_spikes
+from estimation.isolated_spikes import MAX_RUN_SAMPLES, find_dropouts, find_spikes
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, make_channel
 from scanner.device import Axis, Device
 from scanner.recording import Recording
@@ -101,3 +101,77 @@ def test_the_sensor_is_as_accurate_as_it_states_in_spite_of_spikes() -> None:
     assert axis.amplitude == pytest.approx(1.0, abs=1e-3)
     (note,) = motion.notes
     assert note.startswith("sense_x: 200 single samples far from the samples around, the first at ")
+
+
+STARTS = np.sort(np.random.default_rng(3).choice(np.arange(20, TIME.size - 40, 40), 60, replace=False))
+
+
+def with_dropouts(values: np.ndarray, length: int) -> np.ndarray:
+    dropped = values.copy()
+    for start in STARTS:
+        dropped[start : start + length] = 0.0
+    return dropped
+
+
+@pytest.mark.parametrize("length", [2, 3, MAX_RUN_SAMPLES])
+def test_dropouts_are_found_where_they_are_far_from_the_signal(length: int) -> None:
+    runs = find_dropouts(channel(with_dropouts(SINE + 1e-3 * NOISE, length)))
+    far = np.minimum(np.abs(SINE[STARTS]), np.abs(SINE[STARTS + length - 1])) > 0.03
+    assert {(int(start), int(start) + length) for start in STARTS[far]} <= set(runs)
+    assert {start for start, _ in runs} <= set(STARTS.tolist())
+
+
+def test_dropouts_are_found_once_where_two_parts_of_a_long_signal_meet() -> None:
+    time = np.arange(READ_CHUNK_SAMPLES + 60) / RATE_HZ
+    values = (
+        2.0 + np.sin(2.0 * np.pi * FREQUENCY_HZ * time) + 1e-3 * np.random.default_rng(2).standard_normal(time.size)
+    )
+    starts = READ_CHUNK_SAMPLES + np.array([-22, -6, 1, 8])
+    for start in starts:
+        values[start : start + 3] = 0.0
+    assert find_dropouts(channel(values)) == [(start, start + 3) for start in starts]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        SINE,
+        SINE + 0.1 * NOISE,
+        np.round(100.0 * SINE),
+        np.round(10.0 * SINE),
+        np.round(10.0 * np.sin(2.0 * np.pi * 100.0 * TIME)),
+        np.round(10.0 * np.sin(2.0 * np.pi * 400.0 * TIME) + 0.3 * NOISE),
+        np.sin(2.0 * np.pi * 0.3 * np.arange(4_000)),
+        np.repeat(SINE[::6], 6),
+        np.repeat(SINE[::15], 15) + 1e-4 * np.resize(NOISE, 15 * SINE[::15].size),
+        (TIME * 1e3) % 1.0 + 1e-4 * NOISE,
+        np.interp(TIME * 1e3 % 1.0, [0.0, 0.995, 1.0], [0.0, 1.0, 0.0]) + 1e-2 * NOISE,
+        np.where(TIME < 0.02, 0.0, 1.0) + 1e-4 * NOISE,
+        np.convolve(np.where(TIME < 0.02, 0.0, 1.0), np.hanning(7) / 3.0, "same") + 1e-4 * NOISE,
+        np.cumsum(NOISE),
+        np.zeros(100),
+        np.full(100, np.nan),
+        np.full(100, np.inf),
+        1e300 * SINE,
+        SINE[:6],
+        SINE[:1],
+        np.clip(SINE + 1e-4 * NOISE, -0.9, 0.9),
+        np.clip(SINE[::20] + 1e-4 * NOISE[::20], -0.9, 0.9),
+        np.clip(SINE[::4] + 1e-2 * NOISE[::4], -0.7, 0.7),
+        np.where(np.arange(TIME.size) % 37 == 5, np.nan, SINE + 1e-3 * NOISE),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_other_signals_have_no_dropouts(values: np.ndarray) -> None:
+    assert find_dropouts(channel(values)) == []
+
+
+def test_the_sensor_is_as_accurate_as_it_states_in_spite_of_dropouts() -> None:
+    device = Device("lever", {"x": Axis(readout=Position(1.0, 1e-3), name="x")})
+    recording = Recording.from_arrays({"sense_x": (with_dropouts(SINE + 1e-3 * NOISE, 3), "V", RATE_HZ)}, device)
+    motion = estimate_from_sensor(recording, device)
+    axis = motion.axes["x"]
+    assert np.abs(axis.angle.read(0, TIME.size) - SINE).max() < 0.03
+    assert axis.amplitude == pytest.approx(1.0, abs=1e-3)
+    assert "runs of 3 samples far from the samples around, the first at" in motion.notes[0]
+    assert "missing samples" in motion.notes[1]
