@@ -196,7 +196,8 @@ def make_channel(
 
     Args:
         name: of the channel.
-        raw: real samples, shape (n,); (n, detectors) is accepted for names outside ``CHANNEL_UNITS``.
+        raw: real samples, shape (n,). For names outside ``CHANNEL_UNITS``, as the intensity, (n, detectors) is accepted
+            too, and so are Boolean samples, as 0 and 1.
         unit: of ``gain * raw + offset``.
         sample_rate: [Hz].
         start: time of the first sample [s].
@@ -215,6 +216,8 @@ def make_channel(
     def bad(what: str, hint: str) -> BadInput:
         return BadInput(what, file=file, channel=name, hint=hint)
 
+    if raw.dtype.kind == "b" and name not in CHANNEL_UNITS:  # a photon or none
+        raw = _zeros_and_ones(raw)
     if raw.dtype.kind not in "iuf":
         raise bad(f"holds {raw.dtype}, not real numbers", "store integers or floats")
     max_dimensions = 1 if name in CHANNEL_UNITS else 2
@@ -251,6 +254,15 @@ def make_channel(
         raise bad(f"names the detectors {', '.join(names)}", f"give {columns} different names, one for each detector")
     gain, offset = slope * factor, zero * factor
     return Channel(name, channel_unit, rate, first_time, raw, 0, raw.shape[0], gain, offset, file, names, reference)  # type: ignore[arg-type]
+
+
+def _zeros_and_ones(raw: SampleSource) -> LazySamples:
+    """Boolean samples as integers, converted when they are read."""
+
+    def fetch(first: int, stop: int) -> NDArray[Any]:
+        return raw[first:stop].astype(np.uint8)
+
+    return LazySamples(raw.shape, np.dtype(np.uint8), fetch)
 
 
 def _linear_samples(raw: SampleSource, gain: float, offset: float, level: float) -> LazySamples:

@@ -36,6 +36,22 @@ def stored(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_boolean_intensity_is_0_and_1(tmp_path: Path) -> None:
+    """The output of a photon counter's discriminator."""
+    light = np.random.default_rng(1).random((30, 2)) < 0.3
+    path = tmp_path / "rec.h5"
+    Recording.from_arrays({"intensity": (light.astype(float), "count", 1e3)}, Device.from_toml(STAGE)).write(path)
+    with h5py.File(path, "a") as file:
+        stated = dict(file["channels/intensity"].attrs)
+        del file["channels/intensity"]
+        file["channels/intensity"] = light
+        file["channels/intensity"].attrs.update(stated)
+    with Recording.open(path) as recording:
+        np.testing.assert_array_equal(recording["intensity"].read(5, 20), light[5:20].astype(float))
+        assert recording["intensity"].shape == light.shape
+        np.testing.assert_array_equal(recording.slice(0.01, 0.02)["intensity"].read(), light[10:20].astype(float))
+
+
 samples = hnp.arrays(
     st.sampled_from([np.int8, np.int16, np.uint16, np.int32, np.float32, np.float64]), st.integers(1, 40)
 )
