@@ -25,6 +25,7 @@ from recon.imaging.sample_motion.motion_check import describe_unremoved_motion
 from recon.imaging.saturation import detector_rails, sd_without_saturated
 from recon.imaging.scan_phase.image_phase import refine_motion
 from recon.imaging.scan_phase.start_shift import describe_start_shift
+from recon.imaging.wild_samples import without_wild_samples
 from recon.quality.amplitude_check import (
     amplitude_calibration,
     check_signal_units,
@@ -46,7 +47,7 @@ from recon.quality.overflow import describe_overflows
 from recon.quality.resonance_check import describe_resonance_mismatch
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs, without_contradicted_signs
-from recon.quality.structure import describe_unstructured
+from recon.quality.structure import describe_missing_structure
 from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from recon.steps.estimated_motion import EstimatedMotion
 from recon.steps.estimator_choice import choose_estimator
@@ -65,6 +66,7 @@ from recon.steps.preparation import PreparedRecording, prepare, prepare_segment
 from recon.steps.reconstruction import Options, Reconstruction
 from recon.steps.registration_segments import registration_segments
 from recon.steps.sign_after_rest import follow_signs
+from scanner.channel import Channel
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
@@ -187,7 +189,7 @@ def correct_sample_motion(estimated: EstimatedMotion, options: Options) -> Estim
     """Take the motion of the sample out of the beam's positions if it is asked for."""
     if not options.sample_motion:
         return estimated
-    intensity = estimated.prepared.intensity
+    intensity = without_wild_samples(estimated.prepared.intensity, estimated.beam, estimated.grid)
     found = measure_sample_motion(estimated.beam, intensity, estimated.grid, _unlocated(estimated))
     notes = [*estimated.motion_notes, describe_sample_motion(found, intensity.sample_rate)]
     return replace(estimated, sample_motion=found, motion_notes=notes)
@@ -214,14 +216,18 @@ def grid_scan(estimated: EstimatedMotion, options: Options) -> GriddedScan:
     return GriddedScan(estimated, picture, unlocated, affected, field_notes)
 
 
-def _describe_unremoved_motion(gridded: GriddedScan, options: Options) -> list[str]:
-    """The line on a motion of the sample that was not to be removed; none of a stack, or where the beam is wrong."""
+def _describe_unremoved_motion(gridded: GriddedScan, intensity: Channel, options: Options) -> list[str]:
+    """The line on a motion of the sample that was not to be removed; none of a stack, or where the beam is wrong.
+
+    Args:
+        gridded: the picture.
+        intensity: without wild samples.
+        options: of the user.
+    """
     estimated = gridded.estimated
     if options.sample_motion or estimated.contradictions or estimated.prepared.position_z is not None:
         return []
-    return describe_unremoved_motion(
-        estimated.beam, estimated.prepared.intensity, estimated.grid, gridded.unlocated, options.p
-    )
+    return describe_unremoved_motion(estimated.beam, intensity, estimated.grid, gridded.unlocated, options.p)
 
 
 def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Reconstruction:
@@ -232,6 +238,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
     estimate = estimate_picture(options.picture, gridded.picture, noise, beam, intensity, gridded.unlocated)
     amplitude_checks = compare_with_signal(prepared.recording, prepared.device, motion)
     samples, angles = (beam, intensity, estimated.grid, gridded.unlocated), truth.angles if truth else {}
+    tame = without_wild_samples(intensity, beam, estimated.grid)
     return Reconstruction(
         motion=motion,
         beam=beam,
@@ -261,8 +268,8 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_start_shift(prepared.uncorrected, motion, estimated.contradictions),
             *describe_centre_motion(prepared.recording, prepared.device, motion, estimated.grid, options.p),
             *estimated.clock_limits,
-            *_describe_unremoved_motion(gridded, options),
-            *(estimate.limits or describe_unstructured(gridded.picture, intensity)),
+            *_describe_unremoved_motion(gridded, tame, options),
+            *describe_missing_structure(estimate, gridded.picture, beam, intensity, tame, gridded.unlocated),
         ],
         notes=[
             *estimated.field_notes,

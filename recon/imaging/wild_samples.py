@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.special import pdtrc
 
+from recon.imaging.gridding import find_sample_pixels
+from recon.imaging.picture import Grid
 from scanner.arrays import Array
+from scanner.channel import Channel, LazySamples
+from scanner.device import AXES
+from scanner.motion import Motion
 
 MAX_CHECKED_SAMPLES = 1_000_000
 """Samples from the start of the intensity that are checked: 0.2 s at 5 MS/s. Sorting takes 0.1 s."""
@@ -58,8 +64,66 @@ def wild_limits(values: Array) -> WildLimits:
 
 
 def usable_samples(values: Array, limits: WildLimits) -> NDArray[np.bool_]:
-    """Whether each sample is finite and not wild, shape (n, detectors); arguments as :func:`find_wild_samples`."""
-    return np.isfinite(values).reshape(len(values), -1) & ~find_wild_samples(values, limits)
+    """Whether each sample is finite and within the limits, shape (n, detectors).
+
+    Wild samples with a bright one beside them are left out too: a single one determines a standard deviation.
+
+    Args:
+        values, limits: as for :func:`find_wild_samples`.
+    """
+    columns = values.reshape(len(values), -1).astype(float)
+    return np.isfinite(columns) & (columns >= limits.low) & (columns <= limits.high)
+
+
+def without_wild_samples(intensity: Channel, beam: Motion, grid: Grid) -> Channel:
+    """The intensity with NaN in the place of electric pulses, for what compares samples of one place.
+
+    Left out is what lies beyond the limits and is no point of the scene, also beside a bright sample. It is the channel
+    itself if the samples that are checked hold no wild one.
+
+    Args:
+        intensity: shape (n,) or (n, detectors).
+        beam: motion whose angles are on the intensity's clock.
+        grid: the pixels.
+    """
+    values = intensity.read(0, MAX_CHECKED_SAMPLES)
+    limits = wild_limits(values)
+    if not find_wild_in_place(values, limits, beam, grid).any():
+        return intensity
+    pulses = [np.empty((0, 2), np.int64)]
+    for first in range(0, intensity.size, MAX_CHECKED_SAMPLES):
+        values = intensity.read(first, first + MAX_CHECKED_SAMPLES).reshape(-1, limits.middle.size)
+        far = np.isfinite(values) & ~usable_samples(values, limits)
+        pulses.append(np.argwhere(far & ~_find_repeated_at(values, limits, beam, grid, first)) + np.array([first, 0]))
+    row, column = np.concatenate(pulses).T
+
+    def fetch(first: int, stop: int) -> Array:
+        part = intensity.read(first, stop)
+        low, high = np.searchsorted(row, [first, stop])
+        part.reshape(len(part), -1)[row[low:high] - first, column[low:high]] = np.nan
+        return part
+
+    samples = LazySamples(intensity.shape, np.dtype(np.float64), fetch)
+    return replace(intensity, raw=samples, first=0, stop=intensity.size, gain=1.0, offset=0.0)
+
+
+def find_wild_in_place(values: Array, limits: WildLimits, beam: Motion, grid: Grid) -> NDArray[np.bool_]:
+    """As :func:`find_wild_samples`, without points of the scene: samples near whose place others are far too.
+
+    Args:
+        values: the first samples of an intensity, shape (n,) or (n, detectors).
+        limits: of the detectors.
+        beam: motion whose angles are on the intensity's clock.
+        grid: the pixels.
+    """
+    wild = find_wild_samples(values, limits)
+    return wild & ~_find_repeated_at(values, limits, beam, grid, 0) if wild.any() else wild
+
+
+def _find_repeated_at(values: Array, limits: WildLimits, beam: Motion, grid: Grid, first: int) -> NDArray[np.bool_]:
+    """:func:`find_repeated` at the places of the samples from ``first`` on."""
+    x, y = (beam.axes[axis].angle.read(first, first + len(values)) for axis in AXES)
+    return find_repeated(values, limits, find_sample_pixels(x, y, grid), (grid.height, grid.width))
 
 
 def find_wild_samples(values: Array, limits: WildLimits) -> NDArray[np.bool_]:

@@ -4,15 +4,43 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, detector_names
+from recon.imaging.picture_kinds.picture_estimate import EstimatedPicture, picture_of_sums
+from recon.imaging.pixel_noise import measure_noise
+from recon.sample_ranges import SampleRanges
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel
+from scanner.motion import Motion
 
 MAX_FLAT_EXCESS_SD = 4.0
 """Excess of the scatter between pixels over that of noise, in its standard deviations, up to which they are alike."""
 
 MIN_MAPPED_FRACTION = 0.99
 """Fraction of the samples that lie in the pixels from which the scatter within pixels follows from that of all."""
+
+
+def describe_missing_structure(
+    estimate: EstimatedPicture,
+    means: Picture,
+    beam: Motion,
+    intensity: Channel,
+    tame: Channel,
+    unlocated: SampleRanges,
+) -> list[str]:
+    """A line for each detector whose picture shows no more than noise.
+
+    Args:
+        estimate: the picture.
+        means: picture of the means of all samples.
+        beam, intensity, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
+        tame: the intensity without electric pulses, each of which would scatter more than the scene.
+    """
+    if tame is intensity:
+        return estimate.limits or describe_unstructured(means, intensity)
+    means = grid_intensity(beam, tame, means.grid, unlocated)
+    noise = measure_noise(beam, tame, means.grid)
+    return picture_of_sums("mean", means, None, noise).limits or describe_unstructured(means, tame)
 
 
 def describe_unstructured(means: Picture, intensity: Channel) -> list[str]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from estimation.rail import upper_rail
-from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.picture import Grid, detector_names
 from recon.imaging.saturation import COUNT_UNITS, detector_rails
-from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_repeated, find_wild_samples, wild_limits
+from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, find_wild_in_place, find_wild_samples, wild_limits
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
@@ -95,7 +94,7 @@ def describe_lower_rail(intensity: Channel) -> list[str]:
     for name, column in _checked_columns(intensity):
         finite = column[np.isfinite(column)]
         rail = upper_rail(-finite) if finite.size else None
-        if rail is not None and rail[0] != 0.0:
+        if rail is not None and rail[0] != 0.0 and -rail[0] >= wild_limits(column).low[0]:
             lines.append(
                 f"{name}: {rail[1] / len(column):.2%} of the samples stand at the smallest value, {-rail[0]:.4g} "
                 f"{intensity.unit}: the signal is clipped there, and dark places appear too bright; change the offset "
@@ -125,10 +124,10 @@ def describe_wild_samples(intensity: Channel, beam: Motion | None = None, grid: 
     """
     values = intensity.read(0, MAX_CHECKED_SAMPLES)
     limits = wild_limits(values)
-    wild = find_wild_samples(values, limits)
-    if beam is not None and grid is not None and wild.any():
-        x, y = (beam.axes[axis].angle.read(0, len(values)) for axis in AXES)
-        wild &= ~find_repeated(values, limits, find_sample_pixels(x, y, grid), (grid.height, grid.width))
+    if beam is None or grid is None:
+        wild = find_wild_samples(values, limits)
+    else:
+        wild = find_wild_in_place(values, limits, beam, grid)
     lines = []
     for name, column, own in zip(_detector_names(intensity), values.reshape(len(values), -1).T, wild.T, strict=True):
         if own.any():

@@ -43,6 +43,7 @@ from recon.imaging.scan_phase.readout_phase_model import ReadoutPhase
 from recon.imaging.scan_phase.remaining_phase import include_remaining_errors
 from recon.imaging.scan_phase.searched_phase import SearchedPhase, search_phase_of
 from recon.imaging.scan_phase.slow_gain import GainPart, describe_slow_gain
+from recon.imaging.wild_samples import without_wild_samples
 from recon.quality.dropped_samples import first_late_slice, register_slices_separately
 from recon.steps.estimated_motion import EstimatedMotion
 from recon.steps.preparation import PreparedRecording
@@ -63,8 +64,10 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
     phase is kept. All this is measured without the low-pass of a slow detector, which displaces detail of different
     size by a different time; the intensity that the picture is made of has it as ``options`` want it.
     """
+    recorded, estimated = estimated.prepared, replace(estimated, prepared=_without_wild(estimated))
     phased = correct_readout_phase(estimated, options)
     if options.intensity_drift is None:
+        phased = replace(phased, prepared=recorded)
         notes = [*phased.motion_notes, *_describe_gain(phased)]
         return replace(phased, prepared=phased.prepared.for_picture(options.undo_lag), motion_notes=notes)
     drifts = _measure_drift(phased, options.intensity_drift)
@@ -72,7 +75,7 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
         without_drift = replace(estimated, prepared=_without_drift(estimated.prepared, drifts))
         phased = replace(correct_readout_phase(without_drift, options), prepared=estimated.prepared)
         drifts = _measure_drift(phased, options.intensity_drift)
-    prepared = _without_drift(estimated.prepared.for_picture(options.undo_lag), drifts)
+    prepared = _without_drift(recorded.for_picture(options.undo_lag), drifts)
     notes = [*phased.motion_notes, *describe_drift(drifts, prepared.intensity.unit)]
     return replace(phased, prepared=prepared, intensity_drift=drifts, motion_notes=notes)
 
@@ -80,6 +83,13 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
 def _measure_drift(estimated: EstimatedMotion, kind: DriftKind) -> Sequence[IntensityDrift | None]:
     """The drift of the detectors."""
     return measure_intensity_drift(estimated.beam, estimated.prepared.intensity, estimated.grid, kind)
+
+
+def _without_wild(estimated: EstimatedMotion) -> PreparedRecording:
+    """The recording whose intensity lacks electric pulses, which would hide the phase that the picture shows."""
+    prepared = estimated.prepared
+    cleaned = without_wild_samples(prepared.intensity, estimated.beam, estimated.grid)
+    return replace(prepared, recording=prepared.recording.with_channel(cleaned))
 
 
 def _without_drift(prepared: PreparedRecording, drifts: Sequence[IntensityDrift | None]) -> PreparedRecording:

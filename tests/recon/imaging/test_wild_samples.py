@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.imaging.picture import Grid
 from recon.imaging.saturation import detector_rails
-from recon.imaging.wild_samples import find_repeated, find_wild_samples, wild_limits
+from recon.imaging.wild_samples import find_repeated, find_wild_samples, wild_limits, without_wild_samples
 from recon.pipeline import reconstruct
 from recon.steps.intensity_notes import describe_wild_samples
 from recon.steps.reconstruction import Options
@@ -75,6 +76,33 @@ def test_wild_samples_are_not_taken_for_a_detector_that_was_off() -> None:
     light[: light.size // 2] = spoiled(light[: light.size // 2], 1e3 * float(light.max()))
     changed = recording.with_channel(replace(recording["intensity"], raw=light, gain=1.0, offset=0.0))
     result = reconstruct(changed, Options(pixels=(100, 100)), quiet=True)
-    assert not any("off or covered" in limit for limit in result.limits)
+    assert result.limits == reconstruct(recording, Options(pixels=(100, 100)), quiet=True).limits
     (note,) = (note for note in result.notes if "single samples" in note)
     assert 0.9 * WILD < int(note.split()[1]) <= WILD  # few lie beside the brightest places of the scene
+
+
+@pytest.mark.parametrize(("level", "number"), [(1e3, 5), (1e5, 30), (-1e4, 30)])
+def test_the_phase_and_the_structure_are_measured_without_electric_pulses(level: float, number: int) -> None:
+    recording, _ = imaging()
+    light = recording["intensity"].read()
+    at = np.random.default_rng(RNG_SEED).choice(light.size, number, replace=False)
+    light[at] = level * float(light.max())
+    changed = recording.with_channel(replace(recording["intensity"], raw=light, gain=1.0, offset=0.0))
+    clean, result = (reconstruct(each, Options(pixels=(100, 100)), quiet=True) for each in (recording, changed))
+    assert result.limits == clean.limits
+    for name, axis in clean.motion.axes.items():
+        np.testing.assert_allclose(result.motion.axes[name].phase_sd, axis.phase_sd, rtol=0.1)
+
+
+def test_what_is_left_out_of_comparisons_is_no_point_of_the_scene() -> None:
+    recording, _ = imaging()
+    beam, grid = reconstruct(recording, Options(pixels=(100, 100)), quiet=True).beam, Grid(100, 100, 0.2, 0.2)
+    light = recording["intensity"].read()
+    at = np.random.default_rng(RNG_SEED).choice(light.size, WILD, replace=False)
+    light[at] = 1e3 * float(light.max())
+    two = np.stack([light, recording["intensity"].read()], axis=1)
+    channel = replace(recording["intensity"], raw=two, gain=1.0, offset=0.0)
+    left = without_wild_samples(channel, beam, grid).read()
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(left[:, 0])), np.sort(at))
+    np.testing.assert_array_equal(left[:, 1], two[:, 1])
+    assert without_wild_samples(recording["intensity"], beam, grid) is recording["intensity"]
