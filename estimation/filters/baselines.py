@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from estimation.reference import (
     sampled_too_slowly,
     tone_frequency,
 )
+from estimation.sensor_hum import describe_hum, find_hum, without_hum
 from estimation.short_tone import fit_short_tone
 from estimation.signals import (
     intensity_clock,
@@ -84,20 +87,53 @@ def estimate_from_sensor(recording: Recording, device: Device) -> Motion:
     Raises:
         ChannelMissing: an axis has neither. BadInput: a channel cannot be used.
     """
-    found = {name: axis_motion_from_sensor(recording, device, name) for name in device.axes}
-    notes = tuple(note for _, own in found.values() for note in own)
-    return Motion({name: motion for name, (motion, _) in found.items()}, "sensor", {}, notes)
+    found = {name: _measure_axis(recording, device, name) for name in device.axes}
+    slower = min(float(np.median(axis.motion.frequency)) for axis in found.values())
+    axes, notes = {}, list[str]()
+    for name, axis in found.items():
+        hum = find_hum(recording, device.axis(name), name, axis.angle, axis.motion, slower)
+        axes[name] = axis.measure(without_hum(axis.angle, hum)) if hum else axis.motion
+        notes += [*axis.notes, *describe_hum(axis.channel, axis.gain, hum)]
+    return Motion(axes, "sensor", {}, tuple(notes))
 
 
 def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> tuple[AxisMotion, list[str]]:
-    """Motion of one axis, and a note on samples that are left out; as :func:`estimate_from_sensor`."""
+    """Motion of one axis, whose hum is kept, and notes on its samples; as :func:`estimate_from_sensor`."""
+    axis = _measure_axis(recording, device, name)
+    return axis.motion, list(axis.notes)
+
+
+class _MeasuredAxis(NamedTuple):
+    """The motion of one axis from its position signal.
+
+    Attributes:
+        motion: of the axis.
+        measure: the motion from such an angle, in place of the own one.
+        angle: that was measured [rad].
+        channel, gain: from which it was computed, and its unit per rad.
+        notes: on samples that were replaced or left out, a line each.
+    """
+
+    motion: AxisMotion
+    measure: Callable[[Channel], AxisMotion]
+    angle: Channel
+    channel: Channel
+    gain: float = 1.0
+    notes: Sequence[str] = ()
+
+
+def _measure_axis(recording: Recording, device: Device, name: str) -> _MeasuredAxis:
+    """Motion of one axis; as :func:`estimate_from_sensor`."""
     measured = any(f"{kind}_{name}" in recording for kind in ("sense", "angle"))
     if f"amplitude_{name}" in recording and "intensity" in recording and not measured:
         light = recording["intensity"]
         values = lock_in_angle(recording, device.axis(name), light.time())
         angle = make_channel(f"phase_{name}", values, unit="rad", sample_rate=light.sample_rate, start=light.start)
         reference = reference_of_any_waveform(recording, device, name, angle)
-        return axis_motion_from_angle(angle, reference, None, intensity_clock(recording, angle)), []
+        measure = partial(
+            axis_motion_from_angle, reference=reference, noise_sd=None, clock=intensity_clock(recording, angle)
+        )
+        return _MeasuredAxis(measure(angle), measure, angle, angle)
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel, gaps_ok=True)
     channel = replace(channel, raw=channel.stored(), first=0, stop=channel.size)  # the file may be closed later
@@ -116,14 +152,16 @@ def axis_motion_from_sensor(recording: Recording, device: Device, name: str) -> 
     angle = replace(repaired, unit="rad", gain=repaired.gain / scale, offset=(repaired.offset - zero) / scale)
     held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
     clock, unknown = intensity_clock(recording, channel), sorted([*held, *filled.left_out])
-    motion = axis_motion_from_angle(angle, reference, noise_sd, clock, unknown)
+    measure = partial(axis_motion_from_angle, reference=reference, noise_sd=noise_sd, clock=clock, held=unknown)
+    motion = measure(angle)
     notes = [
         *_describe_held(channel, held),
         *_describe_dropouts(channel, dropouts),
         *_describe_missing(channel, filled),
         *_describe_spikes(channel, spikes.at),
+        *_describe_noise(channel, abs(scale), noise_sd, motion.angle_noise_sd),
     ]
-    return motion, [*notes, *_describe_noise(channel, abs(scale), noise_sd, motion.angle_noise_sd)]
+    return _MeasuredAxis(motion, measure, angle, channel, scale, notes)
 
 
 def _describe_noise(channel: Channel, gain: float, stated: float | None, found: float) -> list[str]:

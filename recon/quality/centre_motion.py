@@ -6,6 +6,7 @@ from math import sqrt
 
 import numpy as np
 
+from estimation.sensor_hum import MIN_CENTRES, mean_window, means_over_periods
 from estimation.signals import white_noise_sd
 from estimation.tracker.track import MIN_RELATIVE_FREQUENCY
 from recon.imaging.picture import Grid
@@ -16,10 +17,6 @@ from scanner.recording import Recording
 
 MAX_READ_SAMPLES = 1 << 22
 """Samples from the start in which the centre is measured: 32 MB of doubles, and 0.8 s at 5 MS/s."""
-
-MIN_CENTRES = 8
-"""Fewest values of the centre from which its motion is stated."""
-
 
 MIN_BEATS = 10.0
 """Beats of the frequencies of both axes, and periods of the other axis, in a block in which crosstalk is measured: the
@@ -121,31 +118,11 @@ def _undriven_centre(
     if frequency < MIN_RELATIVE_FREQUENCY * axis.resonance:  # the drive moves it slowly
         return nothing
     rate, values = track.angle.sample_rate, _angles(motion, name) - factor * _angles(motion, _other(name))
-    time, centre = _centres(values, rate, track.angle.start, frequency)
+    time, centre = means_over_periods(values, rate, track.angle.start, frequency)
     if axis.drive.kind == "linear":
-        volts = _centres(drive.read(0, MAX_READ_SAMPLES), drive.sample_rate, drive.start, frequency)
+        volts = means_over_periods(drive.read(0, MAX_READ_SAMPLES), drive.sample_rate, drive.start, frequency)
         if axis.drive.torque_per_volt is None or volts[1].size < MIN_CENTRES:
             return nothing
         centre -= axis.drive.torque_per_volt / axis.mechanics.k * np.interp(time, *volts)
     known = np.isfinite(centre)
-    return time[known], centre[known], white_noise_sd(values) * float(np.linalg.norm(_window(rate, frequency)))
-
-
-def _centres(values: Array, rate: float, start: float, frequency: float) -> tuple[Array, Array]:
-    """Times [s] and means of an oscillation without its period, one value a period.
-
-    Each is weighted by a Hann window of two periods, which cancels a sine of the period and its harmonics, also where
-    the amplitude changes.
-    """
-    window = _window(rate, frequency)
-    length = window.size // 2
-    finite = np.where(np.isfinite(values), values, np.nan)
-    periods = finite[: values.size // length * length].reshape(-1, length)
-    means = np.asarray(periods[:-1] @ window[:length] + periods[1:] @ window[length:], np.float64)
-    return np.asarray(start + np.arange(1, means.size + 1) * length / rate, np.float64), means
-
-
-def _window(rate: float, frequency: float) -> Array:
-    """A Hann window of two periods, of sum 1."""
-    length = max(2, round(rate / frequency))
-    return np.asarray(np.hanning(2 * length + 1)[:-1] / length, np.float64)
+    return time[known], centre[known], white_noise_sd(values) * float(np.linalg.norm(mean_window(rate, frequency)))

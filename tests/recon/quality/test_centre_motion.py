@@ -21,10 +21,10 @@ DEVICE = Device.from_toml(new_device("electromagnetic", {"x": KnownAxis(2000.0),
 
 
 def scan(
-    hum_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5,
+    drift_rad: float = 0.0, slow_drive: float = 0.0, noise_rad: float = 1e-5,
     crosstalk: tuple[float, float] = (0.0, 0.0), device: Device = DEVICE,
 ) -> list[str]:  # fmt: skip
-    """Limits of a scan from rest, of amplitudes that fill the field; hum in the sensor and a slow drive are in x.
+    """Limits of a scan from rest, of amplitudes that fill the field; drift of the sensor and a slow drive are in x.
 
     The sensors of x and y hold ``crosstalk`` times the other angle.
     """
@@ -45,9 +45,9 @@ def scan(
         system = cont2discrete(([1 / m.J], [1, m.b / m.J, m.k / m.J]), 1 / RATE_HZ)
         angle = lfilter(system[0].ravel(), system[1], torque * volts)
         angles.append(angle / half_angle)
-        hum = hum_rad * np.sin(2 * np.pi * 50.0 * TIME_S) if name == "x" else 0.0
+        drift = drift_rad * np.sqrt(1.5) * np.linspace(-1.0, 1.0, TIME_S.size) if name == "x" else 0.0
         noise = rng.normal(0.0, noise_rad, TIME_S.size)
-        channels |= {f"drive_{name}": (volts, "V", RATE_HZ), f"angle_{name}": (angle + hum + noise, "rad", RATE_HZ)}
+        channels |= {f"drive_{name}": (volts, "V", RATE_HZ), f"angle_{name}": (angle + drift + noise, "rad", RATE_HZ)}
     x, y = angles
     for name, other, factor, half_angle in (
         ("x", y, crosstalk[0], DEVICE.scan.half_angle_y),
@@ -60,11 +60,11 @@ def scan(
     return reconstruct(recording, Options(estimator="sensor", pixels=(80, 80), allow_outside=True), quiet=True).limits
 
 
-def test_hum_in_a_position_signal_is_stated_with_its_size() -> None:
+def test_a_drift_of_a_position_signal_is_stated_with_its_size() -> None:
     assert DEVICE.scan is not None
-    hum = 3.0 * 2.0 * DEVICE.scan.half_angle_x / 80  # three pixels
-    (line,) = (line for line in scan(hum_rad=hum) if "centre" in line)
-    assert line.startswith("x: the centre of the motion moves by ±3 pixels, most at 50")
+    drift = 3.0 * 2.0 * DEVICE.scan.half_angle_x / 80  # three pixels
+    (line,) = (line for line in scan(drift_rad=drift) if "centre" in line)
+    assert line.startswith("x: the centre of the motion moves by ±3 pixels, most at 10")
 
 
 @pytest.mark.parametrize(("crosstalk", "name"), [((0.05, 0.0), "x"), ((0.0, -0.05), "y")])
@@ -83,11 +83,11 @@ def test_crosstalk_that_the_device_states_is_subtracted() -> None:
     assert not any("follows" in line for line in scan(crosstalk=(0.05, 0.0), device=stated))
 
 
-def test_crosstalk_and_hum_are_stated_both() -> None:
+def test_crosstalk_and_a_drift_are_stated_both() -> None:
     assert DEVICE.scan is not None
-    hum = 3.0 * 2.0 * DEVICE.scan.half_angle_x / 80
-    lines = [line for line in scan(hum_rad=hum, crosstalk=(0.05, 0.0)) if "centre" in line or "follows" in line]
-    assert [("follows" in line, "most at 50" in line) for line in lines] == [(True, False), (False, True)]
+    drift = 3.0 * 2.0 * DEVICE.scan.half_angle_x / 80
+    lines = [line for line in scan(drift_rad=drift, crosstalk=(0.05, 0.0)) if "centre" in line or "follows" in line]
+    assert [("follows" in line, "most at 10" in line) for line in lines] == [(True, False), (False, True)]
 
 
 @pytest.mark.parametrize("change", [{}, {"slow_drive": 0.3}, {"noise_rad": 5e-3}])
