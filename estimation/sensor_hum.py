@@ -75,8 +75,8 @@ class Line(NamedTuple):
         return np.asarray(self.cosine * np.cos(phase) + self.sine * np.sin(phase))
 
 
-class HumBlock(NamedTuple):
-    """Begin and end of a part of a recording [s], and the lines of the hum in it."""
+class LineBlock(NamedTuple):
+    """Begin and end of a part of a recording [s], and the lines in it."""
 
     begin: float
     end: float
@@ -85,7 +85,7 @@ class HumBlock(NamedTuple):
 
 def find_hum(
     recording: Recording, axis: Axis, name: str, angle: Channel, motion: AxisMotion, slower: float
-) -> list[HumBlock]:
+) -> list[LineBlock]:
     """The hum in the position signal of an axis, in consecutive blocks; empty if there is none.
 
     Without a recorded drive and the mechanics of the device, the slow part of the torque is not known, and none is
@@ -107,7 +107,7 @@ def find_hum(
         time, centre = _undriven_centre(recording, axis, name, angle, (first, stop), frequency)
         lines = find_lines(time, centre, MAX_RELATIVE_FREQUENCY * slower, change)
         begin, end = (angle.start + at / rate for at in (first, stop))
-        blocks.append(HumBlock(begin, end, tuple(_before_mean(line, rate, frequency) for line in lines)))
+        blocks.append(LineBlock(begin, end, tuple(_before_mean(line, rate, frequency) for line in lines)))
     return blocks if any(block.lines for block in blocks) else []
 
 
@@ -133,21 +133,26 @@ def _passed_change(motion: AxisMotion) -> float:
     return MAX_PASSED_CHANGE * float(np.sqrt(2.0) * np.std(phasors)) if phasors.size > 1 else np.inf
 
 
-def without_hum(angle: Channel, hum: Sequence[HumBlock]) -> Channel:
+def without_hum(angle: Channel, hum: Sequence[LineBlock]) -> Channel:
     """The position signal [rad] less its hum, which is subtracted as the samples are read."""
 
     def fetch(first: int, stop: int) -> Array:
-        values, time = angle.read(first, stop), angle.time(first, stop)
-        for block in hum:
-            low, high = np.searchsorted(time, [block.begin, block.end])
-            for line in block.lines:
-                values[low:high] -= line.at(time[low:high])
-        return values
+        return angle.read(first, stop) - sum_of_lines(hum, angle.time(first, stop))
 
     return with_samples(angle, LazySamples((angle.size,), np.dtype(np.float64), fetch))
 
 
-def describe_hum(channel: Channel, gain: float, hum: Sequence[HumBlock]) -> list[str]:
+def sum_of_lines(blocks: Sequence[LineBlock], time: Array) -> Array:
+    """The lines of the blocks at increasing times [s], shape (n,)."""
+    values = np.zeros(time.size)
+    for block in blocks:
+        low, high = np.searchsorted(time, [block.begin, block.end])
+        for line in block.lines if low < high else ():
+            values[low:high] += line.at(time[low:high])
+    return values
+
+
+def describe_hum(channel: Channel, gain: float, hum: Sequence[LineBlock]) -> list[str]:
     """A line on the hum that was subtracted.
 
     Args:

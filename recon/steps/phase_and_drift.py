@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from estimation.sensor_hum import LineBlock
+from recon.imaging.flicker import describe_flicker, find_flicker, without_flicker
 from recon.imaging.intensity_correction import (
     correct_drift,
     describe_drift,
@@ -65,11 +67,13 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
     size by a different time; the intensity that the picture is made of has it as ``options`` want it.
     """
     recorded, estimated = estimated.prepared, replace(estimated, prepared=_without_wild(estimated))
-    phased = correct_readout_phase(estimated, options)
     if options.intensity_drift is None:
+        flicker = find_flicker(estimated.beam, estimated.prepared.intensity, estimated.grid)
+        phased = correct_readout_phase(replace(estimated, prepared=_without_flicker(estimated, flicker)), options)
         phased = replace(phased, prepared=recorded)
-        notes = [*phased.motion_notes, *_describe_gain(phased)]
+        notes = [*phased.motion_notes, *(describe_flicker(flicker) or _describe_gain(phased))]
         return replace(phased, prepared=phased.prepared.for_picture(options.undo_lag), motion_notes=notes)
+    phased = correct_readout_phase(estimated, options)
     drifts = _measure_drift(phased, options.intensity_drift)
     if exceeds_uncertainty(drifts):
         without_drift = replace(estimated, prepared=_without_drift(estimated.prepared, drifts))
@@ -90,6 +94,12 @@ def _without_wild(estimated: EstimatedMotion) -> PreparedRecording:
     prepared = estimated.prepared
     cleaned = without_wild_samples(prepared.intensity, estimated.beam, estimated.grid)
     return replace(prepared, recording=prepared.recording.with_channel(cleaned))
+
+
+def _without_flicker(estimated: EstimatedMotion, flicker: Sequence[LineBlock]) -> PreparedRecording:
+    """The recording whose intensity does not flicker."""
+    prepared = estimated.prepared
+    return replace(prepared, recording=prepared.recording.with_channel(without_flicker(prepared.intensity, flicker)))
 
 
 def _without_drift(prepared: PreparedRecording, drifts: Sequence[IntensityDrift | None]) -> PreparedRecording:
