@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from scanner.arrays import Array
+from scanner.arrays import Array, Index
 
 NOISE_BEND_RATIOS = 10.0 ** np.arange(-8.0, 9.0, 2.0)
 """Variances of the noise over that of the bends that are compared: from a curve through every knot to one that is
@@ -37,15 +37,26 @@ def smooth_knots(time: Array, phase: Array) -> Array:
     """
     if time.size < MIN_KNOTS:
         return phase
-    differences = np.abs(np.diff(phase, n=3))
-    difference_sd = float(np.median(differences)) / NORMAL_MEDIAN
+    jumps, difference_sd = find_jumps(phase)
     if not difference_sd > 0.0:
         return phase
     noise = difference_sd / np.sqrt(20.0)
-    jumps = 2 + np.flatnonzero(differences > MIN_JUMP_SDS * difference_sd)
     bounds = [0, *jumps.tolist(), time.size]
     parts = [slice(first, stop) for first, stop in pairwise(bounds)]
     return np.concatenate([_smooth_part(time[part], phase[part] / noise) * noise for part in parts])
+
+
+def find_jumps(phase: Array) -> tuple[Index, float]:
+    """Numbers of the knots before which the phase or the frequency may jump, and the sd of the third differences.
+
+    A jump is large in three of them.
+
+    Args:
+        phase: at the knots, shape (n,) [rad].
+    """
+    differences = np.abs(np.diff(phase, n=3))
+    sd = float(np.median(differences)) / NORMAL_MEDIAN if differences.size else 0.0
+    return 2 + np.flatnonzero(differences > MIN_JUMP_SDS * sd), sd
 
 
 def _smooth_part(time: Array, value: Array) -> Array:

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimation.knot_smoother import find_jumps
 from estimation.reference import PhaseReference
 from estimation.tracker.demodulation import Projections, project_blocks, residual_variance
 from scanner.arrays import Array, Index
@@ -45,8 +46,9 @@ def find_switch_times(
 ) -> Array:
     """Times at which a drive switched, at most one a block, shape (switches,) [s].
 
-    Searched in blocks whose residual variance is high, and in those half a block earlier and later: of a switch between
-    two blocks the reference alone is wrong in either. The drive of the preceding block and the drive of the next one
+    Searched in blocks whose residual variance is high, in those at which the reference jumps, and in those half a block
+    earlier and later: of a switch between two blocks the reference alone is wrong in either, which noise hides. The
+    drive of the preceding block and the drive of the next one
     are continued through the block; the switch is where the first followed by the second has the least squared
     residuals. It is accepted if these are below MAX_RESIDUAL_RATIO of those without a switch.
 
@@ -57,7 +59,9 @@ def find_switch_times(
     """
     variance, found = residual_variance(fitted), []
     min_power = MIN_SWITCH_VARIANCE_RATIO * float(fitted.squares.max()) / length
-    for k in np.flatnonzero(variance > max(SWITCH_VARIANCE_RATIO * float(np.nanmedian(variance)), min_power)):
+    searched_blocks = variance > max(SWITCH_VARIANCE_RATIO * float(np.nanmedian(variance)), min_power)
+    searched_blocks[_blocks_of_jumps(channel, reference, starts)] = True
+    for k in np.flatnonzero(searched_blocks):
         if 0 < k < starts.size - 1:
             windows = [int(starts[k]) + shift for shift in (-length // 2, 0, length // 2)]
             searched = [_find_switch(channel, reference, first, length, orders, square, min_power) for first in windows]
@@ -65,6 +69,13 @@ def find_switch_times(
             if ratio < MAX_RESIDUAL_RATIO:
                 found.append((ratio, time))
     return _distinct_times(found, length / channel.sample_rate)
+
+
+def _blocks_of_jumps(channel: Channel, reference: PhaseReference, starts: Index) -> Index:
+    """Numbers of the blocks at which the phase of the reference jumps between two knots."""
+    jumps, _ = find_jumps(reference.slow)
+    sample = (reference.knots[jumps] - channel.start) * channel.sample_rate
+    return np.unique(np.clip(np.searchsorted(starts, sample, side="right") - 1, 0, starts.size - 1))
 
 
 def _distinct_times(found: Sequence[tuple[float, float]], width: float) -> Array:

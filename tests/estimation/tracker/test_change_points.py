@@ -53,18 +53,21 @@ def test_reference_has_the_frequency_step_and_phase_jump_of_the_drive() -> None:
     assert np.allclose(slow, np.where(time < 0.00997, 0.0, 1.0 + 30.0 * (time - 0.01)), atol=1e-6)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.06])
 @pytest.mark.parametrize("at", [0.0155, 0.0158, 0.016, 0.017])
-def test_a_phase_jump_is_found_within_and_between_blocks(at: float) -> None:
+def test_a_phase_jump_is_found_within_and_between_blocks(at: float, noise: float) -> None:
     rate, width = 1e6, 1e-3
     time = np.arange(40_000) / rate
     volts = np.sin(2 * np.pi * 2000.0 * time + (time >= at))
+    volts += noise * np.random.default_rng(7).standard_normal(time.size)
     drive = make_channel("drive_x", volts, unit="V", sample_rate=rate)
     axis = linear_device().axis("x")
     law = axis_parameters(axis, axis.require_readout())
     found = demodulate_drive(drive, drive_reference(drive, "drive"), width * (np.arange(40) + 0.5), width, law)
-    assert np.abs(found.switches - at).min() < 2e-6
+    nearest = 2e-6 + 2e-4 * noise
+    assert np.abs(found.switches - at).min() < nearest
     error = found.reference.phase(time) - 2 * np.pi * 2000.0 * time - (time >= at)
-    assert np.abs(error[np.abs(time - at) > 2e-6]).max() < 1e-3
+    assert np.abs(error[np.abs(time - at) > nearest]).max() < 1e-3 + 0.3 * noise
 
 
 def test_block_with_a_switch_uses_the_piece_with_its_middle() -> None:
