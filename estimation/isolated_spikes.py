@@ -84,7 +84,7 @@ def find_dropouts(channel: Channel) -> list[tuple[int, int]]:
         channel: of shape (n,).
     """
     step = max(1, channel.size // MAX_NOISE_SAMPLES)
-    typical = [np.abs(_second_differences(values))[::step] for _, values in _overlapping(channel)]
+    typical = (np.abs(_second_differences(values))[::step] for _, values in _overlapping(channel))
     known = np.concatenate([np.zeros(0), *(each[np.isfinite(each)] for each in typical)])
     limit = MIN_SPIKE_SDS / NORMAL_QUANTILE * float(np.quantile(known, SCALE_QUANTILE)) if known.size else 0.0
     runs = list[tuple[int, int]]()
