@@ -238,7 +238,7 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
     estimate = estimate_picture(options.picture, gridded.picture, noise, beam, intensity, gridded.unlocated)
     amplitude_checks = compare_with_signal(prepared.recording, prepared.device, motion)
     samples, angles = (beam, intensity, estimated.grid, gridded.unlocated), truth.angles if truth else {}
-    tame = without_wild_samples(intensity, beam, estimated.grid)
+    cleaned = without_wild_samples(intensity, beam, estimated.grid)
     return Reconstruction(
         motion=motion,
         beam=beam,
@@ -268,8 +268,8 @@ def assess(gridded: GriddedScan, options: Options, truth: Truth | None) -> Recon
             *describe_start_shift(prepared.uncorrected, motion, estimated.contradictions),
             *describe_centre_motion(prepared.recording, prepared.device, motion, estimated.grid, options.p),
             *estimated.clock_limits,
-            *_describe_unremoved_motion(gridded, tame, options),
-            *describe_missing_structure(estimate, gridded.picture, beam, intensity, tame, gridded.unlocated),
+            *_describe_unremoved_motion(gridded, cleaned, options),
+            *describe_missing_structure(estimate, gridded.picture, beam, intensity, cleaned, gridded.unlocated),
         ],
         notes=[
             *estimated.field_notes,

@@ -25,7 +25,7 @@ def describe_missing_structure(
     means: Picture,
     beam: Motion,
     intensity: Channel,
-    tame: Channel,
+    cleaned: Channel,
     unlocated: SampleRanges,
 ) -> list[str]:
     """A line for each detector whose picture shows no more than noise.
@@ -34,13 +34,13 @@ def describe_missing_structure(
         estimate: the picture.
         means: picture of the means of all samples.
         beam, intensity, unlocated: as for :func:`recon.imaging.intensity_gridding.grid_intensity`.
-        tame: the intensity without electric pulses, each of which would scatter more than the scene.
+        cleaned: the intensity without electric pulses, each of which would scatter more than the scene.
     """
-    if tame is intensity:
+    if cleaned is intensity:
         return estimate.limits or describe_unstructured(means, intensity)
-    means = grid_intensity(beam, tame, means.grid, unlocated)
-    noise = measure_noise(beam, tame, means.grid)
-    return picture_of_sums("mean", means, None, noise).limits or describe_unstructured(means, tame)
+    means = grid_intensity(beam, cleaned, means.grid, unlocated)
+    noise = measure_noise(beam, cleaned, means.grid)
+    return picture_of_sums("mean", means, None, noise).limits or describe_unstructured(means, cleaned)
 
 
 def describe_unstructured(means: Picture, intensity: Channel) -> list[str]:
