@@ -101,7 +101,7 @@ def find_hum(
     if not _is_drive_known(recording, axis, name, motion):
         return []
     frequency, rate, change = float(np.median(motion.frequency)), angle.sample_rate, _passed_change(motion)
-    edges = np.linspace(0, angle.size, max(1, round(angle.size / (BLOCK_S * rate))) + 1).astype(np.int64).tolist()
+    edges = part_edges(angle, 1.0 / frequency)
     blocks = []
     for first, stop in pairwise(edges):
         time, centre = _undriven_centre(recording, axis, name, angle, (first, stop), frequency)
@@ -109,6 +109,17 @@ def find_hum(
         begin, end = (angle.start + at / rate for at in (first, stop))
         blocks.append(LineBlock(begin, end, tuple(_before_mean(line, rate, frequency) for line in lines)))
     return blocks if any(block.lines for block in blocks) else []
+
+
+def part_edges(channel: Channel, mean_s: float) -> list[int]:
+    """Numbers of the first samples of parts of about ``BLOCK_S``, and of the sample after the last part.
+
+    Args:
+        channel: of any shape.
+        mean_s: time of a mean [s]; a part is long enough for ``MIN_CENTRES`` of them.
+    """
+    length = channel.sample_rate * max(BLOCK_S, (MIN_CENTRES + 1) * mean_s)
+    return [int(edge) for edge in np.linspace(0, channel.size, max(1, round(channel.size / length)) + 1)]
 
 
 def find_slow_lines(motion: AxisMotion, slower: float) -> list[Line]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.isolated_spikes import MAX_VALUE
-from estimation.sensor_hum import BLOCK_S, Line, LineBlock, find_lines, sum_of_lines
+from estimation.sensor_hum import Line, LineBlock, find_lines, part_edges, sum_of_lines
 from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
@@ -52,11 +52,14 @@ def find_flicker(beam: Motion, intensity: Channel, grid: Grid) -> list[LineBlock
         intensity: shape (n,) or (n, detectors); detectors are averaged.
         grid: whose field is used.
     """
-    parts = max(1, round(intensity.size / (BLOCK_S * intensity.sample_rate)))
-    edges = np.linspace(0, intensity.size, parts + 1).astype(np.int64).tolist()
+    slower = min(float(np.median(axis.frequency)) for axis in beam.axes.values())
+    if not slower > 0.0:
+        return []
+    length = max(round(intensity.sample_rate / (BLOCKS_PER_PERIOD * slower)), 1)
+    edges = part_edges(intensity, length / intensity.sample_rate)
     found = list[LineBlock]()
     for first, stop in pairwise(edges):
-        lines = _lines_of_part(beam, intensity, grid, first, stop)
+        lines = _lines_of_part(beam, intensity, grid, (first, stop), length, MAX_RELATIVE_FREQUENCY * slower)
         if not found and not lines:
             return []
         begin, end = (intensity.start + at / intensity.sample_rate for at in (first, stop))
@@ -64,10 +67,18 @@ def find_flicker(beam: Motion, intensity: Channel, grid: Grid) -> list[LineBlock
     return found
 
 
-def _lines_of_part(beam: Motion, intensity: Channel, grid: Grid, first: int, stop: int) -> list[Line]:
-    """Lines in the gain of the samples ``first`` up to ``stop``, the largest first."""
-    slower = min(float(np.median(axis.frequency)) for axis in beam.axes.values())
-    length = max(round(intensity.sample_rate / (BLOCKS_PER_PERIOD * slower)), 1)
+def _lines_of_part(
+    beam: Motion, intensity: Channel, grid: Grid, part: tuple[int, int], length: int, highest: float
+) -> list[Line]:
+    """Lines in the gain of a part of the samples, the largest first.
+
+    Args:
+        beam, intensity, grid: as for :func:`find_flicker`.
+        part: range of the samples (first, stop).
+        length: samples of a block.
+        highest: frequency of a line at most [Hz].
+    """
+    first, stop = part
     across = max(int(sqrt((stop - first) / SAMPLES_PER_CELL)), 1)
     cells = replace(grid, width=min(across, grid.width), height=min(across, grid.height))
     x, y = (beam.axes[axis].angle.read(first, stop) for axis in AXES)
@@ -79,7 +90,7 @@ def _lines_of_part(beam: Motion, intensity: Channel, grid: Grid, first: int, sto
     middle = first + (np.arange(gain.size) + 0.5) * length
     time = np.asarray(intensity.start + middle / intensity.sample_rate, np.float64)
     time, gain = time[np.isfinite(gain)], gain[np.isfinite(gain)]
-    lines = find_lines(time, gain, MAX_RELATIVE_FREQUENCY * slower, MIN_AMPLITUDE)
+    lines = find_lines(time, gain, highest, MIN_AMPLITUDE)
     steady = float(np.mean(gain - sum(line.at(time) for line in lines))) if lines else 1.0  # of cycles that are cut
     return [Line(line.frequency, line.cosine / steady, line.sine / steady) for line in lines]
 

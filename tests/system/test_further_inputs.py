@@ -53,7 +53,7 @@ RECORDINGS: dict[str, tuple[str, Change | None, str]] = {
     "constant with gaps": (DEVICE, values("intensity", gaps_in_a_constant), "intensity: is constant, 3 V"),
     "no dimension": (DEVICE, stored("intensity", 3.0), "intensity: has shape (); store it as (n,) or (n, detectors)"),
     "texts": (DEVICE, stored("intensity", np.array([b"a", b"b"])), "intensity: holds |S1, not real numbers"),
-    "truth values": (DEVICE, values("intensity", lambda v: v > 100.0), "intensity: holds bool, not real numbers"),
+    "truth values": (DEVICE, values("sense_x", lambda v: v > 0.0), "sense_x: holds bool, not real numbers"),
     "differences that underflow": (
         DEVICE, values("intensity", lambda v: 1e-312 * v), "intensity: changes by 9.95e-311 V only; check its type"),
     "sensor as a column": (DEVICE, values("sense_x", lambda v: v[:, None]), "sense_x: has shape (20000, 1); store"),

@@ -90,7 +90,7 @@ def test_what_a_correction_beside_named_laws_still_takes_is_stated(
     result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, remaining=remaining, steps=steps)
     correction = SimpleNamespace(predicted_gain=1000.0, candidate=SimpleNamespace(term=SimpleNamespace(stage="drive")))
     remainder = find_remainder(cast(SelectionResult, result), cast(ScoreTest, correction))
-    expected = {"share": pytest.approx(0.02), "stage": "drive", "channel": "sense_x"}
+    expected = {"share": pytest.approx(0.02), "stage": "drive", "channel": "sense_x", "in_device": False}
     assert remainder == (expected if stated else None)
 
 
