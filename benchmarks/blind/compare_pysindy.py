@@ -40,7 +40,7 @@ NAMED_TERMS = {
     "t omega": "damping-drift",
 }
 """Candidate terms of the library and the catalogue's name of each."""
-ALSO_RIGHT = {"sine-stiffness": {"cubic-stiffness", "quintic-stiffness"}}
+ALSO_RIGHT = {"sine-stiffness": {"cubic-stiffness", "quintic-stiffness", "gravity-stiffness"}}
 THRESHOLDS = (5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2)
 """Smallest coefficients that STLSQ retains, in units of the linear spring's. Effects of the benchmark start at 3e-3."""
 MIN_INCLUSION = 0.9

@@ -60,7 +60,7 @@ def _spot_off_edge(s: SizeReference, p: Truth, r: float, u: Shape) -> dict[str, 
 
 SINE_STIFFNESS = Effect(
     "sine-stiffness", "mechanics", {"tf": (1.0, 1.0)}, lambda s, p, r, u: {"pendulum": r}, listed=False,
-    linear_fraction=1.0, also_right=("cubic-stiffness", "quintic-stiffness", "pendulum-stiffness"),
+    linear_fraction=1.0, also_right=("cubic-stiffness", "quintic-stiffness", "gravity-stiffness"),
 )  # fmt: skip
 """A pendulum's torque k sin(theta), which a cubic and a quintic spring describe up to about a right angle."""
 

@@ -38,6 +38,7 @@ from benchmarks.blind.scanner_truth import Truth
 from benchmarks.blind.sensitivity import unprojected_norm
 from scanner.device import Device
 from scanner.recording import Recording
+from scanner.terms import catalogue
 from tests.support.blind_motion import LINEAR, OMEGA, STEP, SWING, UNDAMPED, run
 
 
@@ -365,3 +366,7 @@ def test_parameters_of_the_readout_do_not_change_the_motion():
 
 def after(truth):
     return {name: getattr(truth, name) for name in AFTER_MOTION}
+
+
+def test_names_that_describe_an_effect_as_well_are_in_the_catalogue() -> None:
+    assert {name for effect in EFFECTS.values() for name in effect.also_right} <= set(catalogue())
