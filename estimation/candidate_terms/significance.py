@@ -21,10 +21,16 @@ MAX_HELD_OUT_CHI2 = 1.3
 
 def satisfies_sign_constraints(fit: Fit) -> bool:
     """Whether every parameter of the terms has a physically possible sign."""
+    return all(has_possible_signs(fit, candidate.term.effect) for candidate in fit.model.candidates)
+
+
+def has_possible_signs(fit: Fit, effect: str) -> bool:
+    """Whether every parameter of the terms with one effect has a physically possible sign."""
     return all(
-        f.parameter is None or f.parameter.sign * fit.x[i] >= 0.0
-        for i, f in enumerate(fit.model.parameters)
-        if f.kind == "term"
+        fit.model.parameters[i].parameter.sign * fit.x[i] >= 0.0  # type: ignore[union-attr]
+        for candidate in fit.model.candidates
+        if candidate.term.effect == effect
+        for i in fit.model.indices("term", candidate.key)
     )
 
 

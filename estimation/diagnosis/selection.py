@@ -10,7 +10,12 @@ from estimation.candidate_terms.curves import CURVE_TERMS
 from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, is_discrepancy
 from estimation.candidate_terms.linear_model import RivalFit
 from estimation.candidate_terms.screening import all_candidates, damped_start
-from estimation.candidate_terms.significance import evidence_gain, residual_is_noise, satisfies_sign_constraints
+from estimation.candidate_terms.significance import (
+    evidence_gain,
+    has_possible_signs,
+    residual_is_noise,
+    satisfies_sign_constraints,
+)
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import (
     Fit,
@@ -178,7 +183,8 @@ def _fit_amplitude_effects(search: Search) -> tuple[Fit, list[Fit]]:
     """The fit with the best evidence of those with ``AMPLITUDE_EFFECTS`` that follow the motion, and all fits made.
 
     It is the nominal fit if that follows the motion or none of them does. They take a thirtieth of the time of fits
-    from the stated values; the second one is not made where the first leaves only noise.
+    from the stated values; the second one is not made where the first leaves only noise. A spring that hardens is no
+    pendulum.
     """
     anchor, tried = search.nominal, list[Fit]()
     for effects in AMPLITUDE_EFFECTS:
@@ -187,7 +193,8 @@ def _fit_amplitude_effects(search: Search) -> tuple[Fit, list[Fit]]:
             continue
         fit, made = fit_anchor(search.likelihood, search.nominal, search.early, search.stops, [group])
         tried += made
-        if fit is not search.nominal and (anchor is search.nominal or _has_less_evidence(anchor, [fit])):
+        possible = fit is not search.nominal and has_possible_signs(fit, effects[0])
+        if possible and (anchor is search.nominal or _has_less_evidence(anchor, [fit])):
             anchor = fit
         if not made or _is_explained(anchor, search.nominal):
             break

@@ -16,6 +16,7 @@ NOMINAL = SimpleNamespace(neg2_log_evidence=1e6)
     ("cubic", "follows", "gravity", "chosen"),
     [
         (900.0, (True, True), 500.0, "gravity-stiffness"),
+        (900.0, (True, True), 150.0, "cubic-stiffness"),  # a hanging mass that hardens
         (500.0, (True, True), 900.0, "cubic-stiffness"),
         (500.0, (False, True), 900.0, "gravity-stiffness"),  # a fit that loses the motion is no start
         (900.0, (True, False), 500.0, "cubic-stiffness"),
@@ -33,11 +34,14 @@ def test_it_is_the_one_with_the_best_evidence_that_follows_the_motion(
         )
     }
 
+    possible = {"cubic-stiffness": True, "gravity-stiffness": gravity != 150.0}
+
     def fit_anchor(likelihood: object, nominal: object, early: object, stops: object, groups: Any) -> Any:
         fit = fits[groups[0][0].term.effect]
         return (fit if fit.follows else NOMINAL), [fit]
 
     monkeypatch.setattr(selection, "fit_anchor", fit_anchor)
+    monkeypatch.setattr(selection, "has_possible_signs", lambda fit, effect: fit is fits[effect] and possible[effect])
     monkeypatch.setattr(selection, "_is_explained", lambda anchor, nominal: anchor.neg2_log_evidence < 100.0)
     search = SimpleNamespace(
         nominal=NOMINAL,
