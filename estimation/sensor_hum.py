@@ -207,17 +207,35 @@ def _undriven_centre(
         frequency: of the motion [Hz].
     """
     time, centre = means_over_periods(angle.read(*part), angle.sample_rate, float(angle.time(*part)[0]), frequency)
-    if axis.drive is not None and axis.drive.kind == "linear" and axis.mechanics is not None:
+    if axis.drive is not None and axis.drive.kind == "linear":
         drive = recording[f"drive_{name}"]
         begin, end = ((angle.time(at, at + 1)[0] - drive.start) * drive.sample_rate for at in (part[0], part[1] - 1))
         first, stop = (min(max(int(at), 0), drive.size) for at in (begin, end + 1.0))
-        volts = drive.read(first, stop)
-        times, means = means_over_periods(volts, drive.sample_rate, drive.start + first / drive.sample_rate, frequency)
-        if means.size < MIN_CENTRES or axis.drive.torque_per_volt is None:
+        driven = slow_drive_angle(axis, drive, (first, stop), frequency, time)
+        if driven is None:
             return time[:0], centre[:0]
-        centre = centre - axis.drive.torque_per_volt / axis.mechanics.k * np.interp(time, times, means)
+        centre = centre - driven
     known = np.isfinite(centre)
     return (time, np.interp(time, time[known], centre[known])) if known.sum() >= MIN_CENTRES else (time[:0], centre[:0])
+
+
+def slow_drive_angle(axis: Axis, drive: Channel, part: tuple[int, int], frequency: float, time: Array) -> Array | None:
+    """Angle to which the slow part of a linear drive turns an axis, shape of ``time`` [rad]; None where it is unknown.
+
+    Args:
+        axis: driven.
+        drive: its voltage.
+        part: range of samples (first, stop) of the drive.
+        frequency: of the motion [Hz].
+        time: [s].
+    """
+    if axis.drive is None or axis.drive.torque_per_volt is None or axis.mechanics is None:
+        return None
+    start = drive.start + part[0] / drive.sample_rate
+    times, means = means_over_periods(drive.read(*part), drive.sample_rate, start, frequency)
+    if means.size < MIN_CENTRES:
+        return None
+    return np.asarray(axis.drive.torque_per_volt / axis.mechanics.k * np.interp(time, times, means))
 
 
 def means_over_periods(values: Array, rate: float, start: float, frequency: float) -> tuple[Array, Array]:

@@ -48,9 +48,9 @@ def find_switch_times(
 
     Searched in blocks whose residual variance is high, in those at which the reference jumps, and in those half a block
     earlier and later: of a switch between two blocks the reference alone is wrong in either, which noise hides. The
-    drive of the preceding block and the drive of the next one
-    are continued through the block; the switch is where the first followed by the second has the least squared
-    residuals. It is accepted if these are below MAX_RESIDUAL_RATIO of those without a switch.
+    drive of the preceding block and the drive of the next one are continued through the block; the switch is where the
+    first followed by the second has the least squared residuals. It is accepted if these are below MAX_RESIDUAL_RATIO
+    of those without a switch.
 
     Args:
         starts: first sample of every block, shape (blocks,). length: of a block [samples].

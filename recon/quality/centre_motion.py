@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from estimation.sensor_hum import MIN_CENTRES, mean_window, means_over_periods
+from estimation.sensor_hum import MIN_CENTRES, mean_window, means_over_periods, slow_drive_angle
 from estimation.signals import white_noise_sd
 from estimation.tracker.track import MIN_RELATIVE_FREQUENCY
 from recon.imaging.picture import Grid
@@ -120,9 +120,9 @@ def _undriven_centre(
     rate, values = track.angle.sample_rate, _angles(motion, name) - factor * _angles(motion, _other(name))
     time, centre = means_over_periods(values, rate, track.angle.start, frequency)
     if axis.drive.kind == "linear":
-        volts = means_over_periods(drive.read(0, MAX_READ_SAMPLES), drive.sample_rate, drive.start, frequency)
-        if axis.drive.torque_per_volt is None or volts[1].size < MIN_CENTRES:
+        driven = slow_drive_angle(axis, drive, (0, MAX_READ_SAMPLES), frequency, time)
+        if driven is None:
             return nothing
-        centre -= axis.drive.torque_per_volt / axis.mechanics.k * np.interp(time, *volts)
+        centre -= driven
     known = np.isfinite(centre)
     return time[known], centre[known], white_noise_sd(values) * float(np.linalg.norm(mean_window(rate, frequency)))
