@@ -35,14 +35,22 @@ class OpenLoop:
     """Prediction of one channel by a device, on held-out samples.
 
     Attributes:
-        error: root-mean-square error, in the channel's unit.
+        squares: mean squared error of every held-out block, in the square of the channel's unit, shape (n,).
         deviation: standard deviation of the recorded samples, in the channel's unit.
-        sd: standard uncertainty of ``error``, from its scatter between held-out blocks.
     """
 
-    error: float
+    squares: Array
     deviation: float
-    sd: float
+
+    @property
+    def error(self) -> float:
+        """Root-mean-square error, in the channel's unit."""
+        return float(np.sqrt(self.squares.mean()))
+
+    @property
+    def relative_squares(self) -> Array:
+        """Mean squared error of every block as a fraction of the variance of the signal, shape (n,)."""
+        return np.asarray(self.squares / max(self.deviation, 1e-150) ** 2)
 
     def to_json(self) -> dict[str, Any]:
         """Error, and error as a fraction of the signal."""
@@ -78,36 +86,35 @@ def open_loop(runs: Sequence[Run], device: Device) -> dict[str, OpenLoop]:
                 squares = [float(np.mean(error[rows][blocks == block] ** 2)) for block in np.unique(blocks)]
                 squared_errors.setdefault(output.name, []).append(np.array(squares))
                 data.setdefault(output.name, []).append(output.data[rows])
-    by_channel = {}
-    for name, parts in squared_errors.items():
-        squares_of_blocks = np.concatenate(parts)
-        count = squares_of_blocks.size
-        rms = float(np.sqrt(squares_of_blocks.mean()))
-        scatter = float(squares_of_blocks.std() / np.sqrt(max(count - 1, 1)))
-        deviation = float(np.sqrt(np.mean([part.var() for part in data[name]])))
-        by_channel[name] = OpenLoop(rms, deviation, scatter / max(2.0 * rms, 1e-300))
-    return by_channel
+    return {
+        name: OpenLoop(np.concatenate(parts), float(np.sqrt(np.mean([part.var() for part in data[name]]))))
+        for name, parts in squared_errors.items()
+    }
 
 
 def has_larger_error(nominal: Mapping[str, OpenLoop], improved: Mapping[str, OpenLoop]) -> bool:
     """Whether the error of a device, over all channels as in :func:`is_worse`, exceeds that of the nominal one."""
-    return _relative_error(improved)[0] > (1.0 + ERROR_MARGIN) * _relative_error(nominal)[0]
+    return _relative_error(improved) > (1.0 + ERROR_MARGIN) * _relative_error(nominal)
 
 
 def is_worse(reference: Mapping[str, OpenLoop], device: Mapping[str, OpenLoop]) -> bool:
     """Whether a device predicts worse than a reference, by more than ``ERROR_MARGIN`` and twice the uncertainty.
 
     The errors of all channels are added, each as a fraction of its signal: a readout lag may change the angle by a
-    thousandth of its amplitude while the error of the sense signal falls to a tenth.
+    thousandth of its amplitude while the error of the sense signal falls to a tenth. The uncertainty is that of the
+    difference, from its scatter between the blocks: where both devices predict some blocks worse than others, the
+    scatter of either error alone would be much larger.
+
+    Args:
+        reference, device: prediction of every channel on the same blocks.
     """
-    before, before_sd = _relative_error(reference)
-    after, after_sd = _relative_error(device)
-    return bool(after - before > 2.0 * np.hypot(before_sd, after_sd) + ERROR_MARGIN * before)
+    before, after = _relative_error(reference), _relative_error(device)
+    changes = [device[name].relative_squares - reference[name].relative_squares for name in reference]
+    variance = sum(float(change.var()) / max(change.size - 1, 1) for change in changes)
+    uncertainty = np.sqrt(variance) / max(before + after, 1e-300)
+    return bool(after - before > 2.0 * uncertainty + ERROR_MARGIN * before)
 
 
-def _relative_error(channels: Mapping[str, OpenLoop]) -> tuple[float, float]:
-    """Root sum of squares of the errors of all channels as fractions of their signals, and its uncertainty."""
-    deviation = [max(channel.deviation, 1e-300) for channel in channels.values()]
-    error, sd = np.array([(channel.error, channel.sd) for channel in channels.values()]).T / deviation
-    total = float(np.linalg.norm(error))
-    return total, float(np.linalg.norm(error * sd)) / max(total, 1e-300)
+def _relative_error(channels: Mapping[str, OpenLoop]) -> float:
+    """Root sum of squares of the errors of all channels as fractions of their signals."""
+    return float(np.sqrt(sum(channel.relative_squares.mean() for channel in channels.values())))

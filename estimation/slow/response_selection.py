@@ -63,9 +63,7 @@ def prediction_error(response: Response, fit: ResponseFit) -> OpenLoop:
     """Error of a fit on the tones that are held out, in the unit of the response."""
     rows = response.held_out
     squares = np.abs(response.values - fit.predicted)[rows] ** 2
-    rms = float(np.sqrt(squares.mean()))
-    sd = float(squares.std() / np.sqrt(max(squares.size - 1, 1))) / max(2.0 * rms, 1e-300)
-    return OpenLoop(rms, float(np.sqrt(np.mean(np.abs(response.values[rows]) ** 2))), sd)
+    return OpenLoop(squares, float(np.sqrt(np.mean(np.abs(response.values[rows]) ** 2))))
 
 
 def predicts_worse(before: OpenLoop, after: OpenLoop) -> bool:

@@ -286,7 +286,5 @@ def prediction_errors(decays: Decays, predicted: Sequence[Array]) -> list[OpenLo
         amplitude = decays.reference * np.exp(decays.log_relative(part))
         squares = (amplitude - decays.reference * np.exp(log_a)) ** 2
         means = np.array([squares[block == each].mean() for each in np.unique(block[block >= 0])])
-        rms = float(np.sqrt(means.mean()))
-        sd = float(means.std() / np.sqrt(max(means.size - 1, 1))) / max(2.0 * rms, 1e-300)
-        errors.append(OpenLoop(rms, float(np.sqrt(np.mean(amplitude[block >= 0] ** 2))), sd))
+        errors.append(OpenLoop(means, float(np.sqrt(np.mean(amplitude[block >= 0] ** 2)))))
     return errors

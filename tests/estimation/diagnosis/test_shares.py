@@ -109,16 +109,25 @@ def test_the_share_of_a_rail_and_the_remainder_are_of_the_fit_without_the_rail(m
     assert remainder["share"] == pytest.approx(0.25)
 
 
+def _one_channel(*squares: float) -> dict[str, OpenLoop]:
+    return {"sense_x": OpenLoop(np.array(squares), 10.0)}
+
+
 def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> None:
-    nominal = {"sense_x": OpenLoop(1.0, 10.0, 0.1)}
-    assert not is_worse(nominal, {"sense_x": OpenLoop(1.2, 10.0, 0.1)})
-    assert is_worse(nominal, {"sense_x": OpenLoop(1.4, 10.0, 0.1)})
+    nominal = _one_channel(1.0, 1.2, 0.8, 1.0)
+    assert not is_worse(nominal, _one_channel(1.0, 0.7, 1.9, 1.1))
+    assert is_worse(nominal, _one_channel(1.9, 1.7, 2.1, 2.0))
+
+
+def test_blocks_that_both_devices_predict_badly_do_not_hide_a_difference_in_all_blocks() -> None:
+    nominal = _one_channel(0.1, 9.0, 0.2, 1.0)
+    assert is_worse(nominal, _one_channel(0.2, 11.0, 1.5, 3.0))
+    assert not is_worse(nominal, _one_channel(0.2, 30.0, 0.1, 1.0))
 
 
 @pytest.mark.parametrize(("error", "larger"), [(0.9, False), (1.005, False), (1.2, True)])
 def test_a_larger_error_counts_whatever_its_uncertainty(error: float, larger: bool) -> None:
-    nominal = {"sense_x": OpenLoop(1.0, 10.0, 0.5)}
-    assert has_larger_error(nominal, {"sense_x": OpenLoop(error, 10.0, 0.5)}) is larger
+    assert has_larger_error(_one_channel(0.5, 1.5), _one_channel(2.0 * error**2, 0.0)) is larger
 
 
 def test_a_rail_is_detected_from_samples_at_one_value() -> None:
