@@ -50,7 +50,7 @@ class OpenLoop:
     @property
     def relative_squares(self) -> Array:
         """Mean squared error of every block as a fraction of the variance of the signal, shape (n,)."""
-        return np.asarray(self.squares / max(self.deviation, 1e-150) ** 2)
+        return np.asarray(self.squares / max(self.deviation, 1e-50) ** 2)
 
     def to_json(self) -> dict[str, Any]:
         """Error, and error as a fraction of the signal."""
@@ -109,10 +109,16 @@ def is_worse(reference: Mapping[str, OpenLoop], device: Mapping[str, OpenLoop]) 
         reference, device: prediction of every channel on the same blocks.
     """
     before, after = _relative_error(reference), _relative_error(device)
-    changes = [device[name].relative_squares - reference[name].relative_squares for name in reference]
-    variance = sum(float(change.var()) / max(change.size - 1, 1) for change in changes)
-    uncertainty = np.sqrt(variance) / max(before + after, 1e-300)
-    return bool(after - before > 2.0 * uncertainty + ERROR_MARGIN * before)
+    variance = 0.0
+    for name, channel in device.items():
+        change = _error_changes(channel, after) - _error_changes(reference[name], before)
+        variance += float(change.var()) / max(change.size - 1, 1)
+    return bool(after - before > 2.0 * np.sqrt(variance) + ERROR_MARGIN * before)
+
+
+def _error_changes(channel: OpenLoop, relative_error: float) -> Array:
+    """Derivative of the root sum of squares ``relative_error`` by the mean square of each block, times that square."""
+    return np.asarray(channel.relative_squares / (2.0 * max(relative_error, 1e-300)))
 
 
 def _relative_error(channels: Mapping[str, OpenLoop]) -> float:
