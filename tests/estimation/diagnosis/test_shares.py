@@ -121,8 +121,15 @@ def test_a_device_is_worse_only_beyond_the_uncertainty_of_the_comparison() -> No
 
 def test_blocks_that_both_devices_predict_badly_do_not_hide_a_difference_in_all_blocks() -> None:
     nominal = _one_channel(0.1, 9.0, 0.2, 1.0)
-    assert is_worse(nominal, _one_channel(0.2, 11.0, 1.5, 3.0))
-    assert not is_worse(nominal, _one_channel(0.2, 30.0, 0.1, 1.0))
+    assert is_worse(nominal, _one_channel(0.3, 11.0, 0.5, 2.0))
+    assert not is_worse(nominal, _one_channel(0.1, 30.0, 0.1, 1.0))
+
+
+def test_a_channel_with_a_negligible_error_does_not_make_a_device_worse() -> None:
+    nominal = {**_one_channel(1.0, 1.2, 0.8, 1.0), "angle_x": OpenLoop(np.full(4, 1e-6), 10.0)}
+    better = {**_one_channel(0.1, 0.1, 0.1, 0.1), "angle_x": OpenLoop(np.full(4, 1e-5), 10.0)}
+    assert not is_worse(nominal, better)
+    assert is_worse(better, nominal)
 
 
 @pytest.mark.parametrize(("error", "larger"), [(0.9, False), (1.005, False), (1.2, True)])
