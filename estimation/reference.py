@@ -13,6 +13,10 @@ from scanner.channel import Channel, hint_of_dead
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block, unwrap_phase
 
+MIN_RELATIVE_FREQUENCY = 0.2
+"""Frequency of a motion over the resonance below which the mirror follows its drive slowly: the spring balances the
+drive. The inertia, whose exchange of energy with the spring the tracker averages, then has 4 % of its force."""
+
 BLOCK_CYCLES = 4
 """Cycles of the drive per block: the phase then advances by less than half a cycle a block for a chirp of up to an
 eighth of the frequency each way, and can be unwrapped."""

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.isolated_spikes import MAX_VALUE
+from estimation.reference import MIN_RELATIVE_FREQUENCY
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples
 from scanner.device import Axis
@@ -21,9 +22,8 @@ from scanner.motion import AxisMotion
 from scanner.recording import Recording
 from scanner.replaced_samples import with_samples
 
-MAX_RELATIVE_FREQUENCY = 0.2
-"""Frequency of hum over that of the slower axis, up to which it is distinguished from the motion of either axis, and a
-motion over the resonance, up to which a drive moves a mirror slowly."""
+MAX_HUM_FREQUENCY = 0.2
+"""Frequency of hum over that of the slower axis, up to which it is distinguished from the motion of either axis."""
 
 BLOCK_S = 0.5
 """Time over which frequency, amplitude and phase of hum are taken to be constant [s]."""
@@ -42,7 +42,7 @@ BACKFIT_ROUNDS = 3
 """Times that each line is fitted again without the others, beside which it was found: each removes most of the rest."""
 
 MAX_LINES = 6
-"""Lines of a block at most: the mains and its harmonics below ``MAX_RELATIVE_FREQUENCY``."""
+"""Lines of a block at most: the mains and its harmonics below ``MAX_HUM_FREQUENCY``."""
 
 MAX_PASSED_CHANGE = 0.15
 """Part of a change of the amplitude or the phase that the mean over a period passes at most: a sideband at 0.8 of the
@@ -98,14 +98,14 @@ def find_hum(
         motion: from this signal.
         slower: frequency of the slower axis [Hz].
     """
-    if not _is_drive_known(recording, axis, name, motion):
+    if not is_slow_drive_known(recording, axis, name, motion):
         return []
     frequency, rate, change = float(np.median(motion.frequency)), angle.sample_rate, _passed_change(motion)
     edges = part_edges(angle, 1.0 / frequency)
     blocks = []
     for first, stop in pairwise(edges):
         time, centre = _undriven_centre(recording, axis, name, angle, (first, stop), frequency)
-        lines = find_lines(time, centre, MAX_RELATIVE_FREQUENCY * slower, change)
+        lines = find_lines(time, centre, MAX_HUM_FREQUENCY * slower, change)
         begin, end = (angle.start + at / rate for at in (first, stop))
         blocks.append(LineBlock(begin, end, tuple(_before_mean(line, rate, frequency) for line in lines)))
     return blocks if any(block.lines for block in blocks) else []
@@ -134,7 +134,7 @@ def find_slow_lines(motion: AxisMotion, slower: float) -> list[Line]:
     time, centre = means_over_periods(values, angle.sample_rate, angle.start, frequency)
     if time.size < MIN_CENTRES or not np.isfinite(centre).all():
         return []
-    lines = find_lines(time, centre, MAX_RELATIVE_FREQUENCY * slower, _passed_change(motion))
+    lines = find_lines(time, centre, MAX_HUM_FREQUENCY * slower, _passed_change(motion))
     return [_before_mean(line, angle.sample_rate, frequency) for line in lines]
 
 
@@ -184,14 +184,14 @@ def describe_hum(channel: Channel, gain: float, hum: Sequence[LineBlock]) -> lis
     ]
 
 
-def _is_drive_known(recording: Recording, axis: Axis, name: str, motion: AxisMotion) -> bool:
+def is_slow_drive_known(recording: Recording, axis: Axis, name: str, motion: AxisMotion) -> bool:
     """Whether the slow part of the torque on an axis is known, and the axis moves near its resonance or above."""
     return (
         f"drive_{name}" in recording
         and axis.drive is not None
         and axis.mechanics is not None
         and motion.reference in ("drive", "half-drive")
-        and float(np.median(motion.frequency)) >= MAX_RELATIVE_FREQUENCY * axis.resonance
+        and float(np.median(motion.frequency)) >= MIN_RELATIVE_FREQUENCY * axis.resonance
         and (axis.drive.kind != "linear" or axis.drive.torque_per_volt is not None)
     )
 

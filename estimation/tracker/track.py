@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimation.held_samples import without_held_samples
-from estimation.reference import PhaseReference
+from estimation.reference import MIN_RELATIVE_FREQUENCY, PhaseReference
 from estimation.signals import SenseChannel, intensity_clock, is_capacitive, phase_reference, sense_channels
 from estimation.tracker.block_tracking import LOOKAHEAD_BLOCKS, average_over_noise, expand_clipped_blocks, track_blocks
 from estimation.tracker.continuation import TrackEnd, Tuning, continued_prior, end_of_track, find_end
@@ -36,10 +36,6 @@ from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
-
-MIN_RELATIVE_FREQUENCY = 0.2
-"""Frequency of a motion over the resonance below which the tracker refuses it: the spring then balances the drive, and
-the inertia, on whose exchange of energy with the spring the averaged dynamics rest, has 4 % of its force."""
 
 SECTION_BLOCKS = 16384
 """Blocks whose samples are projected at a time, some 10 s: bounds the memory of a long recording."""

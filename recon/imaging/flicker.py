@@ -28,7 +28,7 @@ from scanner.wording import counted
 BLOCKS_PER_PERIOD = 2
 """Blocks in a period of the slower axis: each crosses the whole field."""
 
-MAX_RELATIVE_FREQUENCY = 0.25
+MAX_FLICKER_FREQUENCY = 0.25
 """Frequency of flicker over that of the slower axis at most: eight blocks in a cycle, over which the scene averages."""
 
 SAMPLES_PER_CELL = 16
@@ -59,7 +59,7 @@ def find_flicker(beam: Motion, intensity: Channel, grid: Grid) -> list[LineBlock
     edges = part_edges(intensity, length / intensity.sample_rate)
     found = list[LineBlock]()
     for first, stop in pairwise(edges):
-        lines = _lines_of_part(beam, intensity, grid, (first, stop), length, MAX_RELATIVE_FREQUENCY * slower)
+        lines = _lines_of_part(beam, intensity, grid, (first, stop), length, MAX_FLICKER_FREQUENCY * slower)
         if not found and not lines:
             return []
         begin, end = (intensity.start + at / intensity.sample_rate for at in (first, stop))

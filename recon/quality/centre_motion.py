@@ -6,9 +6,8 @@ from math import sqrt
 
 import numpy as np
 
-from estimation.sensor_hum import MIN_CENTRES, mean_window, means_over_periods, slow_drive_angle
+from estimation.sensor_hum import MIN_CENTRES, is_slow_drive_known, mean_window, means_over_periods, slow_drive_angle
 from estimation.signals import white_noise_sd
-from estimation.tracker.track import MIN_RELATIVE_FREQUENCY
 from recon.imaging.picture import Grid
 from scanner.arrays import Array
 from scanner.device import AXES, Axis, Device
@@ -110,17 +109,15 @@ def _undriven_centre(
 ) -> tuple[Array, Array, float]:
     """Times [s] and centre of the motion less what the drive's slow part causes and ``factor`` times the other axis
     [rad], and the standard deviation of the centre by white noise [rad]; empty where the drive's part is unknown."""
-    drive, track = recording.channels.get(f"drive_{name}"), motion.axes[name]
+    track = motion.axes[name]
     nothing = np.empty(0), np.empty(0), 0.0
+    if not is_slow_drive_known(recording, axis, name, track):
+        return nothing
     frequency = float(np.median(track.frequency))
-    if drive is None or axis.drive is None or axis.mechanics is None or track.reference not in ("drive", "half-drive"):
-        return nothing
-    if frequency < MIN_RELATIVE_FREQUENCY * axis.resonance:  # the drive moves it slowly
-        return nothing
     rate, values = track.angle.sample_rate, _angles(motion, name) - factor * _angles(motion, _other(name))
     time, centre = means_over_periods(values, rate, track.angle.start, frequency)
-    if axis.drive.kind == "linear":
-        driven = slow_drive_angle(axis, drive, (0, MAX_READ_SAMPLES), frequency, time)
+    if axis.drive is not None and axis.drive.kind == "linear":
+        driven = slow_drive_angle(axis, recording[f"drive_{name}"], (0, MAX_READ_SAMPLES), frequency, time)
         if driven is None:
             return nothing
         centre -= driven
