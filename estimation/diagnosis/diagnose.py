@@ -133,9 +133,12 @@ def _diagnose_with_modes(
 
 
 def _leaves_most(diagnosis: Diagnosis) -> bool:
-    """Whether more of the misfit is left than all findings explain, laws and free corrections alike."""
+    """Whether the findings, laws and free corrections alike, explain no more of the misfit than is left.
+
+    Both are zero for a correction whose device was rejected because it predicts worse than the nominal one.
+    """
     explained = sum(finding.share or 0.0 for finding in diagnosis.findings)
-    return (diagnosis.remainder or {}).get("share", 0.0) > explained
+    return bool(diagnosis.findings) and (diagnosis.remainder or {}).get("share", 0.0) >= explained
 
 
 def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress, excluded: Collection[str]) -> Diagnosis:
