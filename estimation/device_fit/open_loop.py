@@ -98,12 +98,13 @@ def has_larger_error(nominal: Mapping[str, OpenLoop], improved: Mapping[str, Ope
 
 
 def is_worse(reference: Mapping[str, OpenLoop], device: Mapping[str, OpenLoop]) -> bool:
-    """Whether a device predicts worse than a reference: by more than ``ERROR_MARGIN`` and in most of the blocks.
+    """Whether a device predicts worse than a reference: by more than ``ERROR_MARGIN`` and consistently.
 
     The errors of all channels are added, each as a fraction of its signal: a readout lag may change the angle by a
-    thousandth of its amplitude while the error of the sense signal falls to a tenth. The scatter between the blocks is
-    that of the logarithm of the ratio of both errors: blocks that are difficult to predict, such as the first ones of
-    a decay, are so for both devices. Channels count in it by their part of the squared errors.
+    thousandth of its amplitude while the error of the sense signal falls to a tenth. Consistently: the mean over the
+    blocks of the logarithm of the ratio of both errors exceeds twice its standard uncertainty. Blocks that are hard to
+    predict, such as the first ones of a decay, are so for both devices, so they do not add to its scatter. Channels
+    count in the mean by their part of the squared errors.
 
     Args:
         reference, device: prediction of every channel on the same blocks.
