@@ -46,6 +46,7 @@ class Diagnosis:
         hum: mains hum that is stronger than the noise, by channel, see
             :func:`estimation.device_fit.hum.describe_strong_hum`. It is taken as noise.
         untested: what the recordings do not test, with the reason, in words; None if everything is tested.
+        remainder_fit: of a measured law of what the findings leave, if the improved device holds one.
     """
 
     verdict: str
@@ -60,6 +61,7 @@ class Diagnosis:
     further_modes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     hum: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     untested: str | None = None
+    remainder_fit: Fit | None = None
 
     def __repr__(self) -> str:
         lines = [f"Diagnosis of {self.device.name!r}: {self.verdict}"]
@@ -177,9 +179,10 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
         improvement.device,
         result,
         {f"{axis}.{name}": {"pull": pull} for pull, axis, name in _pulls(result.final)},
-        find_remainder(result, correction, improvement.has_remainder_law),
+        find_remainder(result, correction, improvement.remainder_fit is not None),
         improvement.to_json(),
         hum=describe_strong_hum(result.final),
+        remainder_fit=improvement.remainder_fit,
     )
 
 

@@ -32,14 +32,14 @@ class Improvement:
         search: result of the selection without the rejected findings.
         device: the improved device, or the nominal one if its open-loop error is not larger.
         nominal, improved: open-loop errors of the nominal and of the improved device, by channel.
-        has_remainder_law: whether the device holds a measured law of what the named laws leave.
+        remainder_fit: of a measured law of what the named laws leave, if the device holds one.
     """
 
     search: SelectionResult
     device: Device
     nominal: Mapping[str, OpenLoop]
     improved: Mapping[str, OpenLoop]
-    has_remainder_law: bool = False
+    remainder_fit: Fit | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``open_loop`` in diagnosis.json."""

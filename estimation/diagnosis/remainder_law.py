@@ -53,7 +53,7 @@ def with_remainder_law(improvement: Improvement, correction: Candidate) -> Impro
     loops = open_loop(runs, extended)
     if not is_worse(loops, improvement.improved) or not all(predicts_no_worse(run, device, extended) for run in runs):
         return improvement
-    return replace(improvement, device=extended, improved=loops, has_remainder_law=True)
+    return replace(improvement, device=extended, improved=loops, remainder_fit=fit)
 
 
 def _fit_beside(improvement: Improvement, law: Candidate) -> Fit | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from estimation.device_fit.fit import Fit
 from estimation.device_fit.posterior import (
     PICTURE_HALF_WIDTH_PX,
     PredictionPhaseError,
@@ -51,8 +52,9 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> tuple[str, s
         diagnosis: of the recordings.
         names: of the recordings.
     """
-    search = diagnosis.search
-    errors = _phase_errors(search) if search is not None and diagnosis.findings else {}
+    search, errors = diagnosis.search, dict[str, PredictionPhaseError]()
+    if search is not None and diagnosis.findings:
+        errors = _phase_errors(search, _improved_fit(diagnosis, search))
     largest = max(errors.values(), key=lambda e: e.blur_px(e.before), default=None)
     blur = None if largest is None else (largest.blur_px(largest.before), largest.blur_px(largest.after))
     sections = [_overview(diagnosis)] if diagnosis.findings else []
@@ -131,10 +133,11 @@ def _motion_sections(
     diagnosis: Diagnosis, search: SelectionResult, errors: Mapping[str, PredictionPhaseError]
 ) -> list[Section]:
     """The evidence from drive to readout."""
-    sections = [_waveforms(search)]
+    improved = _improved_fit(diagnosis, search)
+    sections = [_waveforms(search, improved)]
     if search.steps:
         sections.append(_blur_section(errors))
-    sections += [_residuals(search), _portraits(search)]
+    sections += [_residuals(search, improved), _portraits(search, improved)]
     if search.steps:
         text = (
             "Difference of −2 log evidence to the chosen effect: above 6 an effect is unlikely (odds 1 to 20), above "
@@ -146,21 +149,26 @@ def _motion_sections(
     return [*sections, _detectability(effects), _nominal_values(diagnosis)]
 
 
-def _phase_errors(search: SelectionResult) -> dict[str, PredictionPhaseError]:
+def _improved_fit(diagnosis: Diagnosis, search: SelectionResult) -> Fit:
+    """The fit of the improved device: with the findings, and with a measured law of what they leave."""
+    return diagnosis.remainder_fit or search.final
+
+
+def _phase_errors(search: SelectionResult, improved: Fit) -> dict[str, PredictionPhaseError]:
     """Phase errors of open-loop predictions by recording and axis."""
     errors = {}
     for r, run in enumerate(search.likelihood.runs):
         for axis in run.inputs:
-            error = phase_error(search.nominal, search.final, axis, r)
+            error = phase_error(search.nominal, improved, axis, r)
             if error is not None:
                 errors[f"{run.name}, axis {axis}"] = error
     return errors
 
 
-def _waveforms(search: SelectionResult) -> Section:
+def _waveforms(search: SelectionResult, improved: Fit) -> Section:
     figures = [
         waveform_figure(
-            waveform(search.nominal, search.final, r, channel),
+            waveform(search.nominal, improved, r, channel),
             f"{run.name}, {output.name}" if len(search.likelihood.runs) > 1 else output.name,
             UNITS.get(output.kind, ""),
         )
@@ -189,14 +197,14 @@ def _blur_section(errors: Mapping[str, PredictionPhaseError]) -> Section:
     return Section(heading, text, table, figures, least="24rem")
 
 
-def _residuals(search: SelectionResult) -> Section:
+def _residuals(search: SelectionResult, improved: Fit) -> Section:
     figures = []
     first = 0
     for run, whiteners in zip(search.likelihood.runs, search.likelihood.whiteners, strict=True):
         for output, whitener in zip(run.outputs, whiteners, strict=True):
             part = slice(first, first + whitener.samples)
             first += whitener.samples
-            pair = [search.nominal.residual[part], search.final.residual[part]]
+            pair = [search.nominal.residual[part], improved.residual[part]]
             frequency = np.arange(whitener.psd.size) / (output.data.size * output.step)
             name = f"{run.name}, {output.name}"
             figures.append(residual_over_time_figure(name, whitener.time * run.duration, pair))
@@ -205,12 +213,12 @@ def _residuals(search: SelectionResult) -> Section:
     return Section("Residuals over time and frequency", text, figures=figures, least="24rem")
 
 
-def _portraits(search: SelectionResult) -> Section:
-    pair = (search.nominal.residual, search.final.residual)
+def _portraits(search: SelectionResult, improved: Fit) -> Section:
+    pair = (search.nominal.residual, improved.residual)
     figures = []
     for r, run in enumerate(search.likelihood.runs):
         for channel, output in enumerate(run.outputs):
-            before, after = phase_portrait(search.likelihood, search.final, pair, r, channel)
+            before, after = phase_portrait(search.likelihood, improved, pair, r, channel)
             caption = f"{run.name}, {output.name}: residual over angle and rate of axis {output.axes[0]}"
             figures.append(portrait_figure(before, after, caption))
     return Section("Residuals over the state of the mirror", figures=figures, least="24rem")
