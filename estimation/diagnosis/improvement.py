@@ -18,6 +18,7 @@ from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
+from estimation.diagnosis.shares import explains_most
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.stages import MotionSensor
@@ -56,9 +57,10 @@ def improve(result: SelectionResult) -> Improvement:
     long as the prediction rejects it; a rail at which samples stand is certain and stays. If the findings leave noise
     alone, they are rejected by a prediction that is worse than that of the nominal device, beyond the uncertainty of
     the comparison; within it they stay, but the nominal device takes the place of one with a larger error. If they
-    leave more than noise, they have to lower the error, and the weakest of them too. A discrepancy term always remains
-    a finding, but if the device with its measured law predicts any channel of any run worse, the device with the named
-    laws alone is returned, or the nominal one if that is worse too.
+    leave more than noise, they have to explain more of the misfit of a channel than they leave, and to lower the error,
+    and the weakest of them too. A discrepancy term always remains a finding, but if the device with its measured law
+    predicts any channel of any run worse, the device with the named laws alone is returned, or the nominal one if that
+    is worse too.
     """
     result = without_contradicted(_settled(result))
     runs, stated = result.likelihood.runs, result.final.model.device
@@ -83,7 +85,7 @@ def improve(result: SelectionResult) -> Improvement:
         else:
             reduced = without_weakest(result)
             others = [nominal, open_loop(runs, improved_device(reduced.final))] if reduced.steps else [nominal]
-            if all(has_larger_error(improved, other) for other in others):
+            if explains_most(result) and all(has_larger_error(improved, other) for other in others):
                 return Improvement(result, device, nominal, improved)
             result = reduced
 

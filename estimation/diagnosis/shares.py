@@ -73,6 +73,13 @@ def noise_by_channel(likelihood: Likelihood) -> dict[str, float]:
     return {name: float(np.mean(runs)) for name, runs in values.items()}
 
 
+def explains_most(result: SelectionResult) -> bool:
+    """Whether the final fit explains more of the misfit of any channel than it leaves, on held-out samples."""
+    noise, complete = noise_by_channel(result.likelihood), misfit_by_channel(result.final)
+    nominal = misfit_by_channel(result.nominal)
+    return any(remaining_share(complete[name], nominal[name], noise[name]) < 0.5 for name in noise)
+
+
 def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
     """Share that a finding alone explains of the misfit of the channel whose whitened misfit it lowers most."""
     reduction = chi2_reduction_by_channel(result.likelihood, step.before, result.final)

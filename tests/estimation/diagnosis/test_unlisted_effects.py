@@ -9,6 +9,7 @@ from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
 from estimation.diagnosis.diagnose import Diagnosis, diagnose
 from scanner.terms.measured_law import added, measured_law
 from tests.support.bench import RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES, bench_recording
+from tests.support.cubic_spring import LARGEST_ANGLE
 
 
 def _free_parameters(diagnosis: Diagnosis) -> set[str]:
@@ -73,6 +74,14 @@ def test_a_stop_on_one_side_is_unknown_in_the_mechanics() -> None:
     assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "mechanics")]
     (candidate,) = diagnosis.search.final.model.candidates
     assert len(_free_parameters(diagnosis)) < len(DISCREPANCY_TERMS[candidate.term.effect].free_parameters)
+
+
+@pytest.mark.slow
+def test_a_law_that_takes_a_quarter_of_a_misfit_is_no_answer() -> None:
+    """Beside a narrow dead zone, a cubic curve explains more than any other law, and corrections beside it the rest."""
+    diagnosis = diagnose([bench_recording(dead_zone=0.05 * LARGEST_ANGLE, seed=3)])
+    assert [(finding.effect, finding.stage) for finding in diagnosis.findings] == [("unknown", "readout")]
+    assert diagnosis.findings[0].share > 0.5
 
 
 @pytest.mark.slow
