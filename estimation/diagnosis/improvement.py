@@ -57,8 +57,8 @@ def improve(result: SelectionResult) -> Improvement:
     long as the prediction rejects it; a rail at which samples stand is certain and stays. If the findings leave noise
     alone, they are rejected by a prediction that is worse than that of the nominal device, beyond the uncertainty of
     the comparison; within it they stay, but the nominal device takes the place of one with a larger error. If they
-    leave more than noise, they have to explain more of the misfit of a channel than they leave, and to lower the error,
-    and the weakest of them too. A discrepancy term always remains a finding, but if the device with its measured law
+    leave more than noise, they have to explain more of the misfit than they leave, and to lower the error, and the
+    weakest of them too. A discrepancy term always remains a finding, but if the device with its measured law
     predicts any channel of any run worse, the device with the named laws alone is returned, or the nominal one if that
     is worse too.
     """

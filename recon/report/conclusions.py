@@ -110,7 +110,7 @@ def _describe_values(content: Mapping[str, Any]) -> str:
     listed = ", ".join(f"{name} by {format_value(deviations[name], 2)}" for name in largest)
     return (
         f" Values of the device, as fitted, lie far outside their tolerances: {listed} tolerances. Check that the "
-        "device file is of this mirror and that its tolerances are right: with right values less may be missing."
+        "device file belongs to this device and that its tolerances are right: with right values less may be missing."
     )
 
 

@@ -87,8 +87,9 @@ def _overview(diagnosis: Diagnosis) -> Section:
     text = (
         "Probability: of the effect among the laws that were compared, by these recordings. "
         "Misfit: reduced chi-square on samples that were not used in the fit; noise alone gives 1. Share: of the mean "
-        "square misfit of the nominal device on these samples, in the channel that shows the effect most; what is "
-        "not explained near the noise is a share of the misfit in units of the noise."
+        "square misfit of the nominal device on these samples, in the channel that shows the effect most, that returns "
+        "without the effect: it is small for effects of which one can take the place of the other. What is not "
+        "explained near the noise is a share of the misfit in units of the noise."
     )
     return Section("Effects", text, Table(head, rows))
 

@@ -140,4 +140,4 @@ def test_values_far_outside_their_tolerances_are_named(pulls: dict[str, float], 
     text = conclude_diagnosis({"verdict": "mismatch", "findings": [found("unknown", 1.0)], "nominal": nominal})
     listed = "x.capacitance.C0 by 7.7, x.readout.R_s by 3.3, x.capacitance.theta0 by −2.9 tolerances"
     assert (listed in text) == stated
-    assert ("Check that the device file is of this mirror" in text) == stated
+    assert ("Check that the device file belongs to this device" in text) == stated
