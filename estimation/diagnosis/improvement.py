@@ -11,14 +11,20 @@ import numpy as np
 from estimation.candidate_terms.discrepancy import is_discrepancy
 from estimation.candidate_terms.significance import DETECTION_THRESHOLD, held_out_gain, residual_is_noise
 from estimation.device_fit.data import Run
-from estimation.device_fit.fit import Fit, fit_model, held_out_samples, misfit, time_blocks
+from estimation.device_fit.fit import (
+    Fit,
+    fit_model,
+    held_out_samples,
+    misfit,
+    nominal_values_are_improbable,
+    time_blocks,
+)
 from estimation.device_fit.noise import sample_times
 from estimation.device_fit.open_loop import DIVERGED_ERROR, OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.diagnosis.discrepancy_law import STATIC_PARAMETERS, measured_law_table
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.pruning import refit_without, with_free_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from estimation.diagnosis.shares import explains_most
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.stages import MotionSensor
@@ -58,9 +64,9 @@ def improve(result: SelectionResult) -> Improvement:
     alone, they are rejected by a prediction that is worse than that of the nominal device, beyond the uncertainty of
     the comparison; within it they stay, but the nominal device takes the place of one with a larger error. If they
     leave more than noise, they have to explain more of the misfit than they leave, and to lower the error, and the
-    weakest of them too. A discrepancy term always remains a finding, but if the device with its measured law
-    predicts any channel of any run worse, the device with the named laws alone is returned, or the nominal one if that
-    is worse too.
+    weakest of them too. A discrepancy term always remains a finding, but if the device with its measured law predicts
+    any channel of any run worse, the device with the named laws alone is returned, or the nominal one if that is worse
+    too.
     """
     result = without_contradicted(_settled(result))
     runs, stated = result.likelihood.runs, result.final.model.device
@@ -85,7 +91,7 @@ def improve(result: SelectionResult) -> Improvement:
         else:
             reduced = without_weakest(result)
             others = [nominal, open_loop(runs, improved_device(reduced.final))] if reduced.steps else [nominal]
-            if explains_most(result) and all(has_larger_error(improved, other) for other in others):
+            if _explain_most(result) and all(has_larger_error(improved, other) for other in others):
                 return Improvement(result, device, nominal, improved)
             result = reduced
 
@@ -101,6 +107,16 @@ def _settled(result: SelectionResult) -> SelectionResult:
     if misfit(fit) >= misfit(final):
         return result
     return replace(result, final=fit, steps=tuple(replace(step, after=fit) for step in result.steps))
+
+
+def _explain_most(result: SelectionResult) -> bool:
+    """Whether the findings explain more of the misfit of the fitted samples than they leave above the noise.
+
+    Where nominal values are improbable without the findings, they have absorbed a part of what the findings explain,
+    and nothing follows.
+    """
+    explained, left = misfit(result.nominal) - misfit(result.final), result.final.chi2 - result.final.rows.sum()
+    return nominal_values_are_improbable(result.nominal) or bool(explained > left)
 
 
 def predicts_no_worse(run: Run, stated: Device, device: Device) -> bool:

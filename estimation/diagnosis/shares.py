@@ -13,7 +13,7 @@ from estimation.candidate_terms.linear_model import LinearModel
 from estimation.candidate_terms.linearisation import linear_model_of_corrections
 from estimation.candidate_terms.screening import ScoreTest
 from estimation.candidate_terms.significance import DETECTION_THRESHOLD, residual_is_noise
-from estimation.device_fit.fit import Fit, Likelihood, held_out_samples, misfit, nominal_values_are_improbable
+from estimation.device_fit.fit import Fit, Likelihood, held_out_samples, misfit
 from estimation.diagnosis.localisation import chi2_reduction_by_channel
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 
@@ -71,16 +71,6 @@ def noise_by_channel(likelihood: Likelihood) -> dict[str, float]:
             variance = power * 2.0 / output.data.size**2
             values.setdefault(output.name, []).append(variance)
     return {name: float(np.mean(runs)) for name, runs in values.items()}
-
-
-def explains_most(result: SelectionResult) -> bool:
-    """Whether the findings explain more of the misfit than they leave above the noise.
-
-    Where nominal values are improbable without the findings, they have absorbed a part of what the findings explain,
-    and nothing follows.
-    """
-    explained, left = misfit(result.nominal) - misfit(result.final), result.final.chi2 - result.final.rows.sum()
-    return nominal_values_are_improbable(result.nominal) or bool(explained > left)
 
 
 def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:

@@ -151,7 +151,7 @@ def _motion_sections(
 
 
 def _improved_fit(diagnosis: Diagnosis, search: SelectionResult) -> Fit:
-    """The fit of the improved device: with the findings, and with a measured law of what they leave."""
+    """The fit with the findings, and with a measured law of what they leave where the improved device holds one."""
     return diagnosis.remainder_fit or search.final
 
 

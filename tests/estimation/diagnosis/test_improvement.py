@@ -96,3 +96,18 @@ def test_a_finding_that_held_out_samples_contradict_is_rejected(
     result = without_contradicted(SelectionResult(cast(Any, None), fit_with_residual(9.0), final, steps))
     assert [step.candidate.name for step in result.steps] == ["true", "imitation"][:kept]  # type: ignore[attr-defined]
     assert result.final is (final if kept == 2 else reduced)
+
+
+@pytest.mark.parametrize(
+    ("explained", "absorbed", "expected"),
+    [(130.0, False, True), (70.0, False, False), (70.0, True, True)],
+)
+def test_findings_have_to_explain_more_than_they_leave(
+    explained: float, absorbed: bool, expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They leave 100 above the noise. Nothing follows where nominal values have absorbed a part of the misfit."""
+    monkeypatch.setattr(improvement, "nominal_values_are_improbable", lambda fit: absorbed)
+    final = SimpleNamespace(chi2=600.0, penalty=2.0, rows=np.ones(500, bool))
+    nominal = SimpleNamespace(chi2=602.0 + explained, penalty=0.0)
+    result = SelectionResult(cast(Any, None), cast(Any, nominal), cast(Any, final))
+    assert improvement._explain_most(result) == expected
