@@ -143,6 +143,7 @@ def fit_growing(
     reached: float,
     limit: float = MAX_CORRECTABLE_RATIO,
     fixed: Sequence[int] = (),
+    abort_above: float = np.inf,
 ) -> Fit:
     """Fit over windows that grow as fast as the motion is followed, from one of the length ``reached`` on.
 
@@ -153,11 +154,13 @@ def fit_growing(
         x: start, shape (p,).
         limit: residual ratio up to which a fit over a longer window corrects the phase.
         fixed: indices of parameters that keep their value.
+        abort_above: chi-square of the whole recording above which the fit is of no use. That of a window is smaller,
+            so it ends at the first one above, with the fit over that window.
     """
     stop = reached
     while True:
         fit = fit_window(likelihood, model, x, stop, fixed)
-        if stop >= 1.0:
+        if stop >= 1.0 or fit.chi2 > abort_above:
             return fit
         lost = stop > reached and _residual_ratios(likelihood, fit, stop, fitted=True).max() > limit
         x, stop = fit.x, 1.0 if lost else _next_window(likelihood, fit, stop, limit)

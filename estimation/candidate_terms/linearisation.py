@@ -124,9 +124,9 @@ def common_parameters(fit: Fit) -> list[int]:
 def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequence[LinearTerm]) -> Fit:
     """The fit with these terms and no others, from their estimates in the linear model.
 
-    Where they do not follow the motion, it is made over windows of increasing length. Where the nominal values of
-    ``fit`` lie improbably far from the stated ones, they have absorbed what the terms now explain, and the way back
-    leads through a long curved valley. Then it is made from the stated values first.
+    Where these do not follow the motion, it is made over windows of increasing length. So it is where the nominal
+    values of ``fit`` lie improbably far from the stated ones: they have absorbed what the terms now explain, and the
+    way back leads through a long curved valley. Then it begins at the stated values.
 
     Args:
         fit: around which the model is linear.
@@ -145,12 +145,16 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
             at_term = model.indices("term", key)
             x[at_term] = without[at_term] = term.test.x[term.test.model.indices("term", key)]
         set_amplitudes(x, model, term.candidate, estimates[low:high])
-    if nominal_values_are_improbable(fit):
-        stated = fit_growing(likelihood, model, stated_values(model, x), window_schedule(model)[0])
-        if stated.chi2 < fit.chi2 and not nominal_values_are_improbable(stated):
-            return fit_model(likelihood, model, stated.x)
     start = damped_start(likelihood, fit, model, without, x - without)
     residual = likelihood.residual(model, start)[fit.rows]
-    if residual @ residual < MAX_CHI2_RATIO * fit.chi2:
-        return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
-    return fit_growing(likelihood, model, x, window_schedule(model)[0])
+    follows = residual @ residual < MAX_CHI2_RATIO * fit.chi2
+    absorbed = nominal_values_are_improbable(fit)
+    if absorbed or not follows:
+        most = fit.chi2 if follows else MAX_CHI2_RATIO * fit.chi2
+        begin = stated_values(model, x) if absorbed else x
+        grown = fit_growing(likelihood, model, begin, window_schedule(model)[0], abort_above=most)
+        if absorbed and grown.chi2 < fit.chi2 and not nominal_values_are_improbable(grown):
+            return fit_model(likelihood, model, grown.x)
+        if not follows:
+            return grown
+    return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)

@@ -19,6 +19,7 @@ from estimation.device_fit.hum import STRONG_HUM, TONE, WEAK_HUM, select_mains_h
 from estimation.device_fit.model import Model, uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.least_squares import eliminate_backward, laplace_neg2_log_evidence
+from estimation.parallel import map_fits
 from scanner.arrays import Array
 
 NONLINEAR_ITERATIONS, NONLINEAR_TOLERANCE = 60, 1e-3
@@ -82,13 +83,16 @@ def drop_redundant(likelihood: Likelihood, fit: Fit) -> tuple[Fit, dict[str, Fit
         The fit, and the fits without each of its terms by key, where there are several.
     """
     fit = select_hum(likelihood, fit)
-    without = {}
-    for candidate in uncertain(fit.model) if len(fit.model.candidates) > 1 else ():
-        reduced = select_hum(likelihood, refit_without(likelihood, fit, candidate))
-        if not evidence_gain(likelihood, reduced, fit):
-            return drop_redundant(likelihood, reduced)
-        without[candidate.key] = reduced
-    return fit, without
+    terms = uncertain(fit.model) if len(fit.model.candidates) > 1 else []
+
+    def refit(term: Candidate) -> Fit:
+        return select_hum(likelihood, refit_without(likelihood, fit, term))
+
+    without = map_fits(refit, terms, likelihood.steps)
+    redundant = next((reduced for reduced in without if not evidence_gain(likelihood, reduced, fit)), None)
+    if redundant is not None:
+        return drop_redundant(likelihood, redundant)
+    return fit, {term.key: reduced for term, reduced in zip(terms, without, strict=True)}
 
 
 def select_hum(likelihood: Likelihood, fit: Fit) -> Fit:

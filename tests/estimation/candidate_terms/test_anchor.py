@@ -9,7 +9,7 @@ import pytest
 from numpy.polynomial.chebyshev import chebval
 from scipy.integrate import solve_ivp
 
-from estimation.candidate_terms.anchor import MAX_RESIDUAL_RATIO, fit_anchor, residual_ratio
+from estimation.candidate_terms.anchor import MAX_RESIDUAL_RATIO, fit_anchor, fit_growing, residual_ratio
 from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS, FORCE_POWERS, N_FORCE_POWERS, cosine_series
 from estimation.candidate_terms.screening import ProfiledLinearModel, all_candidates, damped_start, predict_gain
 from estimation.device_fit.data import prepare_run
@@ -84,6 +84,16 @@ def test_a_drifting_stiffness_follows_the_motion_of_a_spring() -> None:
     assert [candidate.term.effect for candidate in choice.fit.model.candidates] == ["cubic-stiffness"]
     (size,) = choice.fit.model.values(choice.fit.model.candidates[0], choice.fit.x)
     assert size == pytest.approx(20.0 * (2 * np.pi * 50.0) ** 2, rel=0.1)  # the angle's gain is known to 2 %
+
+
+def test_a_growing_fit_ends_at_the_first_window_that_is_worse_than_another_fit_of_the_whole() -> None:
+    device, recording = hardening_decay()
+    nominal = Model([prepare_run(recording, device)], device)
+    likelihood, (first, *_) = Likelihood(nominal.runs, flat_whiteners(nominal)), window_schedule(nominal)
+    whole = fit_growing(likelihood, nominal, np.zeros(len(nominal.parameters)), first)
+    aborted = fit_growing(likelihood, nominal, np.zeros(len(nominal.parameters)), first, abort_above=0.001 * whole.chi2)
+    assert 0.001 * whole.chi2 < aborted.chi2 <= whole.chi2
+    assert np.count_nonzero(aborted.rows) < np.count_nonzero(whole.rows)
 
 
 @pytest.mark.slow
