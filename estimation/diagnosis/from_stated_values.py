@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -91,12 +92,11 @@ def fit_nonlinear_law(
         free = fit_window(likelihood, model, kept.x, stop)
         if _leaves_noise(free):
             continue
-        starts = [nonlinear_starts(likelihood, fit, pool, stop) for fit in (kept, free)]
-        fits = [_fit_law_first(likelihood, start, stop) for each in starts for start in _best_of_each_sign(each)]
-        grown = [
-            fit_model(likelihood, fit.model, fit_growing(likelihood, fit.model, fit.x, stop).x)
-            for fit in _different(filter(_leaves_noise, fits))[:MAX_CONTINUED_FITS]
-        ]
+        scored = [nonlinear_starts(likelihood, fit, pool, stop) for fit in (kept, free)]
+        starts = [start for each in scored for start in _best_of_each_sign(each)]
+        fits = map_fits(partial(_fit_law_first, likelihood, stop), starts, stop * likelihood.steps)
+        different = _different(filter(_leaves_noise, fits))[:MAX_CONTINUED_FITS]
+        grown = map_fits(partial(_continue_fit, likelihood, stop), different, likelihood.steps)
         possible = [fit for fit in grown if residual_is_noise(fit) and not nominal_values_are_improbable(fit)]
         if possible:
             return min(possible, key=lambda fit: fit.neg2_log_evidence)
@@ -130,11 +130,16 @@ def _best_of_each_sign(starts: Sequence[ScoreTest]) -> list[ScoreTest]:
     return [start for of_sign in by_sign.values() for start in of_sign[:MAX_WINDOW_STARTS]]
 
 
-def _fit_law_first(likelihood: Likelihood, start: ScoreTest, stop: float) -> Fit:
+def _fit_law_first(likelihood: Likelihood, stop: float, start: ScoreTest) -> Fit:
     """The fit over a window of a law beside the stated values, then of all."""
     model = start.model
     law = fit_window(likelihood, model, stated_values(model, start.x), stop, fixed=model.indices("nominal"))
     return fit_window(likelihood, model, law.x, stop)
+
+
+def _continue_fit(likelihood: Likelihood, stop: float, fit: Fit) -> Fit:
+    """The fit of the whole recording from one over a window."""
+    return fit_model(likelihood, fit.model, fit_growing(likelihood, fit.model, fit.x, stop).x)
 
 
 def _leaves_noise(fit: Fit) -> bool:
