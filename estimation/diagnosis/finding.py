@@ -238,15 +238,13 @@ def _advice(result: SelectionResult, step: SelectionStep, distance: Mapping[str,
     parts = []
     nearest = min(confusable, key=lambda key: distance.get(key, np.inf), default=None)
     if nearest is not None and distance.get(nearest, np.inf) < DISCRIMINATION_SIGMA:
-        parts.append(
-            discrimination_advice(
-                result.likelihood, result.final, candidate, confusable.pop(nearest), distance[nearest]
-            )
-        )
+        rival = confusable[nearest]
+        parts.append(discrimination_advice(result.likelihood, result.final, candidate, rival, distance[nearest]))
+        confusable = {key: other for key, other in confusable.items() if other.term.effect != rival.term.effect}
     for other in confusable.values():
         text = candidate.term.confounders.get(other.term.effect) or other.term.confounders.get(effect)
         parts += [f"{other.term.effect}: {text}"] if text else []
-    return "; ".join(dict.fromkeys(parts)) or None  # a rival on both axes once
+    return "; ".join(dict.fromkeys(parts)) or None  # a rival on several axes or channels once
 
 
 def _name(candidate: Candidate) -> str:

@@ -21,6 +21,7 @@ from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectabi
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from recon.report.conclusions import conclude_diagnosis, conclude_plan, name_rival
 from recon.report.diagnosis_figures import (
+    PAIR,
     detectability_figure,
     effect_figure,
     measured_curve_figure,
@@ -151,7 +152,7 @@ def _motion_sections(
 
 
 def _improved_fit(diagnosis: Diagnosis, search: SelectionResult) -> Fit:
-    """The fit with the findings, and with a measured law of what they leave where the improved device holds one."""
+    """The fit with the findings, and with a measured law of what they leave where the written device holds one."""
     return diagnosis.remainder_fit or search.final
 
 
@@ -190,11 +191,11 @@ def _blur_section(errors: Mapping[str, PredictionPhaseError]) -> Section:
         figures.append(phase_error_figure(error, f"{name}: blur at the centre of a line"))
     text = (
         f"A phase error δφ displaces the centre of a line by m δφ pixels, with m = {PICTURE_HALF_WIDTH_PX} in a "
-        f"picture of {2 * PICTURE_HALF_WIDTH_PX} pixels. Nominal: the motion that the fitted nominal device predicts "
-        "from the drive alone, against the improved device. Improved: 95 % limit of the uncertainty of the improved "
-        "device's phase."
+        f"picture of {2 * PICTURE_HALF_WIDTH_PX} pixels. First the motion that the nominal device with "
+        "fitted values predicts from the drive alone, against that of the device with the findings; then the 95 % "
+        "limit of the uncertainty of this device's phase."
     )
-    table = Table(["rms blur (pixels)", "nominal device", "improved device"], rows)
+    table = Table(["rms blur (pixels)", *(label for _, label in PAIR)], rows)
     return Section(heading, text, table, figures, least="24rem")
 
 

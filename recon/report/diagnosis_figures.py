@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BEFORE, AFTER, MEASURED = "#c8553d", "#2f6fb0", "#333333"
-"""Colours of the nominal device, of the improved device and of measured samples."""
+"""Colours of the nominal device, of the device with the findings and of measured samples."""
 
-PAIR = ((BEFORE, "nominal device"), (AFTER, "improved device"))
+PAIR = ((BEFORE, "nominal device, values fitted"), (AFTER, "with the findings"))
+"""Colour and name of the two fits. The device that is written may hold less than the second one: only what a device
+file can state, and nothing that predicts worse."""
 
 TIME_BINS = 120
 """Bins of a residual over time: enough to resolve a drift, few enough for the noise of a bin to be small."""
@@ -117,7 +119,7 @@ def residual_spectrum_figure(name: str, frequency: Array, pair: Sequence[Array])
 
 
 def portrait_figure(before: Array, after: Array, caption: str) -> Figure:
-    """Residuals of the nominal and the improved device over angle and rate of the mirror."""
+    """Residuals without and with the findings over angle and rate of the mirror."""
     drawing, axes = new_figure(1, 2, (6.0, 3.0))
     largest = max(float(np.nanmax(before)), 2.0)
     for panel, values, (_, name) in zip(axes[0], (before, after), PAIR, strict=True):
@@ -137,8 +139,8 @@ def phase_error_figure(error: PredictionPhaseError, caption: str) -> Figure:
     def draw(axes: Axes) -> None:
         time = 1e3 * error.time
         for phase, colour, label in (
-            (error.before, BEFORE, "nominal device"),
-            (error.after, AFTER, "improved device, 95 % limit"),
+            (error.before, BEFORE, PAIR[0][1]),
+            (error.after, AFTER, f"{PAIR[1][1]}, 95 % limit"),
         ):
             blur = np.maximum(PICTURE_HALF_WIDTH_PX * np.abs(phase), MIN_DRAWN_BLUR_PX)
             axes.plot(time, blur, color=colour, label=label)

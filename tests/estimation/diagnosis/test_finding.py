@@ -93,6 +93,16 @@ def test_a_rival_on_both_axes_gets_its_advice_once() -> None:
     assert text.count("carrier-torque") == 1
 
 
+def test_the_nearest_rival_gets_no_general_advice_for_another_channel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finding, "discrimination_advice", lambda *arguments: "use a larger drive")
+    terms = catalogue()
+    delays = [Candidate(terms["channel-delay"], "x", channel) for channel in ("sense", "angle")]
+    rivals = [SimpleNamespace(candidate=delay, evidence_gap=0.0) for delay in delays]
+    lag = SimpleNamespace(candidate=Candidate(terms["readout-lag"], "x", "sense"), rivals=rivals)
+    result = SimpleNamespace(likelihood=None, final=None)
+    assert _advice(result, lag, {delays[0].key: 0.1}) == "use a larger drive"  # type: ignore[arg-type]
+
+
 def test_the_interval_contains_the_value_of_the_improved_device(monkeypatch: pytest.MonkeyPatch) -> None:
     delay = Candidate(catalogue()["readout-lag"], "x", "sense")
     model = SimpleNamespace(
