@@ -121,7 +121,13 @@ def common_parameters(fit: Fit) -> list[int]:
     return [i for i, f in enumerate(fit.model.parameters) if f.kind not in ("term", "hidden") or f.owner not in linear]
 
 
-def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequence[LinearTerm]) -> Fit:
+def fit_terms(
+    linear: LinearModel,
+    likelihood: Likelihood,
+    fit: Fit,
+    terms: Sequence[LinearTerm],
+    max_ratio: float = MAX_CHI2_RATIO,
+) -> Fit:
     """The fit with these terms and no others, from their estimates in the linear model.
 
     Where these do not follow the motion, it is made over windows of increasing length. So it is where the nominal
@@ -130,6 +136,8 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
 
     Args:
         fit: around which the model is linear.
+        max_ratio: chi-square over that of ``fit`` above which the result is of no use. It is the fit over a window
+            where that shows it.
     """
     at, estimates = columns_of(terms), linear.estimate(terms)
     kept = [candidate for candidate in fit.model.candidates if not is_linear(candidate)]
@@ -150,11 +158,11 @@ def fit_terms(linear: LinearModel, likelihood: Likelihood, fit: Fit, terms: Sequ
     follows = residual @ residual < MAX_CHI2_RATIO * fit.chi2
     absorbed = nominal_values_are_improbable(fit)
     if absorbed or not follows:
-        most = fit.chi2 if follows else MAX_CHI2_RATIO * fit.chi2
+        most = fit.chi2 if follows else max_ratio * fit.chi2
         begin = stated_values(model, x) if absorbed else x
         grown = fit_growing(likelihood, model, begin, window_schedule(model)[0], abort_above=most)
         if absorbed and grown.chi2 < fit.chi2 and not nominal_values_are_improbable(grown):
             return fit_model(likelihood, model, grown.x)
         if not follows:
             return grown
-    return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS)
+    return fit_model(likelihood, model, start, max_iterations=FIT_ITERATIONS, abort_above=max_ratio * fit.chi2)

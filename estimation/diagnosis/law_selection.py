@@ -23,6 +23,7 @@ from estimation.candidate_terms.linear_model import (
     RivalFit,
 )
 from estimation.candidate_terms.linearisation import MAX_CHI2_RATIO, fit_terms, linear_model
+from estimation.candidate_terms.screening import MAX_CHI2_GROWTH
 from estimation.candidate_terms.significance import DETECTION_THRESHOLD, satisfies_sign_constraints
 from estimation.device_fit.fit import Fit, Likelihood, fit_model, misfit
 from estimation.device_fit.initial import refit_under_own_noise
@@ -107,9 +108,9 @@ class _Centre:
         explained = misfit(self.without_laws(nominal)) - misfit(self.fit)
         return need_of_laws(self.linear, self.laws, explained, alone=np.inf).takes_bulk
 
-    def is_followed_by(self, other: Fit) -> bool:
+    def is_followed_by(self, other: Fit, max_ratio: float = MAX_CHI2_RATIO) -> bool:
         """Whether another fit has possible signs and has not lost the motion, which this one has."""
-        return satisfies_sign_constraints(other) and other.chi2 < MAX_CHI2_RATIO * self.fit.chi2
+        return satisfies_sign_constraints(other) and other.chi2 < max_ratio * self.fit.chi2
 
 
 def choose_laws(
@@ -236,7 +237,10 @@ def _further_additions(centre: _Centre, fitted: Collection[Effects]) -> dict[Eff
 
 
 def _fit_sets(
-    centre: _Centre, sets: Mapping[Effects, tuple[int, ...]], fitted: Mapping[Effects, Fit]
+    centre: _Centre,
+    sets: Mapping[Effects, tuple[int, ...]],
+    fitted: Mapping[Effects, Fit],
+    max_ratio: float = MAX_CHI2_RATIO,
 ) -> dict[Effects, Fit]:
     """Fits of sets of laws, each from an earlier one of the same effects where there is one."""
 
@@ -244,7 +248,8 @@ def _fit_sets(
         earlier = fitted.get(centre.linear.effects(laws))
         if earlier is not None:
             return fit_model(centre.likelihood, earlier.model, earlier.x)
-        return fit_terms(centre.linear, centre.likelihood, centre.fit, [centre.linear.laws[i] for i in laws])
+        terms = [centre.linear.laws[i] for i in laws]
+        return fit_terms(centre.linear, centre.likelihood, centre.fit, terms, max_ratio)
 
     return dict(zip(sets, map_fits(fit, sets.values(), centre.likelihood.steps), strict=True))
 
@@ -296,10 +301,11 @@ def _exchange_near_rival(
 
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
     ``DETECTION_THRESHOLD`` are fitted, each once, the best in the place of every law first, and compared around their
-    own fits. Where the laws take the bulk of a misfit and leave more than noise, so are the confounders that their
-    terms state; laws that take a part of what no law describes have none. Where corrections gain no more than that
-    beside the laws, they have no part in the comparison: beside a fit that leaves only noise, one that leaves more to
-    corrections is not a better one.
+    own fits, unless a rival leaves so much more that the linear model, which predicts the same for it, is wrong. Where
+    the laws take the bulk of a misfit and leave more than noise, so are the confounders that their terms state; laws
+    that take a part of what no law describes have none. Where corrections gain no more than that beside the laws, they
+    have no part in the comparison: beside a fit that leaves only noise, one that leaves more to corrections is not a
+    better one.
 
     Returns:
         that fit, and all fits that were compared under the same noise.
@@ -310,9 +316,9 @@ def _exchange_near_rival(
     near = near_rivals(centre.linear, centre.beside, fitted)
     if not centre.leaves_noise and centre.takes_bulk(nominal):
         near |= stated_confounders(centre.linear, centre.laws, fitted.keys() | near.keys())
-    rivals = _fit_sets(centre, near, fitted)
+    rivals = _fit_sets(centre, near, fitted, MAX_CHI2_GROWTH)
     fitted |= rivals
-    compared = {effects: fit for effects, fit in rivals.items() if centre.is_followed_by(fit)}
+    compared = {effects: fit for effects, fit in rivals.items() if centre.is_followed_by(fit, MAX_CHI2_GROWTH)}
     for fit in compared.values():
         around = linear_model(centre.likelihood, fit, discrepancies)
         laws = range(len(around.laws))
