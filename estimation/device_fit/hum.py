@@ -57,7 +57,7 @@ def select_mains_hum(likelihood: Likelihood, fit: Fit, kinds: Sequence[tuple[int
     if not any(each.size for each in columns.values()):
         return min(fit_hum_variants(likelihood, fit), key=lambda variant: variant.neg2_log_evidence)
     beside = _beside_hum(fit)
-    without = beside.evaluate(np.zeros((beside.residual.size, 0)))[0]
+    without = beside.evaluate(np.zeros((np.count_nonzero(fit.rows), 0)))[0]
     lowest, strongest = min((beside.evaluate(each)[0], mains) for mains, each in columns.items())
     selected = min(_refined_mains(likelihood, fit, beside, strongest, kinds))[1:] if lowest < without else ()
     if selected == fit.model.mains:
@@ -148,35 +148,40 @@ def _with_fitted_frequency(likelihood: Likelihood, fit: Fit, beside: _BesideHum,
 
 
 class _BesideHum(NamedTuple):
-    """A linearised fit without its hum.
+    """A linearised fit without its hum, for many columns of hum beside the same parameters.
 
     Attributes:
-        residual: whitened fitted samples with all parameters at zero, shape (n,).
-        columns: their sensitivities to all parameters but the hum, shape (n, p).
-        precision: of the priors of these parameters, shape (p,).
+        residual: whitened fitted samples with all parameters at zero, and as many zeros as parameters, shape (n + p,).
+        basis: orthonormal columns that span the sensitivities to all parameters but the hum, with one more row for the
+            prior of each, shape (n + p, p).
     """
 
     residual: Array
-    columns: Array
-    precision: Array
+    basis: Array
 
     def evaluate(self, hum: Array, offset: Array | float = 0.0) -> tuple[float, Array]:
-        """-2 log evidence with columns of hum (n, q), up to a constant, and their estimates (q,).
+        """-2 log evidence with columns of hum (n, q), up to a constant of the fit, and their estimates (q,).
 
         Args:
             offset: added to the residual, shape (n,).
         """
-        precision = np.concatenate([self.precision, np.ones(hum.shape[1])])
-        result = regress(np.column_stack([self.columns, hum]), (self.residual + offset)[:, None], precision)
+        n, q = hum.shape
+        both = np.zeros((self.residual.size, q + 1))
+        both[:n, :q], both[:, q] = hum, self.residual
+        both[:n, q] += offset
+        both -= self.basis @ (self.basis.T @ both)
+        result = regress(both[:, :q], both[:, q:], np.ones(q))
         estimates = -np.linalg.solve(result.factor, result.projected[:, 0])
-        return float(np.sum(result.remainder**2)) + result.log_determinant, np.asarray(estimates)[self.precision.size :]
+        return float(np.sum(result.remainder**2)) + result.log_determinant, np.asarray(estimates)
 
 
 def _beside_hum(fit: Fit) -> _BesideHum:
     """The linearisation of a fit without its hum."""
     others = [i for i in range(fit.x.size) if not _is_hum(fit.model, i)]
     residual = fit.residual - fit.jacobian @ fit.x
-    return _BesideHum(residual[fit.rows], fit.jacobian[fit.rows][:, others], fit.model.precision[others])
+    priors = np.diag(np.sqrt(fit.model.precision[others]))
+    basis = np.linalg.qr(np.vstack([fit.jacobian[fit.rows][:, others], priors]))[0]
+    return _BesideHum(np.append(residual[fit.rows], np.zeros(len(others))), basis)
 
 
 def _deviating(nominal: Mains, deviation: float) -> Mains:
