@@ -143,18 +143,21 @@ def test_a_law_with_inexact_sensitivities_is_compared_where_the_discrepancy_has_
 
 
 @pytest.mark.parametrize("takes_bulk", [True, False])
-@pytest.mark.parametrize(("discrepancy", "exchanged"), [(0.0, False), (0.05, True)])
+@pytest.mark.parametrize(
+    ("discrepancy", "rival_chi2", "exchanged"), [(0.0, 600.0, False), (0.05, 600.0, True), (0.05, 1300.0, False)]
+)
 def test_beside_a_fit_that_leaves_only_noise_corrections_improve_no_rival(
-    discrepancy: float, exchanged: bool, takes_bulk: bool, monkeypatch: pytest.MonkeyPatch
+    discrepancy: float, rival_chi2: float, exchanged: bool, takes_bulk: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The rival is worse than the present law without corrections, and better with them.
 
-    Confounders that terms state are compared too where the laws leave more than noise and take the bulk of the misfit.
+    One that leaves more than twice as much by itself is not compared. Confounders that terms state are compared too
+    where the laws leave more than noise and take the bulk of the misfit.
     """
     linear = linear_model({"cubic-damping": 1.0}, discrepancy)
     beside = linear.hypothesis((1,), max_scale=MAX_SCALE_BESIDE).neg2_log_evidence
     alone = linear.without_discrepancy((1,)).neg2_log_evidence
-    present, rival = SimpleNamespace(chi2=600.0), SimpleNamespace(chi2=600.0)
+    present, rival = SimpleNamespace(chi2=600.0), SimpleNamespace(chi2=rival_chi2)
 
     def around_rival(likelihood: Likelihood, fit: Fit, corrections: list[Candidate]) -> SimpleNamespace:
         score = beside - 50.0 if corrections else alone + 50.0
