@@ -121,29 +121,28 @@ def fit_levenberg_marquardt(
         fixed: indices of parameters that keep their value.
         max_step: largest change of each parameter in one step, shape (p,); a longer step is scaled down as a whole.
         max_iterations: of new Jacobians. 0 evaluates residual and Jacobian at ``x`` and changes nothing.
-        tolerance: stop when a step lowers the misfit by less, or by less than this times the mean square of the
-            residual, where that is above 1: the parameters are determined as much less precisely.
+        tolerance: stop when a step lowers the misfit by less.
         abort_above: misfit of a competing fit. A fit above it that no longer approaches it is stopped early.
 
     Source: Marquardt, J. SIAM 11, 431 (1963), with damping relative to the diagonal.
     """
     x, current = np.array(x, np.float64), residual(x)
     used = np.ones(current.size, bool) if rows is None else rows
-    held, samples = list(fixed), max(1, int(np.count_nonzero(used)))
+    held = list(fixed)
 
     def misfit(trial: Array, at: Array) -> float:
         part = at[used]
         return float(part @ part + prior_precision @ (trial * trial))
 
     value, slopes = misfit(x, current), jacobian(x, current)
-    damping, fresh, iteration, kept, before = INITIAL_DAMPING, True, 0, 0, value
+    damping, fresh, iteration, kept = INITIAL_DAMPING, True, 0, 0
     while iteration < max_iterations:
         part = slopes[used]
         normal = part.T @ part + np.diag(prior_precision)
         gradient = part.T @ current[used] + prior_precision * x
         normal[held], normal[:, held], gradient[held] = 0.0, 0.0, 0.0
         normal[held, held] = 1.0
-        gain, predicted, least = 0.0, 0.0, tolerance * max(1.0, value / samples)
+        gain = predicted = 0.0
         while damping < MAX_DAMPING:
             try:
                 step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
@@ -159,21 +158,20 @@ def fit_levenberg_marquardt(
                 predicted = -float(step @ (2.0 * gradient + normal @ step))
                 damping = max(damping / DAMPING_LOWER, MIN_DAMPING)
                 break
-            if kept or gradient @ -step < 0.1 * least:  # an old Jacobian, or even its linear model promises no more
+            if gradient @ -step < 0.1 * tolerance:  # even the linear model promises no more than that
                 break
             damping *= DAMPING_RAISE
-        if fresh and gain < least and iteration > 0:
+        if fresh and gain < tolerance and iteration > 0:
             break
         kept += 1
-        fresh = gain <= max(JACOBIAN_REUSE_RATIO * predicted, least) or kept == MAX_STEPS_PER_JACOBIAN
+        fresh = gain <= max(JACOBIAN_REUSE_RATIO * predicted, tolerance) or kept == MAX_STEPS_PER_JACOBIAN
         if fresh:
             kept = 0
             iteration += 1
             slopes = jacobian(x, current)
             patience = 2 if value > DIVERGED_RATIO * abort_above else 4
-            if iteration > patience and before - value < ABORT_PROGRESS * (value - abort_above):
+            if iteration > patience and gain < ABORT_PROGRESS * (value - abort_above):
                 break
-            before = value
     return LeastSquaresFit(x, current, slopes, used, prior_precision)
 
 
