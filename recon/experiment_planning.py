@@ -8,7 +8,6 @@ together, as their recordings would be.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -216,15 +215,13 @@ def plan_files(
     Raises:
         BadInput: an excitation, a recording or the device cannot be used.
     """
-    from tqdm import tqdm
-
     from estimation.device_fit.data import prepare_run
     from recon.report.diagnosis import plan_report
+    from recon.runtime.stage_progress import stage_progress
 
     check_folder(output)
     planned = {path: read_excitation(path) for path in paths if path.suffix == ".toml"}
-    bar_format, hidden = "{elapsed} {desc}", quiet or None  # None shows it on a terminal only
-    with ExitStack() as stack, tqdm(file=sys.stderr, disable=hidden, bar_format=bar_format, leave=False) as bar:
+    with ExitStack() as stack, stage_progress(quiet) as progress:
         recorded = {path: stack.enter_context(open_any(path, mapping)) for path in paths if path.suffix != ".toml"}
         nominal = devices.find(device) if device is not None else None
         nominal = nominal or next((each.device for each in recorded.values() if each.device is not None), None)
@@ -232,11 +229,11 @@ def plan_files(
             raise BadInput("states no device", file=paths[0], hint="give one with --device")
         runs = []
         for path in paths:
-            bar.set_description_str(f"playing {path.name}")
+            progress(f"playing {path.name}")
             runs.append(
                 prepare_planned_run(planned[path], nominal) if path in planned else prepare_run(recorded[path], nominal)
             )
-        bar.set_description_str("every effect of the catalogue")
+        progress("every effect of the catalogue")
         detectabilities = predict_detectability(runs, nominal)
         content = plan_to_json(runs, nominal, detectabilities)
         with replacing_folder(output) as folder:

@@ -62,9 +62,19 @@ class Whitener:
 
     @property
     def noise_variance(self) -> float:
-        """Variance of the noise of a sample, with the level of the last bin in those that are not compared."""
+        """Variance of the noise of a sample, with the level of the last bin in those above the compared band.
+
+        It is an upper limit, because the spectrum below the lowest measured bin is.
+        """
         beyond = max(self.size // 2 - self.psd.size, 0)
         return float(np.sum(self.psd) + beyond * self.psd[-1]) * 2.0 / self.size**2
+
+    @property
+    def measured_noise_variance(self) -> float:
+        """The same with the level of the lowest measured bin below it."""
+        lowest = int(np.ceil(self.first))
+        extrapolated = float(np.sum(self.psd[:lowest])) - lowest * float(self.psd[lowest])
+        return self.noise_variance - extrapolated * 2.0 / self.size**2
 
     @property
     def time(self) -> Array:

@@ -23,9 +23,6 @@ PHASE_POINTS, SAMPLES_PER_PHASE = 200, 16
 WAVEFORM_SAMPLES = 120
 """Samples of a channel whose waveform is shown: a few periods."""
 
-PICTURE_HALF_WIDTH_PX = 200
-"""Pixels from the middle of a line to its end, in a picture of 400 pixels."""
-
 
 def draw_parameters(fit: Fit, count: int = POSTERIOR_DRAWS) -> Array:
     """Parameters drawn from the Gaussian posterior, shape (count, len(x)); the same draws in every call."""
@@ -75,10 +72,6 @@ class PredictionPhaseError:
     time: Array
     before: Array
     after: Array
-
-    def blur_px(self, phase: Array) -> float:
-        """Root mean square of the displacement at the centre of a line by a phase error [px]."""
-        return PICTURE_HALF_WIDTH_PX * float(np.sqrt(np.mean(phase**2)))
 
 
 def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int) -> PredictionPhaseError | None:

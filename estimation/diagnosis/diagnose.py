@@ -17,7 +17,13 @@ from estimation.diagnosis.held_drive import with_held_drives
 from estimation.diagnosis.improvement import improve
 from estimation.diagnosis.remainder_law import with_remainder_law
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
-from estimation.diagnosis.shares import best_correction, describe_unexplained, find_corrections, find_remainder
+from estimation.diagnosis.shares import (
+    best_correction,
+    describe_unexplained,
+    find_corrections,
+    find_remainder,
+    noise_by_channel,
+)
 from estimation.diagnosis.unit_check import check_units_and_signs
 from estimation.parallel import map_fits
 from estimation.signals import require_device
@@ -41,6 +47,7 @@ class Diagnosis:
         nominal: deviation of every nominal value from the stated one, in tolerances.
         remainder: share, stage and channel of the largest misfit that no finding explains, None if there is none.
         open_loop: prediction error of the nominal and the improved device, by channel.
+        noise: standard deviation of the noise, by channel, in its unit: no prediction has a smaller error.
         optics: effects on the picture, for every recording with an intensity.
         further_modes: see :func:`estimation.device_fit.further_modes.describe_modes`.
         hum: mains hum that is stronger than the noise, by channel, see
@@ -62,6 +69,7 @@ class Diagnosis:
     hum: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     untested: str | None = None
     remainder_fit: Fit | None = None
+    noise: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         lines = [f"Diagnosis of {self.device.name!r}: {self.verdict}"]
@@ -83,6 +91,7 @@ class Diagnosis:
             "nominal": dict(self.nominal),
             "remainder": None if self.remainder is None else dict(self.remainder),
             "open_loop": dict(self.open_loop),
+            "noise": dict(self.noise),
             "optics": list(self.optics),
             "further_modes": {name: dict(modes) for name, modes in self.further_modes.items()},
             "hum": {name: dict(of) for name, of in self.hum.items()},
@@ -148,6 +157,7 @@ def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress, excl
     terms: Mapping[str, Term] = {effect: term for effect, term in catalogue().items() if effect not in excluded}
     while True:
         result = select_terms(runs, device, terms, progress)
+        progress("prediction of held-out samples, values and shares")
         diagnosis = build_diagnosis(result)
         if not result.steps or (diagnosis.search and diagnosis.search.steps):
             return diagnosis
@@ -183,6 +193,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
         improvement.to_json(),
         hum=describe_strong_hum(result.final),
         remainder_fit=improvement.remainder_fit,
+        noise={name: variance**0.5 for name, variance in noise_by_channel(result.likelihood).items()},
     )
 
 

@@ -159,7 +159,7 @@ def _iterate_selection(
             return centre, compared  # several laws take parts of what no law describes
         kept = centre.laws if needed == present else ()
         proposed = [centre.laws] if returned else _propose_laws(centre, kept, first=not fitted)
-        progress("beside a discrepancy: " + " or ".join(map(linear.describe, proposed)))
+        progress("fits with " + " or ".join(dict.fromkeys(map(linear.describe, proposed))))
         options = {linear.effects(laws): laws for laws in proposed if laws}
         if not options:
             if not present or needed == present or not _is_needed(centre, centre.without_laws(nominal)):
@@ -167,6 +167,7 @@ def _iterate_selection(
             needed, start = present, centre.fit
             continue
         if list(options) == [present]:
+            progress(f"laws that are hard to tell from {linear.describe(centre.laws)}")
             exchanged, near = _exchange_near_rival(centre, candidates, fitted, nominal)
             compared.append(near)
             if exchanged is None:

@@ -59,17 +59,11 @@ def misfit_by_channel(fit: Fit) -> dict[str, float]:
 
 
 def noise_by_channel(likelihood: Likelihood) -> dict[str, float]:
-    """Variance of every channel's noise in the compared band, averaged over its runs.
-
-    Below the lowest bin that was measured, its level is used: the extrapolated level is an upper limit.
-    """
+    """Variance of every channel's noise, averaged over its runs."""
     values: dict[str, list[float]] = {}
     for run, whiteners in zip(likelihood.runs, likelihood.whiteners, strict=True):
         for output, whitener in zip(run.outputs, whiteners, strict=True):
-            lowest = int(np.ceil(whitener.first))
-            power = float(np.sum(whitener.psd[lowest:])) + lowest * float(whitener.psd[lowest])
-            variance = power * 2.0 / output.data.size**2
-            values.setdefault(output.name, []).append(variance)
+            values.setdefault(output.name, []).append(whitener.measured_noise_variance)
     return {name: float(np.mean(runs)) for name, runs in values.items()}
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,12 +70,11 @@ def diagnose_files(
     """
     from contextlib import ExitStack
 
-    from tqdm import tqdm
-
     from recon.diagnose_recordings import diagnose_recordings
     from recon.io.convert import check_different, open_any
     from recon.io.output import check_folder, replacing_folder
     from recon.report.diagnosis import diagnosis_report
+    from recon.runtime.stage_progress import stage_progress
     from scanner import devices
 
     check_different(paths)
@@ -85,9 +83,9 @@ def diagnose_files(
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_any(path, mapping)) for path in paths]
         nominal = devices.find(device) if device is not None else None
-        with tqdm(file=sys.stderr, disable=quiet or None, bar_format="{elapsed} {desc}", leave=False) as bar:
-            diagnosis = diagnose_recordings(recordings, nominal, bar.set_description_str)
-            bar.set_description_str("report")
+        with stage_progress(quiet) as progress:
+            diagnosis = diagnose_recordings(recordings, nominal, progress)
+            progress("report")
             conclusion, page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
         content = diagnosis.to_json() | {"conclusion": conclusion}
         with replacing_folder(output, device, *paths) as folder:

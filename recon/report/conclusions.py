@@ -49,13 +49,12 @@ def describe_stack(stack: Mapping[str, Any]) -> str:
     return f"stack of {len(z)} slices {1e6 * stack['step_m']:.4g} µm apart{uneven}, from z = {z[0]} µm to {z[-1]} µm"
 
 
-def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] | None = None) -> str:
+def conclude_diagnosis(content: Mapping[str, Any], prediction_error: str = "") -> str:
     """What the nominal device lacks, and what to do.
 
     Args:
         content: of diagnosis.json.
-        blur_px: rms blur in a picture of 400 pixels by the phase error of an open-loop prediction, and the limit of its
-            uncertainty; an error within it is not stated.
+        prediction_error: sentence on the phase error of the nominal device's open-loop prediction, where it has one.
     """
     findings = content["findings"]
     remarks = _describe_hum(content)
@@ -81,11 +80,7 @@ def conclude_diagnosis(content: Mapping[str, Any], blur_px: tuple[float, float] 
         if (content.get("remainder") or {}).get("share", 0.0) > 0.5:
             near_noise = "" if content.get("unexplained") else " with fitted values, which is near the noise,"
             text = f"Most of the difference between recording and nominal device{near_noise} is not explained. {text}"
-    if blur_px is not None and findings and blur_px[0] > blur_px[1]:
-        text += (
-            f" Predicted from the drive alone, the nominal motion is wrong by {format_value(blur_px[0], 2)} px rms in "
-            "a picture of 400 pixels."
-        )
+    text += f" {prediction_error}" if prediction_error else ""
     text += modes + _describe_values(content)
     loops = content.get("open_loop", {}).values()
     in_picture = any(finding["channel"] == "intensity" for finding in findings)
@@ -136,21 +131,20 @@ def _describe_hum(content: Mapping[str, Any]) -> str:
 
 def _describe_open_loop(content: Mapping[str, Any]) -> str:
     """How well the corrected device predicts, beside the nominal one; empty if they are the same."""
-    changed = {
-        channel: (loop["improved"]["fraction"], loop["nominal"]["fraction"])
-        for channel, loop in content.get("open_loop", {}).items()
-        if loop["improved"] != loop["nominal"]
-    }
+    loops = content.get("open_loop", {})
+    changed = {name: loop["improved"] for name, loop in loops.items() if loop["improved"] != loop["nominal"]}
     if not changed:
         return ""
-    listed = ", ".join(
-        f"{percent(after)} of {name} (nominal {percent(before)})" for name, (after, before) in changed.items()
-    )
+    compared = {name: f"nominal {percent(loops[name]['nominal']['fraction'])}" for name in changed}
+    for name, noise in content.get("noise", {}).items():
+        if name in changed:
+            compared[name] += f", noise {percent(noise / changed[name]['rmse'] * changed[name]['fraction'])}"
+    listed = ", ".join(f"{percent(loop['fraction'])} of {name} ({compared[name]})" for name, loop in changed.items())
     text = (
         " From drive and initial state alone, device.toml predicts samples that were not fitted with an error of "
         f"{listed}."
     )
-    useless = [name for name, (after, _) in changed.items() if after >= 1.0]
+    useless = [name for name, loop in changed.items() if loop["fraction"] >= 1.0]
     if useless:
         text += f" That is no better than no prediction of {' and '.join(useless)}."
     return text

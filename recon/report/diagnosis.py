@@ -8,24 +8,16 @@ from typing import Any
 import numpy as np
 
 from estimation.device_fit.fit import Fit
-from estimation.device_fit.posterior import (
-    PICTURE_HALF_WIDTH_PX,
-    PredictionPhaseError,
-    phase_error,
-    phase_portrait,
-    waveform,
-)
+from estimation.device_fit.posterior import PredictionPhaseError, phase_error, phase_portrait, waveform
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability, detectability
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from recon.report.conclusions import conclude_diagnosis, conclude_plan, name_rival
 from recon.report.diagnosis_figures import (
-    PAIR,
     detectability_figure,
     effect_figure,
     measured_curve_figure,
-    phase_error_figure,
     portrait_figure,
     residual_over_time_figure,
     residual_spectrum_figure,
@@ -34,6 +26,7 @@ from recon.report.diagnosis_figures import (
 from recon.report.effect_curve import effect_curve
 from recon.report.numbers import format_interval, format_probability
 from recon.report.page import Figure, Section, Table, render
+from recon.report.prediction_phase import describe_largest_error, prediction_phase_section, scale_for
 from scanner.terms import catalogue
 
 EXCLUDED_NEG2_LOG_EVIDENCE, UNLIKELY_NEG2_LOG_EVIDENCE = 10.0, 6.0
@@ -56,15 +49,13 @@ def diagnosis_report(diagnosis: Diagnosis, names: Sequence[str]) -> tuple[str, s
     search, errors = diagnosis.search, dict[str, PredictionPhaseError]()
     if search is not None and diagnosis.findings:
         errors = _phase_errors(search, _improved_fit(diagnosis, search))
-    largest = max(errors.values(), key=lambda e: e.blur_px(e.before), default=None)
-    blur = None if largest is None else (largest.blur_px(largest.before), largest.blur_px(largest.after))
     sections = [_overview(diagnosis)] if diagnosis.findings else []
-    sections += [_open_loop_section(diagnosis.open_loop)] if diagnosis.open_loop else []
+    sections += [_open_loop_section(diagnosis)] if diagnosis.open_loop else []
     sections += [_finding_section(finding, i, search) for i, finding in enumerate(diagnosis.findings)]
     if search is not None:
         sections += _motion_sections(diagnosis, search, errors)
     sections += [_optics_section(table) for table in diagnosis.optics]
-    conclusion = conclude_diagnosis(diagnosis.to_json(), blur)
+    conclusion = conclude_diagnosis(diagnosis.to_json(), describe_largest_error(errors, scale_for(diagnosis.device)))
     heading, subject = f"Diagnosis of {diagnosis.device.name}", f"From {', '.join(names)}."
     return conclusion, render(heading, conclusion, sections, subject=subject)
 
@@ -95,16 +86,18 @@ def _overview(diagnosis: Diagnosis) -> Section:
     return Section("Effects", text, Table(head, rows))
 
 
-def _open_loop_section(open_loop: Mapping[str, Any]) -> Section:
-    rows = [
-        [channel, *(f"{loop['rmse']:.3g} ({loop['fraction']:.1%})" for loop in loops.values())]
-        for channel, loops in open_loop.items()
-    ]
+def _open_loop_section(diagnosis: Diagnosis) -> Section:
+    rows = []
+    for channel, loops in diagnosis.open_loop.items():
+        noise = f"{diagnosis.noise[channel]:.3g}" if channel in diagnosis.noise else ""
+        rows.append([channel, *(f"{loop['rmse']:.3g} ({loop['fraction']:.1%})" for loop in loops.values()), noise])
     text = (
         "Root mean square error of the prediction from the drive and the initial state alone, on samples that were not "
-        "used in a fit, in the unit of the channel and in percent of its standard deviation."
+        "used in a fit, in the unit of the channel and in percent of its standard deviation. No prediction errs by "
+        "less than the noise."
     )
-    return Section("Prediction by the devices", text, Table(["channel", "nominal device", "improved device"], rows))
+    head = ["channel", "nominal device", "improved device", "noise"]
+    return Section("Prediction by the devices", text, Table(head, rows))
 
 
 def _finding_section(finding: Finding, index: int, search: SelectionResult | None) -> Section:
@@ -138,7 +131,7 @@ def _motion_sections(
     improved = _improved_fit(diagnosis, search)
     sections = [_waveforms(search, improved)]
     if search.steps:
-        sections.append(_blur_section(errors))
+        sections.append(prediction_phase_section(errors, scale_for(diagnosis.device)))
     sections += [_residuals(search, improved), _portraits(search, improved)]
     if search.steps:
         text = (
@@ -178,25 +171,6 @@ def _waveforms(search: SelectionResult, improved: Fit) -> Section:
         for channel, output in enumerate(run.outputs)
     ]
     return Section("Measured and simulated waveforms", figures=figures, least="26rem")
-
-
-def _blur_section(errors: Mapping[str, PredictionPhaseError]) -> Section:
-    """The consequence for a picture."""
-    heading = "Blur of a picture without feedback"
-    if not errors:
-        return Section(heading, "The axis is driven far below its resonance and follows its drive: no phase to lose.")
-    rows, figures = [], []
-    for name, error in errors.items():
-        rows.append([name, f"{error.blur_px(error.before):.2g}", f"{error.blur_px(error.after):.1g}"])
-        figures.append(phase_error_figure(error, f"{name}: blur at the centre of a line"))
-    text = (
-        f"A phase error δφ displaces the centre of a line by m δφ pixels, with m = {PICTURE_HALF_WIDTH_PX} in a "
-        f"picture of {2 * PICTURE_HALF_WIDTH_PX} pixels. First the motion that the nominal device with "
-        "fitted values predicts from the drive alone, against that of the device with the findings; then the 95 % "
-        "limit of the uncertainty of this device's phase."
-    )
-    table = Table(["rms blur (pixels)", *(label for _, label in PAIR)], rows)
-    return Section(heading, text, table, figures, least="24rem")
 
 
 def _residuals(search: SelectionResult, improved: Fit) -> Section:

@@ -1,4 +1,4 @@
-"""Figures of the diagnosis report: effects in their own variables, waveforms, residuals, blur, detectability."""
+"""Figures of the diagnosis report: effects in their own variables, waveforms, residuals, detectability."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimation.device_fit.posterior import PICTURE_HALF_WIDTH_PX, PredictionPhaseError, Waveform
+from estimation.device_fit.posterior import Waveform
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability
 from recon.report.effect_curve import EffectCurve
 from recon.report.figures import figure_uri, new_figure, use_plain_ticks
@@ -29,12 +29,6 @@ TIME_BINS = 120
 
 SPECTRUM_BINS = 400
 """Bins of a spectrum, about as many as its figure has columns."""
-
-TOLERATED_BLUR_PX = 1.0
-"""Blur that is marked as tolerated: the default of ``--p``."""
-
-MIN_DRAWN_BLUR_PX = 1e-3
-"""Blur below this value is drawn at it, because a logarithmic axis has no zero."""
 
 
 def one_panel(draw: Callable[[Axes], None], caption: str, height: float = 3.2) -> Figure:
@@ -131,25 +125,6 @@ def portrait_figure(before: Array, after: Array, caption: str) -> Figure:
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.minorticks_off()
     return Figure(figure_uri(drawing), caption)
-
-
-def phase_error_figure(error: PredictionPhaseError, caption: str) -> Figure:
-    """Blur at the centre of a line by the phase error of an open-loop prediction, over time."""
-
-    def draw(axes: Axes) -> None:
-        time = 1e3 * error.time
-        for phase, colour, label in (
-            (error.before, BEFORE, PAIR[0][1]),
-            (error.after, AFTER, f"{PAIR[1][1]}, 95 % limit"),
-        ):
-            blur = np.maximum(PICTURE_HALF_WIDTH_PX * np.abs(phase), MIN_DRAWN_BLUR_PX)
-            axes.plot(time, blur, color=colour, label=label)
-        axes.axhline(TOLERATED_BLUR_PX, color="#444", lw=0.8, ls="--", label=f"tolerated, {TOLERATED_BLUR_PX:g} pixel")
-        axes.set(xlabel="time (ms)", ylabel="blur (pixels)", yscale="log")
-        use_plain_ticks(axes.yaxis)
-        axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8)
-
-    return one_panel(draw, caption)
 
 
 def detectability_figure(effects: Sequence[Detectability]) -> Figure:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from estimation.device_fit.posterior import (
-    PICTURE_HALF_WIDTH_PX,
     PORTRAIT_CELLS,
     phase_error,
     phase_portrait,
@@ -40,7 +38,6 @@ def test_a_stiffness_error_gives_a_growing_phase_error() -> None:
     assert cost is not None
     rate = DEVICE.axis("x").resonance * 2 * np.pi
     np.testing.assert_allclose(cost.before, 0.5 * 0.02 * 0.01 * rate * cost.time, atol=2e-3)
-    assert cost.blur_px(cost.before) == pytest.approx(PICTURE_HALF_WIDTH_PX * np.sqrt(np.mean(cost.before**2)))
     assert 0.0 < cost.after.max() < 0.1
 
 

@@ -194,6 +194,22 @@ def test_red_noise_is_whitened_at_the_ends_too() -> None:
     assert np.mean(np.square(ends)) == pytest.approx(1.0, abs=0.15)
 
 
+def test_the_variance_of_white_noise_is_that_of_all_frequencies_whatever_band_is_compared() -> None:
+    n, variance = 1000, 4.0
+    for bins in (501, 300, 100):
+        whitener = make_whitener(np.full(bins, n * variance), n, (0, 0))
+        assert whitener.noise_variance == pytest.approx(variance, rel=0.01)
+        assert whitener.measured_noise_variance == pytest.approx(variance, rel=0.01)
+
+
+def test_the_measured_variance_of_noise_has_no_extrapolated_level() -> None:
+    n, psd = 1000, np.full(501, 4000.0)
+    psd[:10] = 4e6
+    whitener = make_whitener(psd, n, (0, 0), first=10.0)
+    assert whitener.measured_noise_variance == pytest.approx(4.0, rel=0.01)
+    assert whitener.noise_variance == pytest.approx(4.0 + 2.0 * 10 * 4e6 / n**2, rel=0.01)
+
+
 def test_low_frequency_misfit_is_attributed_to_noise_as_far_as_a_steeper_spectrum_explains_it() -> None:
     n = 4000
     white = np.random.default_rng(5).normal(0.0, 1.0, n)

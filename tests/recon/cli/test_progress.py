@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon.cli import main
+from recon.runtime import stage_progress
 from scanner.recording import Recording
 
 
@@ -20,3 +21,20 @@ def test_an_error_is_the_only_line_where_stderr_is_no_terminal(
     assert shown.startswith("lissajous diagnose: ")
     assert shown.count("\n") == 1
     assert "\r" not in shown
+
+
+def test_stages_of_long_work_are_lines_of_a_log_file(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([100.0, 101.0, 130.2])
+    monkeypatch.setattr(stage_progress.time, "perf_counter", lambda: next(clock))
+    with stage_progress.stage_progress(quiet=False) as progress:
+        progress("nominal device")
+        progress("report")
+    assert capsys.readouterr().err == "30 s  report\n"
+
+
+def test_quiet_shows_no_stage(capsys: pytest.CaptureFixture[str]) -> None:
+    with stage_progress.stage_progress(quiet=True) as progress:
+        progress("report")
+    assert not capsys.readouterr().err
