@@ -189,12 +189,13 @@ def _covariance(
 
 
 def _angle_sd(axis: AxisMotion, angle: Array, when: Array) -> Array:
-    """Standard deviation of the angle that those of phase and amplitude cause, shape (n,) [rad]."""
+    """Standard deviation of the angle by phase, amplitude and the noise of single samples, shape (n,) [rad]."""
     amplitude, phase_sd = (np.interp(when, axis.time, values) for values in (axis.amplitude, axis.phase_sd))
     by_phase = phase_sd * np.sqrt(np.maximum(np.square(amplitude) - np.square(angle), 0.0))
+    by_both = np.hypot(by_phase, axis.angle_noise_sd)
     if axis.amplitude_sd is None:
-        return by_phase
-    return np.hypot(by_phase, angle / amplitude * np.interp(when, axis.time, axis.amplitude_sd))
+        return by_both
+    return np.hypot(by_both, angle / amplitude * np.interp(when, axis.time, axis.amplitude_sd))
 
 
 def _notes(geometry: Geometry, assumed: bool, distance: Array, estimated: EstimatedMotion) -> list[str]:

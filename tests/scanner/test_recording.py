@@ -245,6 +245,17 @@ def test_error_of_channels_without_common_time_states_their_times() -> None:
         on_clock(recording, ["sense_x", "drive_x"])
 
 
+@pytest.mark.parametrize(("rate", "start"), [(1e6, 1.7e9), (1e6, 1e8), (5e6, 1e18), (1e3, -1e300)])
+def test_a_start_that_rounds_the_times_of_samples_is_refused(rate: float, start: float) -> None:
+    with pytest.raises(BadInput, match=r"samples\); state start from the beginning of the measurement"):
+        Recording.from_arrays({"sense_x": (np.arange(10.0), "V", rate, start)})
+
+
+def test_a_slow_channel_may_count_seconds_since_1970() -> None:
+    recording = Recording.from_arrays({"amplitude_x": (np.arange(10.0), "V", 1e3, 1.7e9)})
+    assert recording.start == 1.7e9
+
+
 def test_truth_is_read_by_read_truth_only(tmp_path: Path) -> None:
     path = tmp_path / "sim.h5"
     truth = {

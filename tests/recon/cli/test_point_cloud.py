@@ -176,3 +176,21 @@ def test_a_colour_bar_of_equal_distances_does_not_show_the_rounding_of_the_arith
     labels = re.findall("<!-- (.*?) -->", base64.b64decode(picture.partition(",")[2]).decode())
     assert "2.00" in labels
     assert max(map(len, labels)) == len("distance [m]")
+
+
+def test_the_covariance_has_the_noise_of_sensed_angles() -> None:
+    """Two angle sensors with white noise and an exact range: as many points as expected lie within two deviations."""
+    rate, samples, noise_sd = 5e4, 20_000, 1e-3
+    t = np.arange(samples) / rate
+    true = {"x": 0.2 * np.sin(2 * np.pi * 600.0 * t + 0.3), "y": 0.2 * np.sin(2 * np.pi * 94.0 * t + 0.1)}
+    distance = 10.0 + 0.5 * np.sin(20.0 * true["x"]) * np.cos(15.0 * true["y"])
+    rng = np.random.default_rng(0)
+    channels = {
+        f"angle_{axis}": (angle + noise_sd * rng.standard_normal(samples), "rad", rate) for axis, angle in true.items()
+    }
+    recording = Recording.from_arrays(channels | {"range": (distance, "m", rate)}, devices.find("imaging"))
+    cloud = make_point_cloud(recording, Options(estimator="sensor"), quiet=True)
+    at = np.round(cloud.time * rate).astype(int)
+    error = cloud.position - locate_points(cloud.geometry, true["x"][at], true["y"][at], distance[at])
+    ratio = error[:, :2] / np.sqrt(cloud.covariance[:, [0, 3]])
+    assert 0.93 < float(np.mean(np.abs(ratio) < 1.96)) < 0.97
