@@ -11,10 +11,10 @@ import numpy as np
 from estimation.device_fit.data import output_channels
 from estimation.device_fit.fit import fit_model
 from estimation.device_fit.model import Model
+from estimation.device_fit.undriven import steady_without_drive
 from estimation.diagnosis.diagnose import Diagnosis, diagnose
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.selection import Progress
-from estimation.diagnosis.undriven import steady_without_drive
 from estimation.held_samples import held_while_driven
 from estimation.signals import require_device
 from estimation.slow.diagnose import diagnose_decays, slow_decays

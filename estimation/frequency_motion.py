@@ -101,6 +101,7 @@ def sine_motion(
         phase_sd=phase.sd,
         angle=PhasorAngle(motion, *clock),
         reference=reference.kind,
+        reference_frequency=reference.frequency,
         sign="ambiguous",
     )
 

@@ -7,7 +7,6 @@ together, as their recordings would be.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ import numpy as np
 from phantoms import waveforms
 from phantoms.waveforms import Constant, Multisine, Sine, Sweep, Waveform
 from recon.io.convert import open_any
-from recon.io.output import check_folder, replacing_folder
+from recon.io.output import check_folder, replacing_folder, write_json
 from scanner import devices
 from scanner.device import Device
 from scanner.device_toml import checked_number
@@ -237,8 +236,7 @@ def plan_files(
         detectabilities = predict_detectability(runs, nominal)
         content = plan_to_json(runs, nominal, detectabilities)
         with replacing_folder(output) as folder:
-            text = json.dumps(content, indent=1, ensure_ascii=False)
-            (folder / "plan.json").write_text(text + "\n", encoding="utf-8")
+            write_json(folder / "plan.json", content)
             (folder / "report.html").write_text(plan_report(content, detectabilities), encoding="utf-8")
     return content | {"output": str(output)}
 

@@ -60,7 +60,7 @@ class AxisMotion:
         time: shape (n,) [s], increasing.
         phase: shape (n,) [rad], unwrapped; of theta = A sin(reference + phase), where the reference is half the
             drive's phase for a parametric (electrostatic) drive, the drive's phase for a linear one, and
-            ``2 pi f0 t`` with the device's resonance f0 where no drive was recorded, or with an arbitrary f0 that makes
+            ``2 pi f t`` with f = ``reference_frequency`` where no drive was recorded, an arbitrary one that makes
             blocks of time where the motion repeats at no known frequency.
         amplitude: shape (n,) [rad].
         frequency: shape (n,), of the motion [Hz].
@@ -72,6 +72,7 @@ class AxisMotion:
             None from an estimator that states none.
         angle_noise_sd: standard deviation of the white noise in single samples of ``angle`` [rad]; 0 where the
             estimator filters the noise, whose rest ``phase_sd`` and ``amplitude_sd`` state.
+        reference_frequency: of the reference at its start [Hz].
     """
 
     time: Array
@@ -84,6 +85,7 @@ class AxisMotion:
     sign: str = "ambiguous"
     amplitude_sd: Array | None = None
     angle_noise_sd: float = 0.0
+    reference_frequency: float | None = None
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -238,13 +238,13 @@ class Recording:
     def start(self) -> float:
         """Time of the first sample of any channel in use [s]; of the first edge where there are edges only."""
         starts = [channel.start for channel in self._channels_in_use()]
-        return min(starts or [float(edges.times[0]) for edges in self.edges.values() if edges.times.size])
+        return min(starts or [float(edges.times[0]) for edges in self._edges_in_use()])
 
     @property
     def end(self) -> float:
         """Time one sample after the last sample of any channel in use [s]; of the last edge with edges only."""
         ends = [channel.end for channel in self._channels_in_use()]
-        return max(ends or [float(edges.times[-1]) for edges in self.edges.values() if edges.times.size])
+        return max(ends or [float(edges.times[-1]) for edges in self._edges_in_use()])
 
     @property
     def duration(self) -> float:
@@ -252,12 +252,16 @@ class Recording:
         return self.end - self.start
 
     def _channels_in_use(self) -> list[Channel]:
-        """The channels whose names have a meaning; all where there are no such channels and no edges.
+        """The channels whose names have a meaning; all where there are neither such channels nor edges.
 
         A room's temperature or a trigger may be recorded for longer than the scan.
         """
         known = [channel for name, channel in self.channels.items() if name in USED_CHANNELS]
-        return known if known or self.edges else list(self.channels.values())
+        return known if known or self._edges_in_use() else list(self.channels.values())
+
+    def _edges_in_use(self) -> list[Edges]:
+        """The lists that hold an edge."""
+        return [edges for edges in self.edges.values() if edges.times.size]
 
     def slice(self, t0: float, t1: float) -> Recording:
         """Return the samples with ``t0 <= t < t1`` [s], on the same clock, without channels that have none.

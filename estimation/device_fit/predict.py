@@ -9,10 +9,12 @@ import numpy as np
 
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.open_loop import fit_start_only
+from estimation.device_fit.undriven import steady_without_drive
 from estimation.held_samples import held_runs_while_driven, without_samples
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 from scanner.terms.measured_law import beyond
@@ -58,9 +60,13 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
         The prediction of each channel by its name.
 
     Raises:
-        BadInput: the recording has no sense or angle channel, or a channel is missing or invalid.
+        BadInput: the recording has no sense or angle channel, a channel is missing or invalid, or its motion persists
+            without a recorded drive.
     """
     run = prepare_run(recording, device)
+    if (steady := steady_without_drive(recording, device)) is not None:
+        hint = "record the voltage that drives it; without one a free decay is predicted"
+        raise BadInput(f"has no drive to predict from: {steady}", file=recording.path, hint=hint)
     model, x = fit_start_only([run], device)
     held = held_runs_while_driven(recording, device)
     return {

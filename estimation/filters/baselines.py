@@ -76,6 +76,7 @@ def estimate_constant(recording: Recording, device: Device) -> Motion:
                 phase_sd=np.full(CONSTANT_POINTS, motion.phase_sd),
                 angle=SampledAngle(motion.amplitude * np.sin(reference.phase(sampled) + motion.phase), rate, first),
                 reference=reference.kind,
+                reference_frequency=reference.frequency,
                 sign=motion.sign,
             )
     return Motion(axes, "constant", {"calibrated_over_s": start.window})

@@ -100,6 +100,7 @@ def axis_motion_from_angle(
         phase_sd=np.minimum(phase_sd, UNKNOWN_PHASE_SD_RAD),
         angle=_on_clock(angle, clock, held, np.zeros_like if reference.kind == "blocks" else oscillation),
         reference=reference.kind,
+        reference_frequency=reference.frequency,
         sign=f"known: {angle.name}",
         angle_noise_sd=noise_sd if is_noise_known else 0.0,
     )

@@ -95,6 +95,7 @@ def axis_motion_from_filter(
         phase_sd=np.sqrt(variance),
         angle=synthesize_angle(filtered.theta[i], channel, reference, time, phase, np.abs(phasors), clock),
         reference=reference.kind,
+        reference_frequency=reference.frequency,
         sign=problem.start.axes[name].sign,
     )
 

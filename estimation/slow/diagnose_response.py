@@ -137,9 +137,10 @@ def _parameters(response: Response, axis: Axis, effect: str, fit: ResponseFit) -
         return (ParameterEstimate("fraction_of_largest_amplitude", size, (size - spread, size + spread), "1"),)
     value, sd = fit.laws[effect]
     if not response.in_rad or axis.mechanics is None:
-        rate = value / (2 * np.pi * float(fit.modes[0, 0])) ** (2 if effect != "cubic-damping" else 1)
-        spread = Z_95 * sd * rate / value
-        return (ParameterEstimate("at_largest_amplitude", rate, (rate - spread, rate + spread), "1"),)
+        power = {"cubic-stiffness": -2, "cubic-damping": -1, "quadratic-drag": 0, "coulomb-friction": -2}[effect]
+        factor = (2.0 * np.pi * float(fit.modes[0, 0])) ** power
+        ends = factor * (value - Z_95 * sd), factor * (value + Z_95 * sd)
+        return (ParameterEstimate("at_largest_amplitude", factor * value, ends, "1"),)
     power = {"cubic-stiffness": -2, "cubic-damping": -2, "quadratic-drag": -1, "coulomb-friction": 1}[effect]
     factor = axis.mechanics.J * response.largest**power
     parameter = catalogue()[effect].parameters[0]

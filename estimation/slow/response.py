@@ -153,7 +153,7 @@ def frequency_responses(recording: Recording, device: Device) -> list[Response]:
         if np.unique(frequency[good]).size < MIN_TONES:
             what = f"holds {counted(np.unique(frequency[good]).size, 'steady tone')}, {MIN_TONES} are needed"
             raise BadInput(what, channel=key, hint="measure tones on both sides of the resonance")
-        scale = float(np.abs(recording[key].read()).max() / amplitude[good].max())
+        scale = float(np.abs(recording[key].read()[good]).max() / amplitude[good].max())
         found.append(Response(name, frequency[good], amplitude[good] * np.exp(1j * phase[good]), in_rad, scale))
     return found
 

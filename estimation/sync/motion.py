@@ -130,6 +130,7 @@ def axis_motion_from_edges(
         phase_sd=found.phase_sd[::step],
         angle=SampledAngle(angle, rate, start),
         reference=reference.kind,
+        reference_frequency=reference.frequency,
         sign=found.sign,
         amplitude_sd=None if measured is None else measured[1][::step],
     )

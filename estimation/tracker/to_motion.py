@@ -120,6 +120,7 @@ def motion_of_knots(
         phase_sd=knots.phase_sd,
         angle=PhasorAngle(motion, *clock),
         reference=reference.kind,
+        reference_frequency=reference.frequency,
         sign=sign,
         amplitude_sd=np.exp(log) * knots.log_amplitude_sd,
     )

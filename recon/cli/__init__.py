@@ -152,7 +152,9 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequ
             announce_compilation()
         summary = module.run(args)
         stop.ended = True
-        print(json.dumps(summary, indent=1) if args.json else _printable(module.format_summary(summary)))
+        from recon.io.output import finite
+
+        print(json.dumps(finite(summary), indent=1) if args.json else _printable(module.format_summary(summary)))
         return int(summary.get("exit", 0))  # of several recordings, some may have failed
     except BadInput as error:
         if stop.came:  # an interrupt may have caused it

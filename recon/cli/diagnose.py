@@ -6,7 +6,6 @@ With ``--plan`` nothing is measured: the command lists which effects such record
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,7 +71,7 @@ def diagnose_files(
 
     from recon.diagnose_recordings import diagnose_recordings
     from recon.io.convert import check_different, open_any
-    from recon.io.output import check_folder, replacing_folder
+    from recon.io.output import check_folder, replacing_folder, write_json
     from recon.report.diagnosis import diagnosis_report
     from recon.runtime.stage_progress import stage_progress
     from scanner import devices
@@ -89,8 +88,7 @@ def diagnose_files(
             conclusion, page = diagnosis_report(diagnosis, [recording.name for recording in recordings])
         content = diagnosis.to_json() | {"conclusion": conclusion}
         with replacing_folder(output, device, *paths) as folder:
-            text = json.dumps(content, indent=1, ensure_ascii=False)
-            (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
+            write_json(folder / "diagnosis.json", content)
             (folder / "device.toml").write_text(diagnosis.device.to_toml(), encoding="utf-8")
             (folder / "report.html").write_text(page, encoding="utf-8")
     return content | {"output": str(output), "seconds": time.perf_counter() - began}

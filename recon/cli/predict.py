@@ -40,6 +40,7 @@ def predict_file(
     import numpy as np
 
     from estimation.device_fit.predict import beyond_measured_laws, drifts, predict
+    from estimation.device_fit.undriven import axes_without_drive
     from estimation.signals import require_device
     from recon.io.convert import open_any
     from recon.io.output import check_folder, replacing_folder, write_json
@@ -58,6 +59,7 @@ def predict_file(
             "device": used.name,
             "terms": {name: sorted(axis.terms) for name, axis in used.axes.items() if axis.terms},
             "drifts": drifts(used),
+            "undriven": axes_without_drive(recording, used),
             "beyond_measured_law": beyond_measured_laws(recording, used),
             "channels": {
                 name: {
@@ -86,6 +88,8 @@ def format_summary(summary: dict[str, Any]) -> str:
     for name, effects in summary["drifts"].items():
         from_start = "from the first sample on, as in the recording to which the device was fitted"
         lines.append(f"  axis {name} drifts {from_start}: {', '.join(effects)}")
+    for name in summary["undriven"]:
+        lines.append(f"  axis {name}: drive_{name} is not in the recording; a free decay is predicted")
     for name, fraction in summary["beyond_measured_law"].items():
         if fraction > 0.0:
             lines.append(f"  axis {name}: {fraction:.1%} of the samples lie beyond the range of its measured law")

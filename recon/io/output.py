@@ -98,6 +98,8 @@ def write_motion(path: Path, motion: Motion, grid: Grid) -> None:
         for name, axis in motion.axes.items():
             group = file.create_group(name)
             group.attrs.update({"reference": axis.reference, "sign": axis.sign})
+            if axis.reference_frequency is not None:
+                group.attrs["reference_frequency"] = axis.reference_frequency
             for key, unit in (
                 ("time", "s"),
                 ("phase", "rad"),
@@ -215,7 +217,7 @@ def _frame_metadata(axis: FrameAxis, detectors: int = 1) -> dict[str, Any]:
 
 def write_json(path: Path, summary: Mapping[str, Any]) -> None:
     """Write a summary as JSON; numbers that are not finite become null."""
-    path.write_text(json.dumps(finite(summary), indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(finite(summary), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def finite(value: Any) -> Any:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.complete_diagnosis import diagnose_with_optics
-from estimation.diagnosis.undriven import steady_without_drive
+from estimation.device_fit.undriven import steady_without_drive
 from estimation.estimate import estimate
 from estimation.identification.calibrate import identify
 from scanner.channel import make_channel

@@ -112,6 +112,33 @@ def test_feedthrough_is_found() -> None:
     assert names(diagnose_with_optics([recording(mode(F0, Q, 0.1) + 0.01j)])) == ["feedthrough"]
 
 
+def test_a_quadratic_drag_in_volts_has_its_size_at_the_largest_amplitude() -> None:
+    """Steady amplitudes of theta'' + b theta' + c |theta'| theta' + w0^2 theta, with c = 0.05; 0.7 V at the largest."""
+    w, drag, amplitude = 2.0 * np.pi * FREQUENCY, 0.05, np.full(FREQUENCY.size, 0.1)
+    for _ in range(200):
+        linear = W0**2 - w**2 + 1j * w * W0 / Q
+        angle = 0.12 * W0**2 / Q / (linear + drag * 8.0j / (3.0 * np.pi) * w**2 * amplitude)
+        amplitude = 0.5 * (amplitude + np.abs(angle))
+    largest = float(amplitude.max())
+    made = recording(angle)
+    volts = {"amplitude_x": replace(made["amplitude_x"], unit="V", gain=0.7 / largest)}
+    without_gain = Device("lever", {"x": replace(AXIS, readout=None)})
+    found = diagnose_with_optics([replace(made, channels={**made.channels, **volts})], without_gain)
+    assert names(found) == ["quadratic-drag"]
+    (size,) = found.findings[0].parameters
+    assert (size.name, size.unit) == ("at_largest_amplitude", "1")
+    assert size.ci95[0] < drag * largest < size.ci95[1]
+    assert size.value == pytest.approx(drag * largest, rel=0.1)
+
+
+def test_a_tone_without_a_value_is_left_out_of_the_error_too() -> None:
+    angle = mode(F0, Q, 0.1)
+    angle[3] = np.nan
+    found = diagnose_with_optics([recording(angle, f0=800.5)])
+    assert found.verdict == "consistent"
+    assert np.isfinite(found.open_loop["amplitude_x"]["improved"]["rmse"])
+
+
 def test_identify_takes_steady_tones() -> None:
     made = recording(mode(801.0, 250.0, 0.1))
     assert made.device is not None

@@ -51,3 +51,14 @@ def test_a_frequency_is_stated_only_if_the_signal_repeats(periods: float) -> Non
     else:
         assert summary["y"]["frequency_hz"] == pytest.approx(periods / SECONDS, rel=0.02)
         assert not notes
+
+
+def test_the_phase_against_an_absolute_reference_gives_the_angle_back() -> None:
+    axis = reconstruct(raster(5.0), Options(pixels=(50, 50)), quiet=True).motion.axes["x"]
+    assert axis.reference == "absolute"
+    assert axis.reference_frequency is not None
+    angle = axis.angle.read()
+    time = axis.angle.start + np.arange(angle.size) / axis.angle.sample_rate
+    phase, amplitude = (np.interp(time, axis.time, values) for values in (axis.phase, axis.amplitude))
+    rebuilt = amplitude * np.sin(2.0 * np.pi * axis.reference_frequency * time + phase)
+    assert np.sqrt(np.nanmean((rebuilt - angle) ** 2)) < 0.05 * amplitude.mean()

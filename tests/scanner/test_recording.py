@@ -316,3 +316,11 @@ def test_constant_signal_is_refused_unless_it_is_allowed() -> None:
     check_signal(recording["bias_x"], constant_ok=True)
     check_signal(recording["sense_x"])
     check_signal(recording["intensity"])
+
+
+def test_a_recording_whose_edge_lists_are_empty_lasts_as_long_as_its_channels() -> None:
+    edges = (np.array([0.1, 0.2]), "s", {"event": "turn"})
+    recording = Recording.from_arrays({"temperature": (np.arange(100.0), "K", 100.0), "sync_x": edges})
+    assert (recording.start, recording.end) == (0.1, 0.2)
+    later = recording.slice(0.5, 0.9)
+    assert (later.start, later.end) == pytest.approx((0.5, 0.9))

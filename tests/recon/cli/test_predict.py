@@ -13,6 +13,7 @@ from phantoms.waveforms import Sine
 from recon.cli import main
 from scanner.device import Device
 from scanner.device_templates import KnownAxis, new_device
+from tests.support.simulated import imaging
 
 
 def test_a_prediction_states_the_drifts_of_the_device(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -27,3 +28,21 @@ def test_a_prediction_states_the_drifts_of_the_device(tmp_path: Path, capsys: py
     assert main(command) == 0
     assert "axis x drifts from the first sample on" in capsys.readouterr().out
     assert json.loads((tmp_path / "o" / "summary.json").read_text())["drifts"] == {"x": ["gain-drift"]}
+
+
+def test_a_steady_motion_without_its_drive_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    recording, _ = imaging()
+    channels = {name: channel for name, channel in recording.channels.items() if not name.startswith("drive")}
+    replace(recording, channels=channels).write(tmp_path / "r.h5")
+    assert main(["predict", str(tmp_path / "r.h5"), "-o", str(tmp_path / "o")]) == 2
+    assert "sense moves steadily without drive_x and drive_y; record the voltage" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_an_axis_without_its_drive_is_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    recording, _ = imaging()
+    channels = {name: channel for name, channel in recording.channels.items() if name != "drive_y"}
+    replace(recording, channels=channels).write(tmp_path / "r.h5")
+    assert main(["predict", str(tmp_path / "r.h5"), "-o", str(tmp_path / "o")]) == 0
+    assert "axis y: drive_y is not in the recording; a free decay is predicted" in capsys.readouterr().out
+    assert json.loads((tmp_path / "o" / "summary.json").read_text())["undriven"] == ["y"]

@@ -53,6 +53,12 @@ def steady_without_drive(recording: Recording, device: Device) -> str | None:
     return None
 
 
+def axes_without_drive(recording: Recording, device: Device) -> list[str]:
+    """The axes of the measured channels of which neither drive nor bias was recorded."""
+    measured = sorted({axis for _, axes in output_channels(recording, device).values() for axis in axes})
+    return [axis for axis in measured if not {f"drive_{axis}", f"bias_{axis}"} & recording.channels.keys()]
+
+
 def _tone_amplitude(values: Array) -> float:
     """Amplitude of the strongest line of some samples, up to a constant; 0 if it has less than half of the power."""
     values = values[np.isfinite(values)]
