@@ -40,6 +40,7 @@ from estimation.reference import drive_reference
 from estimation.slow.response import Response, ResponseFit, frequency_responses
 from estimation.slow.response_selection import select_response_effects
 from scanner.arrays import Array
+from scanner.channel import check_signal
 from scanner.clock import on_clock
 from scanner.device import DEFAULT_TOLERANCE, Axis, Device
 from scanner.errors import BadInput
@@ -188,6 +189,11 @@ class _AxisIdentification:
         reference = find_reference_angle(recording, self.axis, DEFAULT_TOLERANCE)
         if reference is None:
             raise AssertionError(f"{kind} without a reference")
+        sense_shows_comb = f"sense_{self.name}" in recording and not isinstance(
+            self.axis.require_readout(), MotionSensor
+        )
+        if sense_shows_comb:
+            check_signal(recording[f"sense_{self.name}"])
         recording = with_angle(recording, reference)
         names = [f"angle_{self.name}", *[n for n in (f"sense_{self.name}", f"drive_{self.name}") if n in recording]]
         clock, values = on_clock(recording, names)
@@ -200,8 +206,8 @@ class _AxisIdentification:
             self._take_ratios(fit_decay_without_angle(measured, recording[reference.source]), reference.sensor)
         else:
             frequency = self._use_driven(recording, clock.time, angle, values[f"drive_{self.name}"], reference)
-        sense = values.get(f"sense_{self.name}")
-        if sense is not None and not isinstance(self.axis.require_readout(), MotionSensor):
+        if sense_shows_comb:
+            sense = values[f"sense_{self.name}"]
             found = fit_capacitance_profile(self.axis, angle, sense, clock.rate, frequency).values
             self.values = combine_values([self.values, found])
             if reference.order:
@@ -256,9 +262,15 @@ class _AxisIdentification:
         self.values = combine_values([self.values, found])
 
     def _volt(self, recording: Recording) -> float:
-        """Voltage on the combs during a free decay [V]."""
-        names = [name for name in (f"bias_{self.name}", f"drive_{self.name}") if name in recording]
-        return sum((float(recording[name].read().mean()) for name in names), start=0.0)
+        """Voltage on the combs during a free decay [V].
+
+        Raises:
+            BadInput: a sample of it is not finite.
+        """
+        voltages = [recording[name] for name in (f"bias_{self.name}", f"drive_{self.name}") if name in recording]
+        for voltage in voltages:
+            check_signal(voltage, constant_ok=True)
+        return sum((float(voltage.read().mean()) for voltage in voltages), start=0.0)
 
     def conclude(self) -> None:
         """Determine the mechanics: scaled by driven motion, else by a bias during a decay, else by the nominal J."""

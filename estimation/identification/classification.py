@@ -26,7 +26,7 @@ def classify_recording(recording: Recording, name: str) -> str | None:
     A reference is the angle, the velocity, the acceleration, or amplitude and phase of a lock-in amplifier.
 
     Raises:
-        BadInput: a sample of the drive, or of a sense signal without a reference, is not finite.
+        BadInput: a sample of the drive, of a reference, or of a sense signal without a reference, is not finite.
     """
     drive, sense = (recording.channels.get(f"{kind}_{name}") for kind in ("drive", "sense"))
     oscillates = False
@@ -36,9 +36,13 @@ def classify_recording(recording: Recording, name: str) -> str | None:
         oscillates = bool(np.std(values) > MIN_DRIVE_VARIATION * max(np.abs(values).max(), 1e-300))
     if lock_in_only(recording, name):
         return "driven" if oscillates else "free decay"
-    references = [recording.channels.get(f"{kind}_{name}") for kind in ("angle", "velocity", "acceleration")]
-    if any(reference is not None and shows_motion(reference.read()) for reference in references):
-        return "driven" if oscillates else "free decay"
+    for kind in ("angle", "velocity", "acceleration"):
+        reference = recording.channels.get(f"{kind}_{name}")
+        if reference is None:
+            continue
+        check_signal(reference, constant_ok=True)
+        if shows_motion(reference.read()):
+            return "driven" if oscillates else "free decay"
     if sense is None:
         return None
     check_signal(sense)

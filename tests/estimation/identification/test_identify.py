@@ -263,6 +263,24 @@ def test_a_recording_is_classified_as_rest_free_decay_or_driven(decay):
         classify_recording(made(angle=swinging, drive=gap), "x")
 
 
+@pytest.mark.parametrize("channel", ["angle_x", "velocity_x", "sense_x", "bias_x"])
+def test_a_sample_that_is_not_finite_is_refused_in_every_channel_that_is_read(decay, tmp_path, capsys, channel) -> None:
+    """With one NaN an angle counted as without motion, and the ratios came from the sense signal alone; a sense signal
+    or a bias ended with a traceback."""
+    angle, sense = decay
+    channels = {"angle_x": (angle, "rad"), "sense_x": (sense, "V"), "bias_x": (np.full(angle.size, 10.0), "V")}
+    if channel == "velocity_x":
+        channels["velocity_x"] = (np.gradient(channels.pop("angle_x")[0]) * 5e5, "rad/s")
+    values, unit = channels[channel]
+    channels[channel] = (np.where(np.arange(values.size) == 1000, np.nan, values), unit)
+    path = tmp_path / "nan.h5"
+    Recording.from_arrays({name: (*each, 5e5) for name, each in channels.items()}).write(path)
+    device = tmp_path / "device.toml"
+    device.write_text(Device("d", {"x": sensing_axis()}).to_toml(), encoding="utf-8")
+    assert main(["identify", str(path), "--device", str(device), "-o", str(tmp_path / "out")]) == 2
+    assert f"{channel}: sample 1000 at 0.002 s is not finite; cut the recording there" in capsys.readouterr().err
+
+
 def test_driven_recordings_without_a_reference_angle_are_refused(tmp_path, capsys):
     path = tmp_path / "no.h5"
     swinging = np.sin(np.arange(3000) / 50.0)
