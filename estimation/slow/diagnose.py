@@ -27,6 +27,7 @@ from estimation.slow.selection import (
     rate_price,
 )
 from scanner.arrays import Array
+from scanner.channel import check_signal
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
@@ -78,7 +79,11 @@ def slow_decays(recording: Recording, device: Device) -> list[SlowDecay]:
     """The free decays of a recording that are diagnosed by their amplitude, at most one an axis.
 
     That is an ``amplitude_x`` channel beside no other signal of the motion, or the waveform of a sensor of the motion
-    over more than ``MIN_COMPRESSED_TURNS`` turns without a drive.
+    over more than ``MIN_COMPRESSED_TURNS`` turns without a drive. A block of a waveform with a sample that is not
+    finite has no amplitude (NaN).
+
+    Raises:
+        BadInput: a channel holds no sample that can be used.
     """
     decays = []
     for name, axis in device.axes.items():
@@ -96,9 +101,11 @@ def slow_decays(recording: Recording, device: Device) -> list[SlowDecay]:
             channel, frequency = recording[key], axis.resonance
             if channel.sample_rate < MIN_SAMPLES_PER_PERIOD * frequency:
                 continue  # refused by the diagnosis of waveforms
+            check_signal(channel, gaps_ok=True)
             block = block_length(frequency, channel.sample_rate, BLOCK_TURNS)
             values = channel.read()
-            time, phasors = block_phasors(values - values.mean(), channel.sample_rate, channel.start, frequency, block)
+            values -= values[np.isfinite(values)].mean()
+            time, phasors = block_phasors(values, channel.sample_rate, channel.start, frequency, block)
             scale = gain * (2 * np.pi * frequency) ** order
             decays.append(SlowDecay(name, key, time, np.abs(phasors) / scale, True, scale))
     return decays

@@ -149,11 +149,12 @@ def frequency_responses(recording: Recording, device: Device) -> list[Response]:
             hint = "state one amplitude, phase and frequency for every tone"
             raise BadInput("differs from its phase or its frequency in length", channel=key, hint=hint)
         order = np.argsort(frequency)
-        good = order[np.isfinite(amplitude[order]) & np.isfinite(phase[order]) & (amplitude[order] > 0.0)]
+        finite = np.isfinite(amplitude) & np.isfinite(phase) & np.isfinite(frequency)
+        good = order[(finite & (amplitude > 0.0))[order]]
         if np.unique(frequency[good]).size < MIN_TONES:
             what = f"holds {counted(np.unique(frequency[good]).size, 'steady tone')}, {MIN_TONES} are needed"
             raise BadInput(what, channel=key, hint="measure tones on both sides of the resonance")
-        scale = float(np.abs(recording[key].read()[good]).max() / amplitude[good].max())
+        scale = float(np.abs(recording[key].read())[good].max() / amplitude[good].max())
         found.append(Response(name, frequency[good], amplitude[good] * np.exp(1j * phase[good]), in_rad, scale))
     return found
 

@@ -119,6 +119,9 @@ def compress(time: Array, amplitude: Array) -> Decay:
     from scipy.ndimage import median_filter
 
     good = np.isfinite(amplitude) & (amplitude > 0.0)
+    if not good.any():
+        hint = "check the sign of the amplitude, and repair samples that are not finite"
+        raise BadInput("gives no amplitude above 0", hint=hint)
     time, y = time[good], np.log(amplitude[good])
     smooth = median_filter(y, 5)
     first = int(np.flatnonzero(smooth > smooth.max() + np.log(RELEASED_FRACTION))[-1]) + 1

@@ -12,6 +12,7 @@ from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.estimate import default_estimator, estimate
 from estimation.slow.decay import LAWS, solve_decay
+from estimation.slow.diagnose import SlowDecay, slow_decays
 from estimation.slow.selection import Decays, compress, fit_law, held_out, prediction_errors
 from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant
@@ -125,6 +126,24 @@ def test_the_improved_device_decays_as_the_recording() -> None:
     (finding,) = found.findings
     assert finding.effect == "cubic-damping"
     assert finding.parameters[0].value == pytest.approx(8e-8, rel=0.1)
+
+
+def test_a_missing_sample_of_a_long_waveform_takes_one_block() -> None:
+    """The mean of the waveform was NaN, and with it every amplitude, which ended with a traceback."""
+    time, rng = np.arange(250_000) / 5e4, np.random.default_rng(0)
+    waveform = np.exp(-0.5 * W / 2e4 * time) * np.sin(W * time) + 1e-3 * rng.standard_normal(time.size)
+
+    def decays(values: np.ndarray) -> SlowDecay:
+        return slow_decays(Recording.from_arrays({"sense_x": (values, "V", 5e4)}), DEVICE)[0]
+
+    whole, missing = decays(waveform), decays(np.where(time == time[1234], np.nan, waveform))
+    assert np.flatnonzero(np.isnan(missing.amplitude)).tolist() == [1234 // 200]
+    assert np.nanmax(np.abs(missing.amplitude - whole.amplitude)) < 1e-9
+    with pytest.raises(BadInput, match="sense_x: holds no sample that can be used"):
+        decays(np.full(time.size, np.nan))
+    everywhere = {"sense_x": (np.where(np.arange(time.size) % 100, waveform, np.nan), "V", 5e4)}
+    with pytest.raises(BadInput, match="sense_x: gives no amplitude above 0"):
+        diagnose_with_optics([Recording.from_arrays(everywhere, DEVICE)])
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.identification.calibrate import identify
+from estimation.slow.response import frequency_responses
 from recon.io.convert import convert
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
@@ -56,6 +57,20 @@ def test_a_linear_response_is_consistent_and_corrects_resonance_and_damping() ->
     assert found.device.axes["x"].resonance == pytest.approx(F0, abs=0.01)
     loop = found.open_loop["amplitude_x"]
     assert loop["improved"]["fraction"] < 0.1 * loop["nominal"]["fraction"]
+
+
+@pytest.mark.parametrize("missing", ["frequency", "amplitude_x", "phase_x"])
+def test_a_tone_that_is_not_finite_is_left_out(missing: str) -> None:
+    """With an amplitude of NaN the error of the prediction was NaN, which no JSON holds; a frequency of NaN counted as
+    a tone."""
+    made = recording(mode(F0, Q, 0.1))
+    values = made[missing].read()
+    values[3] = np.nan
+    channels = {**made.channels, missing: replace(made[missing], raw=values)}
+    (response,) = frequency_responses(replace(made, channels=channels), made.device)
+    assert response.frequency.tolist() == np.delete(FREQUENCY, 3).tolist()
+    assert np.isfinite(response.values).all()
+    assert response.scale == pytest.approx(1.0)
 
 
 def test_two_modes_are_found_with_their_frequencies() -> None:
