@@ -35,7 +35,7 @@ from estimation.signals import (
     sense_channels,
 )
 from scanner.angle_tracks import SampledAngle
-from scanner.arrays import Index
+from scanner.arrays import Index, Mask
 from scanner.channel import Channel, check_signal, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Axis, Device
@@ -128,13 +128,14 @@ def _measure_axis(recording: Recording, device: Device, name: str) -> _MeasuredA
     measured = any(f"{kind}_{name}" in recording for kind in ("sense", "angle"))
     if f"amplitude_{name}" in recording and "intensity" in recording and not measured:
         light = recording["intensity"]
-        values = lock_in_angle(recording, device.axis(name), light.time())
+        values, missing = lock_in_angle(recording, device.axis(name), light.time())
         angle = make_channel(f"phase_{name}", values, unit="rad", sample_rate=light.sample_rate, start=light.start)
         reference = reference_of_any_waveform(recording, device, name, angle)
-        measure = partial(
-            axis_motion_from_angle, reference=reference, noise_sd=None, clock=intensity_clock(recording, angle)
-        )
-        return _MeasuredAxis(measure(angle), measure, angle, angle)
+        ends = np.flatnonzero(np.diff(missing, prepend=False, append=False))
+        gaps = list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
+        clock = intensity_clock(recording, angle)
+        measure = partial(axis_motion_from_angle, reference=reference, noise_sd=None, clock=clock, held=gaps)
+        return _MeasuredAxis(measure(angle), measure, angle, angle, notes=_describe_missing_lock_in(name, missing))
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel, gaps_ok=True)
     channel = replace(channel, raw=channel.stored(), first=0, stop=channel.size)  # the file may be closed later
@@ -223,6 +224,17 @@ def _describe_missing(channel: Channel, repaired: Filled) -> list[str]:
         gaps = counted(len(repaired.left_out), "gap")
         notes.append(f"{channel.name}: left out {number} in {gaps} too long to interpolate; no angle is known there")
     return notes
+
+
+def _describe_missing_lock_in(name: str, missing: Mask) -> list[str]:
+    """A line on the samples beside missing values of a lock-in amplifier, if there are any."""
+    if not missing.any():
+        return []
+    number = f"{counted(int(missing.sum()), 'sample')} of the intensity ({percent(float(missing.mean()))})"
+    return [
+        f"amplitude_{name}, phase_{name}: left out {number} beside values of the lock-in amplifier that are missing; "
+        "no angle is known there"
+    ]
 
 
 def _describe_held(channel: Channel, held: Sequence[tuple[int, int]]) -> list[str]:

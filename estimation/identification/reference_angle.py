@@ -75,7 +75,7 @@ def find_reference_angle(recording: Recording, axis: Axis, default_tolerance: fl
         if not inside.any():
             hint = "check their start times and rates"
             raise BadInput(f"has no time in common with drive_{name}", file=held.file, channel=held.name, hint=hint)
-        angle = lock_in_angle(recording, axis, time[inside])
+        angle = lock_in_angle(recording, axis, time[inside]).values
         return ReferenceAngle(_channel(name, angle, drive.sample_rate, float(time[inside][0])), held.name)
     if f"sense_{name}" in recording and isinstance(axis.readout, MotionSensor):
         sense, readout = recording[f"sense_{name}"], axis.readout

@@ -11,6 +11,7 @@ import pytest
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.estimate import default_estimator, estimate
+from estimation.lock_in_channels import lock_in_values
 from estimation.slow.decay import LAWS, solve_decay
 from estimation.slow.diagnose import SlowDecay, slow_decays
 from estimation.slow.selection import Decays, compress, fit_law, held_out, prediction_errors
@@ -197,3 +198,38 @@ def test_lock_in_channels_are_a_sensor(reference: float | str) -> None:
     true = (0.1 - 0.1 * time) * np.sin(2 * np.pi * 700.0 * time + 20.0 * time)
     assert np.abs(axis.angle.read() - true)[: 199 * 100].max() < 1e-6
     assert axis.sign == "known: phase_x"
+
+
+@pytest.mark.parametrize("channel", ["amplitude_x", "phase_x", "frequency"])
+def test_a_missing_value_of_a_lock_in_amplifier_affects_the_samples_beside_it_only(channel: str) -> None:
+    """A phase or a frequency of NaN made every later sample NaN; the estimator then ended with "diverges"."""
+    slow, time = np.arange(0.0, 0.2, 1e-3), np.arange(20_000) / 1e5
+    extra = {"reference": "frequency"}
+    channels = {
+        "intensity": (time, "V", 1e5),
+        "amplitude_x": (0.1 - 0.1 * slow, "rad", 1e3, 0.0, extra),
+        "phase_x": (np.angle(np.exp(1j * 20.0 * slow)), "rad", 1e3, 0.0, extra),
+        "frequency": (700.0 + 50.0 * slow, "Hz", 1e3),
+    }
+    channels[channel] = (np.where(slow == slow[5], np.nan, channels[channel][0]), *channels[channel][1:])
+    recording = Recording.from_arrays(channels, Device.from_toml("[x]\n"))
+    motion = estimate(recording)
+    angle = motion.axes["x"].angle.read()[: 199 * 100]
+    true = (0.1 - 0.1 * time) * np.sin(2 * np.pi * (700.0 + 25.0 * time) * time + 20.0 * time)
+    assert np.flatnonzero(np.isnan(angle)).tolist() == list(range(401, 600))
+    assert np.nanmax(np.abs(angle - true[: angle.size])) < 1e-5
+    assert [note for note in motion.notes if "left out 199 samples of the intensity" in note]
+    used, values = lock_in_values(recording, recording.device.axes["x"])
+    assert used == pytest.approx(np.delete(slow, 5))
+    assert np.angle(values) == pytest.approx(np.angle(np.exp(20j * used)))
+
+
+def test_a_lock_in_phase_without_a_finite_sample_is_refused() -> None:
+    slow = np.arange(0.0, 0.2, 1e-3)
+    channels = {
+        "intensity": (np.arange(20_000.0), "V", 1e5),
+        "amplitude_x": (0.1 - 0.1 * slow, "rad", 1e3, 0.0, {"reference": 700.0}),
+        "phase_x": (np.full(slow.size, np.nan), "rad", 1e3, 0.0, {"reference": 700.0}),
+    }
+    with pytest.raises(BadInput, match="phase_x: holds no sample that can be used"):
+        estimate(Recording.from_arrays(channels, Device.from_toml("[x]\n")))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,6 +139,32 @@ def test_a_decay_behind_a_lock_in_amplifier_determines_the_ratios() -> None:
     found = identify([lock_in(recording, 0.1)], nominal())
     assert_within(found.values["x"], ["k_over_J", "b_over_J"])
     assert found.used["x"] == ["recording: free decay, from amplitude_x and phase_x"]
+
+
+@pytest.mark.parametrize("at", [0, 10, 40])
+def test_a_missing_phase_takes_one_value_of_a_decay(at: int) -> None:
+    """All later values were left out: intervals were 700 times as wide, or no decay was found."""
+    recording = lock_in(measure(SENSORS["angle"], Constant(0.0), 0.1, InitialState(0.1, 0.0)), 0.1)
+    found = []
+    for name in ("amplitude_x", "phase_x"):
+        channel = recording[name]
+        values = np.where(np.arange(channel.size) == at, np.nan, channel.read())
+        damaged = replace(recording, channels={**recording.channels, name: replace(channel, raw=values)})
+        found.append(identify([damaged], nominal()).values["x"])
+    assert found[0] == found[1]
+    assert_within(found[1], ["k_over_J", "b_over_J"])
+
+
+@pytest.mark.parametrize("name", ["amplitude_x", "phase_x"])
+def test_a_missing_lock_in_value_beside_a_drive_takes_one_value(name: str) -> None:
+    recording = recorded("lock-in", SWEEP, 91800)
+    channel = recording[name]
+    values = np.where(np.arange(channel.size) == 5, np.nan, channel.read())
+    damaged = replace(recording, channels={**recording.channels, name: replace(channel, raw=values)})
+    whole, found = (identify([each], nominal()).values["x"] for each in (recording, damaged))
+    for key in ("k_over_J", "b_over_J", "J"):
+        assert found[key].value == pytest.approx(whole[key].value, abs=0.5 * whole[key].sd)
+        assert found[key].sd == pytest.approx(whole[key].sd, rel=0.2)
 
 
 def test_a_steady_motion_without_its_drive_is_no_decay() -> None:
