@@ -293,6 +293,26 @@ class Regression(NamedTuple):
         return np.asarray(dtrtri(self.factor)[0]) if self.factor.size else self.factor
 
 
+def between_variance(value: Array, sd: Array) -> float:
+    """Variance between measurements of a quantity beyond their standard deviations, 0 where these explain the scatter.
+
+    Source: DerSimonian and Laird, Controlled Clinical Trials 7, 177 (1986): a random effect of each measurement.
+
+    Args:
+        value, sd: in one unit, shape (n,); standard deviations above 0.
+
+    Returns:
+        in the square of that unit.
+    """
+    relative = (sd.min() / sd) ** 2  # weights without overflow
+    freedom, total = value.size - 1, float(relative.sum())
+    shared = float(np.sum(relative * (total - relative)))
+    if shared <= 0.0:
+        return 0.0
+    scatter = float(np.sum(relative * (value - np.sum(relative * value) / total) ** 2))
+    return max(scatter - freedom * float(sd.min()) ** 2, 0.0) * total / shared
+
+
 def triangular_factor(columns: Array) -> Array:
     """Upper triangular matrix with the inner products of ``columns``, shape (n, q)."""
     return np.asarray(np.linalg.qr(columns, mode="r"))

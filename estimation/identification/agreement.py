@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
-from estimation.least_squares import Z_95, fit_linear
+from estimation.least_squares import Z_95, between_variance, fit_linear
 from scanner.arrays import Array
 
 
@@ -77,16 +78,75 @@ def widen(values: Sequence[IdentifiedValue], differences: Differences) -> list[I
     ]
 
 
+class Found(NamedTuple):
+    """Values that one recording determines, by name."""
+
+    recording: str
+    values: Mapping[str, IdentifiedValue]
+
+
+def weighted_mean(same: Sequence[IdentifiedValue]) -> IdentifiedValue:
+    """Mean with inverse variances as weights."""
+    if len(same) == 1:
+        return same[0]
+    sds = _positive_sds(same)
+    relative = (sds.min() / sds) ** 2
+    mean = float(np.average([each.value for each in same], weights=relative))
+    return IdentifiedValue(mean, float(sds.min() * relative.sum() ** -0.5), max(each.conflict for each in same))
+
+
 def combine_values(found: Sequence[Mapping[str, IdentifiedValue]]) -> dict[str, IdentifiedValue]:
-    """Values of several recordings; those of one parameter are averaged with inverse variances as weights."""
+    """Mean over recordings of every value, with inverse variances as weights.
+
+    Where the values of recordings scatter by more than their standard deviations, as of a device that changed between
+    them, the variance between recordings is added to that of each: :func:`between_variance`.
+    """
     values: dict[str, IdentifiedValue] = {}
     for key in dict.fromkeys(key for each in found for key in each):
         same = [each[key] for each in found if key in each]
-        weights = np.array([1.0 / each.sd**2 for each in same]) if len(same) > 1 else np.ones(1)
-        mean = float(np.average([each.value for each in same], weights=weights))
-        sd = float(weights.sum() ** -0.5) if len(same) > 1 else same[0].sd
-        values[key] = IdentifiedValue(mean, sd, max(each.conflict for each in same))
+        excess = between_variance(np.array([each.value for each in same]), _positive_sds(same)) ** 0.5
+        values[key] = weighted_mean([replace(each, sd=float(np.hypot(each.sd, excess))) for each in same])
     return values
+
+
+def _positive_sds(values: Sequence[IdentifiedValue]) -> Array:
+    """Standard deviations, at least the rounding of the values, shape (n,)."""
+    rounding = np.finfo(float).eps
+    return np.array([max(each.sd, rounding * abs(each.value), np.finfo(float).tiny) for each in values])
+
+
+def contradiction_notes(found: Sequence[Found]) -> list[str]:
+    """One note if values of recordings differ by more than ``DISCRIMINATION_SIGMA`` standard deviations, else none.
+
+    It names, for every such value, the two recordings that differ most.
+    """
+    differences = []
+    for key in dict.fromkeys(key for each in found for key in each.values):
+        pairs = combinations([each for each in found if key in each.values], 2)
+        conflict, first, second = max(
+            ((_distance(a.values[key], b.values[key]), a, b) for a, b in pairs),
+            key=lambda each: each[0],
+            default=(0.0, None, None),
+        )
+        if first is None or second is None or conflict <= DISCRIMINATION_SIGMA:
+            continue
+        change = second.values[key].value - first.values[key].value
+        size = f"{change / first.values[key].value:+.2%}" if first.values[key].value else f"{change:+.3g}"
+        differences.append(
+            f"{key.replace('_over_', '/')} by {conflict:.3g} standard deviations ({size}) between {first.recording} "
+            f"and {second.recording}"
+        )
+    if not differences:
+        return []
+    return [
+        f"recordings contradict each other in {'; '.join(differences)}: the device or its surroundings changed between "
+        "them, or its law is not linear; the intervals allow for the scatter of the recordings"
+    ]
+
+
+def _distance(first: IdentifiedValue, second: IdentifiedValue) -> float:
+    """Difference of two values in its standard deviations."""
+    return float(abs(first.value - second.value) / np.hypot(*_positive_sds([first, second])))
 
 
 def scaled_by_inertia(ratio: IdentifiedValue, J: IdentifiedValue) -> IdentifiedValue:

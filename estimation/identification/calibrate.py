@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.identification.agreement import IdentifiedValue, combine_values
+from estimation.identification.agreement import Found, IdentifiedValue, combine_values, contradiction_notes
 from estimation.identification.capacitance_profile import fit_capacitance_profile
 from estimation.identification.classification import (
     UNREFERENCED_DECAY,
@@ -23,6 +23,7 @@ from estimation.identification.combination import (
     average_ratios,
     axis_with_values,
     conflict_notes,
+    fit_decays,
     mechanics_from_decays,
     values_of_mode,
 )
@@ -136,6 +137,7 @@ class _AxisIdentification:
 
     def __init__(self, name: str, axis: Axis):
         self.name, self.axis = name, axis
+        self.found: list[Found] = []  # values of single recordings, before ``conclude`` combines them
         self.values: dict[str, IdentifiedValue] = {}
         self.used: list[str] = []
         self.notes: list[str] = []
@@ -155,7 +157,7 @@ class _AxisIdentification:
             self.used.append(f"{recording.name}: frequency response")
             fit = select_response_effects(responses[0])
             self.responses.append((responses[0], fit))
-            self.values = combine_values([self.values, values_of_mode(fit)])
+            self.found.append(Found(recording.name, values_of_mode(fit)))
             self.notes.append(f"{self.name}: J is the nominal one; steady tones determine only k/J and b/J")
             return
         kind = classify_recording(recording, self.name)
@@ -179,12 +181,12 @@ class _AxisIdentification:
         elif kind == UNREFERENCED_DECAY:
             channel, readout = recording[f"sense_{self.name}"], self.axis.require_readout()
             found = fit_decay_without_angle(self.axis, channel)
-            self._take_ratios(self._with_bias_stiffness(found, self._volt(recording)), readout)
+            self._take_ratios(recording, self._with_bias_stiffness(found, self._volt(recording)), readout)
 
     def _use_reference(self, recording: Recording, kind: str) -> str:
         """Use a free decay or driven motion with a reference; the words that name it if it is no angle channel."""
         if kind == "free decay" and lock_in_only(recording, self.name):
-            self._take_ratios(fit_lock_in_decay(recording, self.axis), None)
+            self._take_ratios(recording, fit_lock_in_decay(recording, self.axis), None)
             return f", from amplitude_{self.name} and phase_{self.name}"
         reference = find_reference_angle(recording, self.axis, DEFAULT_TOLERANCE)
         if reference is None:
@@ -200,16 +202,18 @@ class _AxisIdentification:
         angle = values[f"angle_{self.name}"]
         frequency = self.axis.resonance
         if kind == "free decay" and reference.sensor is None:
-            self.decays.append((angle, clock.rate, self._volt(recording)))
+            self.decays.append(Decay(recording.name, angle, clock.rate, self._volt(recording)))
         elif kind == "free decay":
             measured = replace(self.axis, readout=reference.sensor)
-            self._take_ratios(fit_decay_without_angle(measured, recording[reference.source]), reference.sensor)
+            self._take_ratios(
+                recording, fit_decay_without_angle(measured, recording[reference.source]), reference.sensor
+            )
         else:
             frequency = self._use_driven(recording, clock.time, angle, values[f"drive_{self.name}"], reference)
         if sense_shows_comb:
             sense = values[f"sense_{self.name}"]
             found = fit_capacitance_profile(self.axis, angle, sense, clock.rate, frequency).values
-            self.values = combine_values([self.values, found])
+            self.found.append(Found(recording.name, found))
             if reference.order:
                 self.notes.append(
                     f"{self.name}: {reference.source} does not contain the mean angle; theta_th is relative to it"
@@ -224,7 +228,8 @@ class _AxisIdentification:
         phase = drive_reference(recording[f"drive_{self.name}"], "half-drive" if electrostatic else "drive")
         rate = 1.0 / float(time[1] - time[0])
         lock_in = lock_in_output(recording, self.axis) if reference.source.startswith("amplitude") else None
-        self.swept.append(SweptRecord(DrivenRecord(angle, drive, phase.frequency, rate), time, phase, lock_in))
+        driven = DrivenRecord(angle, drive, phase.frequency, rate)
+        self.swept.append(SweptRecord(driven, time, phase, lock_in, recording.name))
         if lock_in is None:
             self.driven += steady_segments(angle, drive, phase.frequency_at(time), rate)
         self.gain_tolerance = max(self.gain_tolerance, reference.gain_tolerance)
@@ -243,9 +248,9 @@ class _AxisIdentification:
         )
         return found | {"k_over_J": IdentifiedValue(ratio.value, float(np.hypot(ratio.sd, stiffness)))}
 
-    def _take_ratios(self, found: dict[str, IdentifiedValue], readout: Readout | None) -> None:
+    def _take_ratios(self, recording: Recording, found: dict[str, IdentifiedValue], readout: Readout | None) -> None:
         """Take ratios of the mechanics from a free decay without an angle; ``conclude`` names the values left open."""
-        self.values = combine_values([self.values, found])
+        self.found.append(Found(recording.name, found))
         self.open_after_decay = ""
         if isinstance(readout, MotionSensor) and readout is self.axis.readout:
             self.open_after_decay = ", and the gain of the readout"
@@ -259,7 +264,7 @@ class _AxisIdentification:
             found = {"noise_var": IdentifiedValue(variance, variance * np.sqrt(2.0 / sense.size))}
         else:
             found = {"noise_sd": IdentifiedValue(float(np.sqrt(variance)), float(np.sqrt(0.5 * variance / sense.size)))}
-        self.values = combine_values([self.values, found])
+        self.found.append(Found(recording.name, found))
 
     def _volt(self, recording: Recording) -> float:
         """Voltage on the combs during a free decay [V].
@@ -274,6 +279,8 @@ class _AxisIdentification:
 
     def conclude(self) -> None:
         """Determine the mechanics: scaled by driven motion, else by a bias during a decay, else by the nominal J."""
+        self.values = combine_values([each.values for each in self.found])
+        self.notes += [f"{self.name}: {note}" for note in contradiction_notes(self.found)]
         if self.values.keys() <= {"noise_var", "noise_sd"} and self.values and not self.swept:
             self.notes.append(
                 f"{self.name}: no recording shows a motion: resonance, Q and all other constants stay as stated; "
@@ -287,7 +294,12 @@ class _AxisIdentification:
                 self.by_torque[key] = ratio.value * self.axis.tolerance.get("J", DEFAULT_TOLERANCE) * J
         axis = self.device_axis()  # with the capacitance as identified
         if self.decays:
-            self._take(axis, lambda axis: mechanics_from_decays(axis, self.decays))
+            fits = fit_decays(axis, self.decays)
+            self._take(
+                axis,
+                lambda each: mechanics_from_decays(each, fits if each is axis else fit_decays(each, self.decays)),
+            )
+            self.notes += [f"{self.name}: {note}" for note in contradiction_notes(fits)]
         decay = {key: value for key, value in self.values.items() if key in ("k_over_J", "b_over_J")}
         # in a slow sweep at a high Q, segments of steady amplitude are no steady motion: the decay time is longer
         frequencies = (
@@ -302,7 +314,7 @@ class _AxisIdentification:
             fit = fit_swept_motion(axis, self.swept)
             self._take(axis, lambda each: (fit if each is axis else fit_swept_motion(each, self.swept)).values)
             several = self.values != before
-            self.notes += [f"{self.name}: {line}" for line in fit.filters]
+            self.notes += [f"{self.name}: {line}" for line in fit.notes]
         if self.swept and not several:
             self.notes.append(
                 f"{self.name}: the driven motion does not determine J; record two or more drive frequencies, or a "
@@ -323,7 +335,7 @@ class _AxisIdentification:
             for key in MECHANICS_KEYS:
                 self.by_torque[key] = float(np.hypot(self.by_torque[key], self.gain_tolerance * self.values[key].value))
         if self.decays and not several and not self.values["J"].sd:
-            has_bias = any(volt for _, _, volt in self.decays)
+            has_bias = any(each.volt for each in self.decays)
             cause = "the bias has no visible effect, without which " if has_bias else ""
             self.notes.append(
                 f"{self.name}: J is the nominal one; {cause}a free decay determines only k/J and b/J, driven motion "

@@ -4,18 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA
-from estimation.identification.agreement import Differences, IdentifiedValue, combine_values, scaled_by_inertia, widen
+from estimation.identification.agreement import (
+    Differences,
+    Found,
+    IdentifiedValue,
+    combine_values,
+    scaled_by_inertia,
+    weighted_mean,
+    widen,
+)
 from estimation.identification.fits import fit_ringdown
 from estimation.slow.response import ResponseFit
 from scanner.arrays import Array
 from scanner.device import Axis
 
-Decay = tuple[Array, float, float]
-"""Angle of a free decay [rad], shape (n,), its rate [Hz], and the voltage on the combs [V]."""
+
+class Decay(NamedTuple):
+    """Free decay of one recording.
+
+    Attributes:
+        recording: its name.
+        angle: shape (n,) [rad].
+        rate: of the samples [Hz].
+        volt: voltage on the combs [V].
+    """
+
+    recording: str
+    angle: Array
+    rate: float
+    volt: float
 
 
 def values_of_mode(fit: ResponseFit) -> dict[str, IdentifiedValue]:
@@ -29,9 +51,14 @@ def values_of_mode(fit: ResponseFit) -> dict[str, IdentifiedValue]:
     }
 
 
-def mechanics_from_decays(axis: Axis, decays: Sequence[Decay]) -> dict[str, IdentifiedValue]:
-    """Mechanics from free decays; J is the nominal one where no bias determines it."""
-    found = combine_values([fit_ringdown(angle, rate, axis, volt)[0] for angle, rate, volt in decays])
+def fit_decays(axis: Axis, decays: Sequence[Decay]) -> list[Found]:
+    """k/J, b/J and, under a bias, J of every free decay."""
+    return [Found(each.recording, fit_ringdown(each.angle, each.rate, axis, each.volt)[0]) for each in decays]
+
+
+def mechanics_from_decays(axis: Axis, fits: Sequence[Found]) -> dict[str, IdentifiedValue]:
+    """Mechanics from fits of free decays; J is the nominal one where no bias determines it."""
+    found = combine_values([each.values for each in fits])
     J = found.setdefault("J", IdentifiedValue(axis.require_mechanics().J, 0.0))
     return found | {key: scaled_by_inertia(found[f"{key}_over_J"], J) for key in ("k", "b")}
 
@@ -52,7 +79,7 @@ def average_ratios(
     """
     values, weights, notes = {}, {}, []
     for key, free in decay.items():
-        mean = combine_values([{key: free}, {key: driven[key]}])[key]
+        mean = weighted_mean([free, driven[key]])
         difference, sd = free.value - driven[key].value, float(np.hypot(free.sd, driven[key].sd))
         values[key] = widen([mean], Differences(np.array([difference]), np.array([sd])))[0]
         values[key[0]] = scaled_by_inertia(values[key], driven["J"])

@@ -67,12 +67,14 @@ class SweptRecord:
         time: of its samples, shape (n,) [s].
         reference: phase of the motion's drive.
         lock_in: what a lock-in amplifier recorded, where the angle is interpolated from that.
+        recording: its name.
     """
 
     driven: DrivenRecord
     time: Array
     reference: PhaseReference
     lock_in: LockInOutput | None = None
+    recording: str = ""
 
 
 def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, IdentifiedValue]:

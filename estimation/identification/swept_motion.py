@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimation.identification.agreement import IdentifiedValue, combine_values
+from estimation.identification.agreement import Found, IdentifiedValue, combine_values, contradiction_notes
 from estimation.identification.lock_in_sweep import fit_lock_in_sweep
 from estimation.identification.sweep import LockInOutput, SweptRecord, fit_swept
 from estimation.lock_in_channels import lock_in_values, reference_turn
@@ -18,10 +18,10 @@ from scanner.recording import Recording
 
 
 class SweptMotion(NamedTuple):
-    """Identified values by name, and a line for the filter of every lock-in amplifier."""
+    """Identified values by name, and lines: for the filter of every lock-in amplifier, and on contradictions."""
 
     values: dict[str, IdentifiedValue]
-    filters: list[str]
+    notes: list[str]
 
 
 def fit_swept_motion(axis: Axis, records: Sequence[SweptRecord]) -> SweptMotion:
@@ -33,16 +33,16 @@ def fit_swept_motion(axis: Axis, records: Sequence[SweptRecord]) -> SweptMotion:
         axis: its drive and its capacitance set the torque; its mechanics are not used.
     """
     plain = [record for record in records if record.lock_in is None]
-    found, filters = [fit_swept(axis, plain)] if plain else [], []
+    found, notes = [Found(", ".join(each.recording for each in plain), fit_swept(axis, plain))] if plain else [], []
     for record in records:
         first = fit_swept(axis, [record]) if record.lock_in is not None else {}
         if record.lock_in is None or not first:
             continue
         start = (first["k_over_J"].value, max(first["b_over_J"].value, first["b_over_J"].sd))
         fit = fit_lock_in_sweep(axis, record, record.lock_in, start)
-        found.append(fit.values)
-        filters += [fit.describe()] if fit.values else []
-    return SweptMotion(combine_values(found), filters)
+        found.append(Found(record.recording, fit.values))
+        notes += [fit.describe()] if fit.values else []
+    return SweptMotion(combine_values([each.values for each in found]), notes + contradiction_notes(found))
 
 
 def lock_in_output(recording: Recording, axis: Axis) -> LockInOutput:

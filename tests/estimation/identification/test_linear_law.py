@@ -14,8 +14,10 @@ from benchmarks.measured import ROWS
 from benchmarks.papers.sine import linear_axis
 from estimation.identification.agreement import (
     Differences,
+    Found,
     IdentifiedValue,
     combine_values,
+    contradiction_notes,
     difference_by_extra_columns,
     widen,
 )
@@ -159,6 +161,46 @@ def test_an_interval_is_widened_by_what_noise_does_not_explain() -> None:
     assert wide.conflict == pytest.approx(20.0)
     assert wide.ci95[0] < 6.0
     assert combine_values([{"k": wide}, {"k": value}])["k"].conflict == wide.conflict
+
+
+def test_values_of_recordings_that_contradict_each_other_have_an_interval_that_contains_them() -> None:
+    first, second = IdentifiedValue(1.0, 1e-6), IdentifiedValue(1.002, 1e-8)
+    mean = combine_values([{"k": first}, {"k": second}])["k"]
+    assert mean.ci95[0] < first.value < second.value < mean.ci95[1]
+    assert mean.sd == pytest.approx(0.001, rel=1e-3)
+    found = [Found("a", {"k_over_J": first}), Found("b", {"k_over_J": first}), Found("c", {"k_over_J": second})]
+    (note,) = contradiction_notes(found)
+    assert "k/J by 2e+03 standard deviations (+0.20%) between a and c" in note
+    assert not contradiction_notes(found[:2])
+    agreeing = combine_values([{"k": first}, {"k": replace(first, value=1.0 + 1e-6)}])["k"]
+    assert agreeing.sd == pytest.approx(first.sd / np.sqrt(2.0))
+
+
+@pytest.mark.parametrize("kind", ["angle", "sense"])
+@pytest.mark.parametrize("detuning", [0.0, 1e-3])
+def test_free_decays_that_contradict_each_other_are_named(kind: str, detuning: float) -> None:
+    """They were averaged to an interval that contains neither of them, without a note."""
+    rng, time, axis = np.random.default_rng(0), np.arange(8000) / RATE, resonator(40.0, 0.0)
+    w, recordings = axis.resonance * 2 * np.pi, []
+    unit = "rad" if kind == "angle" else "V"
+    for name, factor in (("cold", 1.0), ("warm", 1.0 + detuning)):
+        values = np.exp(-0.5 * w / 40.0 * time) * np.sin(w * factor * time) + 1e-4 * rng.standard_normal(time.size)
+        scale = 0.1 if kind == "angle" else 1.0
+        recordings.append(Recording.from_arrays({f"{kind}_x": (scale * values, unit, RATE)}, name=name))
+    device = Device("d", {"x": axis})
+    found = identify(recordings, device)
+    notes = [note for note in found.notes if "contradict each other" in note]
+    alone = [identify([each], device).values["x"]["k_over_J"] for each in recordings]
+    value = found.values["x"]["k_over_J"]
+    if not detuning:
+        assert not notes
+        assert value.sd < 1.5 * alone[0].sd
+        return
+    (note,) = notes
+    assert note.startswith("x: recordings contradict each other in k/J by ")
+    assert "between cold and warm" in note
+    assert value.sd == pytest.approx(0.5 * abs(alone[0].value - alone[1].value), rel=0.05)
+    assert found.device.axis("x").tolerance["k"] == pytest.approx(1e-3, rel=0.1)
 
 
 def test_the_change_by_further_columns_has_its_stated_deviation() -> None:
