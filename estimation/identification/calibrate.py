@@ -280,7 +280,6 @@ class _AxisIdentification:
     def conclude(self) -> None:
         """Determine the mechanics: scaled by driven motion, else by a bias during a decay, else by the nominal J."""
         self.values = combine_values([each.values for each in self.found])
-        self.notes += [f"{self.name}: {note}" for note in contradiction_notes(self.found)]
         if self.values.keys() <= {"noise_var", "noise_sd"} and self.values and not self.swept:
             self.notes.append(
                 f"{self.name}: no recording shows a motion: resonance, Q and all other constants stay as stated; "
@@ -293,13 +292,16 @@ class _AxisIdentification:
                 self.values[key] = IdentifiedValue(ratio.value * J, ratio.sd * J)
                 self.by_torque[key] = ratio.value * self.axis.tolerance.get("J", DEFAULT_TOLERANCE) * J
         axis = self.device_axis()  # with the capacitance as identified
-        if self.decays:
-            fits = fit_decays(axis, self.decays)
+        fits = fit_decays(axis, self.decays)
+        if fits:
+            others = [each for each in self.found if "k_over_J" in each.values]  # without an angle
             self._take(
                 axis,
-                lambda each: mechanics_from_decays(each, fits if each is axis else fit_decays(each, self.decays)),
+                lambda each: mechanics_from_decays(
+                    each, [*others, *(fits if each is axis else fit_decays(each, self.decays))]
+                ),
             )
-            self.notes += [f"{self.name}: {note}" for note in contradiction_notes(fits)]
+        self.notes += [f"{self.name}: {note}" for note in contradiction_notes([*self.found, *fits])]
         decay = {key: value for key, value in self.values.items() if key in ("k_over_J", "b_over_J")}
         # in a slow sweep at a high Q, segments of steady amplitude are no steady motion: the decay time is longer
         frequencies = (
