@@ -293,13 +293,15 @@ class Regression(NamedTuple):
         return np.asarray(dtrtri(self.factor)[0]) if self.factor.size else self.factor
 
 
-def between_variance(value: Array, sd: Array) -> float:
+def between_variance(value: Array, sd: Array, significance: float = 0.0) -> float:
     """Variance between measurements of a quantity beyond their standard deviations, 0 where these explain the scatter.
 
     Source: DerSimonian and Laird, Controlled Clinical Trials 7, 177 (1986): a random effect of each measurement.
 
     Args:
         value, sd: in one unit, shape (n,); standard deviations above 0.
+        significance: excess of chi-square over its degrees of freedom, in its standard deviations, up to which the
+            standard deviations explain the scatter.
 
     Returns:
         in the square of that unit.
@@ -309,8 +311,9 @@ def between_variance(value: Array, sd: Array) -> float:
     shared = float(np.sum(relative * (total - relative)))
     if shared <= 0.0:
         return 0.0
-    scatter = float(np.sum(relative * (value - np.sum(relative * value) / total) ** 2))
-    return max(scatter - freedom * float(sd.min()) ** 2, 0.0) * total / shared
+    variance = float(sd.min()) ** 2
+    excess = float(np.sum(relative * (value - np.sum(relative * value) / total) ** 2)) - freedom * variance
+    return excess * total / shared if excess > significance * np.sqrt(2.0 * freedom) * variance else 0.0
 
 
 def triangular_factor(columns: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from estimation.least_squares import between_variance
 from recon.evaluation import AxisEvaluation
 from recon.imaging import blur
 from recon.imaging.coverage import fill_against_time
@@ -54,7 +55,8 @@ def picture_phase_error(errors: list[PhaseError], axis: str) -> dict[str, Any]:
     if not determined:
         return {"value": math.nan, "sd": math.inf, "scatter": 0.0, "slices": slices}
     value, sd = (np.array(column) for column in zip(*determined, strict=True))
-    excess, unknown_share = excess_variance(value, sd), 1.0 - sd.size / len(errors)
+    excess = between_variance(value, np.maximum(sd, MIN_SD_RAD), MIN_CONTRADICTION_SDS)
+    unknown_share = 1.0 - sd.size / len(errors)
     mean_sd = math.sqrt(float(np.mean(sd**2) + excess * unknown_share) / sd.size)
     return {
         "value": math.degrees(value.mean()),
@@ -62,25 +64,6 @@ def picture_phase_error(errors: list[PhaseError], axis: str) -> dict[str, Any]:
         "scatter": math.degrees(math.sqrt(excess)),
         "slices": slices,
     }
-
-
-def excess_variance(value: Array, sd: Array) -> float:
-    """Variance between measurements that contradict each other, 0 where their standard errors explain it [rad²].
-
-    Source: DerSimonian and Laird, Controlled Clinical Trials 7, 177 (1986): a random effect of each measurement.
-
-    Args:
-        value, sd: shape (n,) [rad].
-    """
-    if value.size < 2:
-        return 0.0
-    weight = 1.0 / np.maximum(sd, MIN_SD_RAD) ** 2
-    total, freedom = float(weight.sum()), value.size - 1
-    excess = float(np.sum(weight * (value - np.sum(weight * value) / total) ** 2)) - freedom
-    shared = float(np.sum(weight * (total - weight)))
-    if not (excess > MIN_CONTRADICTION_SDS * math.sqrt(2.0 * freedom) and shared > 0.0):
-        return 0.0
-    return excess * total / shared
 
 
 AXIS_QUANTITIES = (

@@ -130,3 +130,6 @@ def test_the_variance_between_measurements_is_what_their_standard_deviations_do_
     for scale in (1e-17, 1.0, 1e12):  # J [kg m2] to k/J [1/s2]
         two = between_variance(scale * np.array([1.0, 3.0]), scale * np.array([1e-8, 1e-9]))
         assert two == pytest.approx(2.0 * scale**2)
+    assert between_variance(np.array([1.0, 3.0]), np.ones(2), significance=3.0) == 0.0
+    assert between_variance(np.array([1.0, -1.0]), np.full(2, 1e-3), significance=3.0) == pytest.approx(2.0, rel=1e-3)
+    assert np.isfinite(between_variance(np.array([1.0, -1.0]), np.array([1e-9, 3.0]), significance=3.0))

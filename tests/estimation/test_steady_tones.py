@@ -146,14 +146,6 @@ def test_a_quadratic_drag_in_volts_has_its_size_at_the_largest_amplitude() -> No
     assert size.value == pytest.approx(drag * largest, rel=0.1)
 
 
-def test_a_tone_without_a_value_is_left_out_of_the_error_too() -> None:
-    angle = mode(F0, Q, 0.1)
-    angle[3] = np.nan
-    found = diagnose_with_optics([recording(angle, f0=800.5)])
-    assert found.verdict == "consistent"
-    assert np.isfinite(found.open_loop["amplitude_x"]["improved"]["rmse"])
-
-
 def test_identify_takes_steady_tones() -> None:
     made = recording(mode(801.0, 250.0, 0.1))
     assert made.device is not None

@@ -5,7 +5,7 @@ import pytest
 
 from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
 from recon.report.conclusions import describe_slices
-from recon.report.summary import excess_variance, picture_phase_error
+from recon.report.summary import picture_phase_error
 
 SLICES = 16
 
@@ -40,10 +40,3 @@ def test_slices_that_differ_beyond_their_errors_are_named_beside_the_mean() -> N
     agree = picture_phase_error(slices(np.array([0.050, 0.053, 0.047]), np.full(3, 2e-3)), "x")
     assert agree["scatter"] == 0.0
     assert describe_slices(agree) == ""
-
-
-def test_one_slice_and_one_without_noise_have_a_finite_excess_variance() -> None:
-    for sd in np.random.default_rng(0).uniform(1e-4, 1.0, 100):
-        assert excess_variance(np.array([0.3]), np.array([sd])) == 0.0
-    assert excess_variance(np.array([1.0, -1.0]), np.array([1e-3, 1e-3])) == pytest.approx(2.0, rel=1e-3)
-    assert np.isfinite(excess_variance(np.array([1.0, -1.0]), np.array([0.0, 3.0])))
