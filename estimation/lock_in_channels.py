@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from scanner.arrays import Array, Complex, Mask
-from scanner.channel import Channel, check_signal
+from scanner.channel import Channel
 from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.stages import MotionSensor
 
 

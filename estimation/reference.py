@@ -9,9 +9,10 @@ import numpy as np
 from estimation.knot_smoother import smooth_knots
 from estimation.short_tone import MIN_PERIODS, fit_short_tone
 from scanner.arrays import Array, Complex
-from scanner.channel import Channel, hint_of_dead
+from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block, unwrap_phase
+from scanner.signal_check import hint_of_dead
 
 MIN_RELATIVE_FREQUENCY = 0.2
 """Frequency of a motion over the resonance below which the mirror follows its drive slowly: the spring balances the

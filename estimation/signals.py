@@ -16,10 +16,11 @@ from estimation.reference import (
     tone_frequency,
 )
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal
+from scanner.channel import Channel
 from scanner.device import Device
 from scanner.errors import BadInput, ChannelMissing, DeviceInvalid
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.stages import Acceleration, MotionSensor, Readout, Velocity
 
 NORMAL_MEDIAN_DEVIATION = 0.6745

@@ -19,12 +19,13 @@ from recon.steps.phase_and_drift import correct_readout_phase
 from recon.steps.preparation import prepare
 from recon.steps.reconstruction import Options
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal
+from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.geometry import Geometry, locate_points, trace_rays
 from scanner.motion import AxisMotion
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.wording import counted
 
 ANGLE_STEP_RAD = 1e-5

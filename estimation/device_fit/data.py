@@ -12,7 +12,7 @@ from estimation.device_fit.drive_lines import drive_lines, is_steady, strongest_
 from estimation.device_fit.resampling import decimate, fast_transform_length, resample_drive
 from estimation.reference import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal
+from scanner.channel import Channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.forward_model import REFERENCE_ORDERS, DriveInput
@@ -20,6 +20,7 @@ from scanner.integrator.nodes import to_nodes
 from scanner.interpolation import interpolate_cubic
 from scanner.lowpass import lowpass_response
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.stages import Amdm, MotionSensor, Readout, Transimpedance
 from scanner.terms import NaturalScales
 

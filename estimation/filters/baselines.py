@@ -36,13 +36,14 @@ from estimation.signals import (
 )
 from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Index, Mask
-from scanner.channel import Channel, check_signal, make_channel
+from scanner.channel import Channel, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from scanner.replaced_samples import with_replaced
+from scanner.signal_check import check_signal
 from scanner.stages import Position
 from scanner.wording import counted, percent
 

@@ -13,12 +13,12 @@ from estimation.filters.baselines import find_position_signal, reference_from_dr
 from estimation.filters.measured_motion import axis_motion_from_angle
 from estimation.signals import intensity_clock
 from scanner.arrays import Array
-from scanner.channel import check_signal
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
 from scanner.motion import Motion
 from scanner.recording import Recording
 from scanner.replaced_samples import with_samples
+from scanner.signal_check import check_signal
 from scanner.stages import Position
 
 SIGMA_POINT_SPREAD = 3.0

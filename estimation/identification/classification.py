@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from scanner.arrays import Array
-from scanner.channel import check_signal
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 
 UNREFERENCED_DECAY = "free decay without a reference angle"
 UNREFERENCED_DRIVE = "driven motion without a reference angle"

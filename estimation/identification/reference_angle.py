@@ -13,10 +13,11 @@ import numpy as np
 from estimation.lock_in_channels import lock_in_angle
 from estimation.reference import dominant_frequency
 from scanner.arrays import Array
-from scanner.channel import Channel, check_signal, make_channel
+from scanner.channel import Channel, make_channel
 from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.stages import Acceleration, MotionSensor, Position, Velocity
 
 MEAN_CYCLES = 8.0

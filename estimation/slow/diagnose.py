@@ -27,11 +27,11 @@ from estimation.slow.selection import (
     rate_price,
 )
 from scanner.arrays import Array
-from scanner.channel import check_signal
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.stages import MotionSensor
 from scanner.terms import catalogue
 

@@ -15,10 +15,11 @@ from estimation.signals import is_capacitive, sense_channels
 from recon.quality.drive_check import SAME_FREQUENCY
 from recon.quality.hum_check import describe_hum
 from recon.quality.line_search import LineSearch, search_lines
-from scanner.channel import Channel, check_signal
+from scanner.channel import Channel
 from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.stages import Position
 
 BAND = (0.8, 1.25)

@@ -15,12 +15,13 @@ import numpy as np
 
 from estimation.reference import tone_frequency
 from estimation.signs import sign_from_edges
-from scanner.channel import Channel, LazySamples, check_signal
+from scanner.channel import Channel, LazySamples
 from scanner.device import AXES, Axis, Device
 from scanner.edges import Edges
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.stages import Mechanics, MotionSensor
 
 COMPARED_SAMPLES = 1 << 16

@@ -16,11 +16,12 @@ from recon.quality.drive_check import check_drives, check_rates, check_signals
 from recon.quality.duration_check import check_duration
 from recon.quality.sensor_sign import describe_inverted_sensors
 from scanner import devices
-from scanner.channel import USED_CHANNELS, Channel, check_signal
+from scanner.channel import USED_CHANNELS, Channel
 from scanner.channel_names import suggest_name
 from scanner.device import AXES, VALUES, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.wording import counted
 
 DeviceSource = str | Path | Device

@@ -12,11 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from scanner.channel import READ_CHUNK_SAMPLES, check_signal
+from scanner.channel import READ_CHUNK_SAMPLES
 from scanner.clock import Clock, on_clock
 from scanner.device import Device
 from scanner.errors import BadInput, ChannelMissing
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from scanner.truth import read_truth
 
 STAGE = 'name = "stage"\n[x.readout]\nkind = "position"\ngain = 2.0\nnoise_sd = 0.1\n'

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from recon.cli import main
 from recon.io.convert import open_any
 from recon.io.readers import read
-from scanner.channel import check_signal
 from scanner.device import Device
 from scanner.devices import load
 from scanner.errors import BadInput
 from scanner.files import parse_toml
 from scanner.recording import Recording
+from scanner.signal_check import check_signal
 from tests.support.fuzzing import damaged, run_in_child
 from tests.support.measured_data import MEASURED_DATA
 from tests.support.sample_files import MEASURED, make_sample_files, recording
