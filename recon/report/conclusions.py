@@ -237,7 +237,8 @@ def conclude_prediction(summary: Mapping[str, Any]) -> str:
     )
     if channel["noise_sd"] and channel["rmse"] > 1.5 * channel["noise_sd"]:
         ratio = format_value(channel["rmse"] / channel["noise_sd"], 2)
-        return text + f", {ratio} times its noise. Run lissajous diagnose to find what the device lacks."
+        advice = "" if summary["terms"] else " Run lissajous diagnose to find what the device lacks."
+        return f"{text}, {ratio} times its noise.{advice}"
     return text + "."
 
 

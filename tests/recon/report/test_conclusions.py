@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from recon.pipeline import reconstruct
 from recon.report.conclusions import conclude_prediction, conclude_study
@@ -42,8 +43,16 @@ def test_an_estimator_that_blurs_every_picture_is_not_recommended() -> None:
 def test_a_prediction_as_far_off_as_none_is_no_prediction() -> None:
     def conclude_single(nrmse: float) -> str:
         channel = {"nrmse": nrmse, "rmse": 0.1, "unit": "V", "noise_sd": 0.1}
-        return conclude_prediction({"device": "mirror", "channels": {"sense_x": channel}})
+        return conclude_prediction({"device": "mirror", "terms": {}, "channels": {"sense_x": channel}})
 
     assert "predicts the channel with an error of 5% of the signal" in conclude_single(0.05)
     assert "with an error of 100% of the signal" in conclude_single(0.999)
     assert "does not predict sense_x: they differ by 2 times the signal" in conclude_single(2.0)
+
+
+@pytest.mark.parametrize("terms", [{}, {"x": ["cubic-stiffness"]}])
+def test_a_device_without_found_laws_is_to_be_diagnosed(terms: dict[str, list[str]]) -> None:
+    channel = {"nrmse": 0.05, "rmse": 0.4, "unit": "V", "noise_sd": 0.1}
+    text = conclude_prediction({"device": "mirror", "terms": terms, "channels": {"sense_x": channel}})
+    assert "4.0 times its noise." in text
+    assert ("Run lissajous diagnose" in text) is not bool(terms)
