@@ -187,7 +187,7 @@ def _origin(spec: Mapping[str, Any], contents: Contents, mapping: str) -> dict[s
     stated = {key: getattr(variable, key) for key in ("unit", "sample_rate", "start")}
     by = {key: "file" if value is not None else "default: 0" for key, value in stated.items()}
     by |= dict.fromkeys((key for key in stated if key in spec), mapping)
-    by |= {key: f"variable {spec['time']}" for key in ("sample_rate", "start") if "time" in spec}
+    by |= {key: f"variable {spec['time']}" for key in ("sample_rate", "start") if "time" in spec and key not in spec}
     overruled = {
         key: value
         for key, value in stated.items()

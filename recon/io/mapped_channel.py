@@ -103,9 +103,10 @@ def map_channel(request: Request) -> Channel:
         raise request.bad("scale must be a number other than 0, offset a number", "channel = scale * variable + offset")
     rate: Any
     if "time" in spec:
-        if "sample_rate" in spec or "start" in spec:
-            raise request.bad("says time and sample_rate or start", "the times state both")
-        rate, start = _clock(_find(request, spec["time"]), spec["time"], request.bad)
+        if "sample_rate" in spec:
+            raise request.bad("says time and sample_rate", "the times state the rate")
+        rate, first_time = _clock(_find(request, spec["time"]), spec["time"], request.bad)
+        start = spec.get("start", first_time)
     else:
         rate, start = spec.get("sample_rate", variable.sample_rate), spec.get("start", variable.start or 0.0)
     unit = spec.get("unit", None if scaled else variable.unit)  # the file states the unit before scaling

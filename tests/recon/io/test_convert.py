@@ -164,7 +164,7 @@ CONTENTS = "run.mat holds x (5,), z (2, 2), label (1,), cell (2,)"
         (("sample_rate = 500", "sample_rate = 1" + "0" * 400), "BOTH: intensity: sample_rate is 1"),
         (
             ("start = 0.25", 'time = "x"'),
-            "MAP: channels.intensity: says time and sample_rate or start; the times state both",
+            "MAP: channels.intensity: says time and sample_rate; the times state the rate",
         ),
         (
             ('name = "bench"', "sample_rate = 5"),
@@ -263,6 +263,16 @@ def test_uniform_times_are_a_clock_and_times_with_a_jump_are_refused(tmp_path: P
     savemat(tmp_path / "a.mat", {"v": np.arange(9.0), "t": np.zeros(9)})
     with pytest.raises(BadInput, match="its times do not rise"):
         convert(tmp_path / "a.mat", plan)
+
+
+def test_times_since_1970_are_a_clock_where_the_mapping_states_the_start(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"v": np.arange(20_000.0), "t": 1.7e9 + np.arange(20_000) / 1e5})
+    channel = {"variable": "v", "unit": "mV", "time": "t"}
+    with pytest.raises(BadInput, match=r"starts at 1.7e\+09 s, where times have steps of 2.4e-07 s"):
+        convert(tmp_path / "a.mat", {"channels": {"sense_x": channel}})
+    with convert(tmp_path / "a.mat", {"channels": {"sense_x": channel | {"start": 0.0}}}) as recording:
+        sense = recording["sense_x"]
+        assert (sense.sample_rate, sense.start) == (pytest.approx(1e5, rel=2e-6), 0.0)
 
 
 def test_a_mapping_may_override_the_file_and_the_summary_reports_it(tmp_path: Path) -> None:
