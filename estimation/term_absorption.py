@@ -18,8 +18,9 @@ from estimation.clipped_samples import clip_again, find_rails
 from scanner.active_terms import ActiveTerm, with_constants
 from scanner.arrays import Array
 from scanner.channel import Channel
+from scanner.coupled_motion import beside_each_other
 from scanner.device import Axis, Device
-from scanner.forward_model import AxisTrajectory, DriveInput, apply_channel_terms, beside_each_other, effective_drive
+from scanner.forward_model import AxisTrajectory, DriveInput, apply_channel_terms, effective_drive
 from scanner.integrator.nodes import nodes_to_samples, to_nodes
 from scanner.recording import Recording
 from scanner.replaced_samples import with_samples

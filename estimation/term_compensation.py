@@ -43,8 +43,9 @@ from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.angle_tracks import SampledAngle
 from scanner.arrays import Array
 from scanner.channel import Channel
+from scanner.coupled_motion import beside_each_other
 from scanner.device import Device
-from scanner.forward_model import AxisTrajectory, beside_each_other, reference_signal, sense_signal
+from scanner.forward_model import AxisTrajectory, reference_signal, sense_signal
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from scanner.replaced_samples import with_samples

@@ -22,17 +22,11 @@ from phantoms.waveforms import Waveform
 from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.arrays import Array
 from scanner.channel import CHANNEL_UNITS
+from scanner.coupled_motion import simulate_coupled
 from scanner.device import Axis, Device
 from scanner.drift import Drift
 from scanner.errors import BadInput, DeviceInvalid
-from scanner.forward_model import (
-    AxisTrajectory,
-    DriveInput,
-    reference_signal,
-    sense_signal,
-    simulate_axis,
-    simulate_coupled,
-)
+from scanner.forward_model import AxisTrajectory, DriveInput, reference_signal, sense_signal, simulate_axis
 from scanner.integrator.nodes import to_nodes
 from scanner.optics import apply_intensity_terms, beam_position
 from scanner.recording import Recording

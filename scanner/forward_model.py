@@ -5,7 +5,7 @@ Simulation, prediction and diagnosis use this one chain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,10 +24,6 @@ _EMPTY = np.empty(0)
 
 REFERENCE_ORDERS = {"angle": 0, "velocity": 1, "acceleration": 2}
 """Kinds of reference channel (``angle_x``, ...) and the time derivatives of the angle that they hold."""
-
-COUPLING_ITERATIONS = 2
-"""Repeated simulations of coupled axes. Each reduces the error by the square of the relative coupling, which is 1e-4
-for a coupling of 1 %."""
 
 
 @dataclass(frozen=True)
@@ -176,48 +172,6 @@ def effective_drive(axis: Axis, terms: Sequence[ActiveTerm], drive: DriveInput) 
         if active.term.voltage is not None:
             voltage = active.term.voltage(voltage, active.values, context)
     return voltage
-
-
-AxisSimulator = Callable[[str, DriveInput, tuple[float, float], "Array | None"], AxisTrajectory]
-"""(axis name, drive, start, the other axis's angle at the nodes) -> the axis's motion."""
-
-
-def simulate_coupled(
-    drives: Mapping[str, DriveInput],
-    starts: Mapping[str, tuple[float, float]],
-    coupled: bool,
-    simulate: AxisSimulator,
-) -> dict[str, AxisTrajectory]:
-    """Return the motion of every axis. Coupled axes are simulated alternately until the coupling has converged.
-
-    Args:
-        drives: by axis name.
-        starts: angle [rad] and rate [rad/s] at the first sample, by axis name.
-        coupled: whether the torque of a term depends on the angle of the other axis.
-        simulate: simulates one axis.
-    """
-    motions = {name: simulate(name, drives[name], starts[name], None) for name in drives}
-    for _ in range(COUPLING_ITERATIONS if coupled and len(motions) > 1 else 0):
-        previous = dict(motions)
-        for name in drives:
-            (other,) = (motion for other_name, motion in previous.items() if other_name != name)
-            motions[name] = simulate(name, drives[name], starts[name], _angle_at_nodes(other))
-    return beside_each_other(motions)
-
-
-def beside_each_other(motions: Mapping[str, AxisTrajectory]) -> dict[str, AxisTrajectory]:
-    """Return the motions, by axis name, each with that of the other axis as ``other``."""
-    return {
-        name: replace(motion, other=next((each for other, each in motions.items() if other != name), None))
-        for name, motion in motions.items()
-    }
-
-
-def _angle_at_nodes(motion: AxisTrajectory) -> Array:
-    """Angle at the nodes of every step, by cubic Hermite interpolation, shape (n, 3) [rad]."""
-    a, b = motion.angle[:-1], motion.angle[1:]
-    middle = 0.5 * (a + b) + motion.drive.step / 8.0 * (motion.rate[:-1] - motion.rate[1:])
-    return np.stack([a, middle, b], axis=1)
 
 
 def acceleration(angle: Array, rate: Array, step: float) -> Array:

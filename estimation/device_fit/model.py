@@ -19,15 +19,9 @@ from estimation.device_fit.parameters import (
 from estimation.device_fit.trajectory_cache import MotionRequest, TrajectoryCache
 from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.arrays import Array
+from scanner.coupled_motion import simulate_coupled
 from scanner.device import Axis, Device
-from scanner.forward_model import (
-    AxisTrajectory,
-    DriveInput,
-    reference_signal,
-    sense_signal,
-    simulate_axis,
-    simulate_coupled,
-)
+from scanner.forward_model import AxisTrajectory, DriveInput, reference_signal, sense_signal, simulate_axis
 from scanner.stages import Amdm
 from scanner.terms import NaturalScales
 

@@ -12,9 +12,12 @@ from phantoms.optics import Detector
 from phantoms.waveforms import Sine
 from scanner import devices
 from scanner.active_terms import stated_terms
-from scanner.device import Device
-from scanner.forward_model import DriveInput, sense_signal, simulate_axis, simulate_coupled
+from scanner.arrays import Array
+from scanner.coupled_motion import simulate_coupled
+from scanner.device import Axis, Device
+from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.integrator.nodes import to_nodes
+from scanner.stages import Mechanics
 from scanner.terms import NaturalScales, Term, catalogue
 
 DURATION, RATE = 1e-3, 5e6
@@ -100,6 +103,30 @@ def test_simulation_agrees_with_the_forward_model(effect: str) -> None:
     )
     direct, shown = sense_signal(device.readout, list(paths.values()))[:-1:4], recorded(device)["sense"]
     assert np.abs(direct - shown)[50:].max() < 2e-4 * np.ptp(shown)
+
+
+@pytest.mark.parametrize("coupling", [0.001, 0.01, 0.1])
+def test_coupled_axes_of_one_resonance_exchange_their_energy(coupling: float) -> None:
+    """Two equal axes of 1 kHz, of which one starts: the sum and the difference of their angles decay freely."""
+    inertia, rate, quality, step, periods = 1e-10, 2 * np.pi * 1e3, 100.0, 5e-6, 60
+    stiffness = inertia * rate**2
+    axis = Axis(Mechanics(inertia, inertia * rate / quality, stiffness), name="x")
+    terms = stated_terms(replace(axis, terms={"cross-axis-coupling": {"kappa": coupling * stiffness}}))
+    inputs = DriveInput(np.zeros((round(periods * 1e-3 / step), 3)), step)
+    paths = simulate_coupled(
+        {"x": inputs, "y": inputs},
+        {"x": (0.05, 0.0), "y": (0.0, 0.0)},
+        True,
+        lambda name, inputs, start, other: simulate_axis(axis, terms, inputs, start, other),
+    )
+    time, decay = np.arange(len(inputs.voltage) + 1) * step, 0.5 * rate / quality
+
+    def free(sign: float) -> Array:
+        frequency = np.sqrt((1.0 + sign * coupling) * rate**2 - decay**2)
+        return 0.05 * np.exp(-decay * time) * (np.cos(frequency * time) + decay / frequency * np.sin(frequency * time))
+
+    for name, exact in (("x", 0.5 * (free(1.0) + free(-1.0))), ("y", 0.5 * (free(1.0) - free(-1.0)))):
+        assert np.abs(paths[name].angle - exact).max() < 1e-5 * np.abs(exact).max()
 
 
 def test_term_of_one_axis_does_not_change_the_comb_of_the_other() -> None:
