@@ -9,13 +9,17 @@ import numpy as np
 from scanner.active_terms import ActiveTerm, in_stage_order, stated_terms
 from scanner.arrays import Array
 from scanner.device import Device
+from scanner.errors import BadInput
 from scanner.terms import SignalContext
 
 _EMPTY = np.empty(0)
 
-DELAY_TEST_SAMPLES = 4096
-"""Samples of the ramp that measures a delay. Half of them are the time for a detector to settle: 0.4 ms at 5 MHz, about
-a hundred time constants of the slowest useful detector."""
+MIN_RAMP_SAMPLES, MIN_RAMP_DELAYS = 4096, 16
+"""Least length of the ramp that measures a delay, in samples and in delays. In half of it a detector settles to
+exp(-8) = 3e-4 of its time constant."""
+
+MAX_DELAY_SAMPLES = 1 << 20
+"""Longest delay that is measured [samples]: 0.2 s at 5 MHz, longer than many frames. The ramp takes 0.1 GB."""
 
 
 def terms_on_channel(device: Device, channel: str, axis: str | None = None) -> list[ActiveTerm]:
@@ -67,14 +71,22 @@ def intensity_delay(device: Device, step: float) -> float:
     Args:
         device: states the terms.
         step: sampling interval of the channel [s].
+
+    Raises:
+        BadInput: the delay is longer than ``MAX_DELAY_SAMPLES``.
     """
-    time = step * np.arange(DELAY_TEST_SAMPLES, dtype=np.float64)
-    terms = terms_on_channel(device, "intensity")
-    ramp, gain = apply_terms(terms, time, time), apply_terms(terms, np.ones(DELAY_TEST_SAMPLES), time)
-    middle = (
-        DELAY_TEST_SAMPLES // 2
-    )  # after the transient of the start, and before the samples that a shift runs out of
-    return float(time[middle] - ramp[middle] / gain[middle])
+    terms, samples = terms_on_channel(device, "intensity"), MIN_RAMP_SAMPLES
+    while True:
+        time = step * np.arange(samples, dtype=np.float64)
+        ramp, gain = apply_terms(terms, time, time), apply_terms(terms, np.ones(samples), time)
+        middle = samples // 2  # after the transient of the start, and before the samples that a shift runs out of
+        delay = float(time[middle] - ramp[middle] / gain[middle])
+        if MIN_RAMP_DELAYS * abs(delay) <= samples * step:
+            return delay
+        if abs(delay) > MAX_DELAY_SAMPLES * step:
+            what = f"comes {delay:.3g} s or more after the light by the terms of {device.name}"
+            raise BadInput(what, channel="intensity", hint="check tau and f_c of its terms; both are in SI units")
+        samples *= 2
 
 
 def intensity_gain(device: Device, time: Array) -> Array:

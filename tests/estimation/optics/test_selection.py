@@ -226,3 +226,15 @@ def test_beam_positions_are_computed_lazily() -> None:
     assert track.read().size == mirror.size
     np.testing.assert_allclose(track.negated().read(0, 9), -mirror.read(0, 9) - 0.5 * np.arange(9) / SAMPLE_RATE_HZ)
     assert beam_motion(motion, device, 0.0).axes["y"] is motion.axes["y"]
+
+
+@pytest.mark.parametrize("tau", [1e-4, 6e-4, 5e-3])
+def test_a_delay_of_any_length_is_corrected(tau: float) -> None:
+    device = Device.from_toml(f"[x]\n[y]\n[x.terms.intensity-delay]\ntau = {tau}\n")
+    assert intensity_delay(device, 2e-7) == pytest.approx(tau, rel=1e-6)
+
+
+def test_a_delay_of_seconds_is_refused() -> None:
+    device = Device.from_toml("[x]\n[y]\n[x.terms.intensity-delay]\ntau = 1.0\n")
+    with pytest.raises(BadInput, match=r"intensity: comes 0.\d+ s or more after the light .* check tau"):
+        intensity_delay(device, 2e-7)
