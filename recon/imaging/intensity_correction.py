@@ -9,6 +9,7 @@ from math import prod
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.sensor_hum import LineBlock
 from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.intensity_drift import IntensityDrift, SampleReader, estimate_intensity_drift
 from recon.imaging.intensity_drift_equations import DriftKind
@@ -32,7 +33,7 @@ kinds of smaller drift, two scans each, the phase changed by at most 0.3 of its 
 
 
 def measure_intensity_drift(
-    beam: Motion, intensity: Channel, grid: Grid, kind: DriftKind
+    beam: Motion, intensity: Channel, grid: Grid, kind: DriftKind, flicker: Sequence[LineBlock] = ()
 ) -> tuple[IntensityDrift | None, ...]:
     """Drift of each detector; None where the samples do not determine one.
 
@@ -41,7 +42,9 @@ def measure_intensity_drift(
         intensity: shape (n,) or (n, detectors).
         grid: the pixels.
         kind: what drifts.
+        flicker: lines that the drift contains.
     """
+    lines = sorted({line.frequency for part in flicker for line in part.lines})
     x, y = (beam.axes[axis].angle for axis in AXES)
 
     def reader(detector: int) -> SampleReader:
@@ -54,7 +57,7 @@ def measure_intensity_drift(
 
     detectors, pixels = prod(intensity.shape[1:]), grid.width * grid.height
     return tuple(
-        estimate_intensity_drift(reader(detector), intensity.size, pixels, intensity.sample_rate, kind)
+        estimate_intensity_drift(reader(detector), intensity.size, pixels, intensity.sample_rate, kind, lines)
         for detector in range(detectors)
     )
 

@@ -25,6 +25,7 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.optimize import nnls
 from scipy.sparse.linalg import LinearOperator, cg
 
+from estimation.device_fit.noise import near_lines
 from scanner.arrays import Array
 
 DriftKind = Literal["offset", "gain"]
@@ -37,6 +38,13 @@ GAIN_GROUPS = 16
 
 MAX_CG_STEPS = 200
 """Limit of the steps of conjugate gradients. Ten are usual; more are needed where few pixels cross."""
+
+LINE_BINS = 3
+"""Bins on either side of a line that are free. The periodic prior has two bins for each cycle in a window, so that this
+is one and a half bins of the window, over which a line of any frequency leaks."""
+
+LEAST_DRIFT_DENSITY = 1e-6
+"""Least spectral density of a drift over that of the noise in block means: it is 0 where there are lines alone."""
 
 CG_TOLERANCE = 1e-3
 """Relative residual at which conjugate gradients end: a thousandth of the drift, far below its standard deviation."""
@@ -74,6 +82,7 @@ class DriftModel(NamedTuple):
         white, flicker, walk: two-sided power spectral density [unit²/Hz] of the noise in the means of blocks, and
             coefficients of that of the drift, ``flicker / f + walk / f²``. The drift of a gain is its logarithm times
             ``level``.
+        lines: frequencies of which amplitude and phase are unknown a priori, as of a lamp at the mains [Hz].
     """
 
     kind: DriftKind
@@ -84,11 +93,12 @@ class DriftModel(NamedTuple):
     white: float = 0.0
     flicker: float = 0.0
     walk: float = 0.0
+    lines: tuple[float, ...] = ()
 
     @property
     def drifts(self) -> bool:
         """Whether there is a drift."""
-        return self.flicker > 0.0 or self.walk > 0.0
+        return self.flicker > 0.0 or self.walk > 0.0 or bool(self.lines)
 
     def sensitivity(self, scene: SceneSums) -> Array:
         """Change of a sample of each pixel with the drift, 0 in the pixel of samples that are left out."""
@@ -107,9 +117,12 @@ class DriftModel(NamedTuple):
         return np.ones_like(drift) if self.kind == "offset" else np.exp(drift / self.level)
 
     def precision(self, frequency: Array) -> Array:
-        """Inverse of the prior's power at frequencies from 0 on [Hz]; 0 at 0, because the mean is free."""
-        power = (self.flicker / frequency[1:] + self.walk / frequency[1:] ** 2) * self.rate
-        return np.concatenate([[0.0], 1.0 / power])
+        """Inverse of the prior's power at frequencies from 0 on [Hz]; 0 at 0, as the mean is free, and at lines."""
+        density = self.flicker / frequency[1:] + self.walk / frequency[1:] ** 2
+        power = np.maximum(density, LEAST_DRIFT_DENSITY * self.white) * self.rate
+        precision = np.concatenate([[0.0], 1.0 / power])
+        precision[near_lines(frequency, self.lines, LINE_BINS * frequency[1])] = 0.0
+        return precision
 
 
 def solve_window(pixel: NDArray[np.int32], intensity: Array, earlier: SceneSums, model: DriftModel) -> Array:

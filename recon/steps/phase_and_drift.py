@@ -67,26 +67,28 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
     size by a different time; the intensity that the picture is made of has it as ``options`` want it.
     """
     recorded, estimated = estimated.prepared, replace(estimated, prepared=_without_wild(estimated))
+    flicker = find_flicker(estimated.beam, estimated.prepared.intensity, estimated.grid)
     if options.intensity_drift is None:
-        flicker = find_flicker(estimated.beam, estimated.prepared.intensity, estimated.grid)
         phased = correct_readout_phase(replace(estimated, prepared=_without_flicker(estimated, flicker)), options)
         phased = replace(phased, prepared=recorded)
         notes = [*phased.motion_notes, *(describe_flicker(flicker) or _describe_gain(phased))]
         return replace(phased, prepared=phased.prepared.for_picture(options.undo_lag), motion_notes=notes)
     phased = correct_readout_phase(estimated, options)
-    drifts = _measure_drift(phased, options.intensity_drift)
+    drifts = _measure_drift(phased, options.intensity_drift, flicker)
     if exceeds_uncertainty(drifts):
         without_drift = replace(estimated, prepared=_without_drift(estimated.prepared, drifts))
         phased = replace(correct_readout_phase(without_drift, options), prepared=estimated.prepared)
-        drifts = _measure_drift(phased, options.intensity_drift)
+        drifts = _measure_drift(phased, options.intensity_drift, flicker)
     prepared = _without_drift(recorded.for_picture(options.undo_lag), drifts)
     notes = [*phased.motion_notes, *describe_drift(drifts, prepared.intensity.unit)]
     return replace(phased, prepared=prepared, intensity_drift=drifts, motion_notes=notes)
 
 
-def _measure_drift(estimated: EstimatedMotion, kind: DriftKind) -> Sequence[IntensityDrift | None]:
-    """The drift of the detectors."""
-    return measure_intensity_drift(estimated.beam, estimated.prepared.intensity, estimated.grid, kind)
+def _measure_drift(
+    estimated: EstimatedMotion, kind: DriftKind, flicker: Sequence[LineBlock]
+) -> Sequence[IntensityDrift | None]:
+    """The drift of the detectors, with the lines of the light in it."""
+    return measure_intensity_drift(estimated.beam, estimated.prepared.intensity, estimated.grid, kind, flicker)
 
 
 def _without_wild(estimated: EstimatedMotion) -> PreparedRecording:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from recon.imaging.flicker import find_flicker, without_flicker
+from recon.imaging.intensity_drift_equations import DriftKind
 from recon.imaging.picture import Grid
 from recon.pipeline import reconstruct
 from recon.steps.reconstruction import Options, Reconstruction
@@ -73,3 +74,21 @@ def test_the_flicker_of_two_detectors_is_removed_from_both() -> None:
     removed, light = without_flicker(two, flicker).read(100, 5000), clean.intensity.read(100, 5000)
     assert np.abs(removed[:, 0] / light - 1.0).max() < 0.03
     np.testing.assert_allclose(removed[:, 1], 3.0 * removed[:, 0])
+
+
+@pytest.mark.parametrize("cycles", [1, 3, 3.4])
+@pytest.mark.parametrize("kind", ["gain", "offset"])
+def test_the_option_for_a_drift_removes_the_lines_of_the_light(kind: DriftKind, cycles: float) -> None:
+    """Also lines of a whole number of cycles, whose power is in one bin of the spectrum of the residual."""
+    recording, clean = steady()
+    light = recording["intensity"]
+    line = 0.2 * np.sin(2.0 * np.pi * cycles * np.arange(light.size) / light.size + 0.7)
+    values = light.read()
+    values = values * (1.0 + line) if kind == "gain" else values + values.mean() * line
+    changing = recording.with_channel(replace(light, raw=values, gain=1.0, offset=0.0))
+    result = reconstruct(changing, replace(OPTIONS, intensity_drift=kind), quiet=True)
+    scale = clean.picture.image / np.nanmean(clean.picture.image)
+    error = result.picture.image / np.nanmean(result.picture.image) - scale
+    unchanged = reconstruct(changing, OPTIONS, quiet=True).picture.image
+    before = unchanged / np.nanmean(unchanged) - scale
+    assert np.nanstd(error) < 0.2 * np.nanstd(before)
