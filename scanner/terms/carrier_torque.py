@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scanner.arrays import Array
-from scanner.terms.term import Parameter, SignalContext, Term
+from scanner.terms.term import Parameter, SignalContext, Term, driven_by_comb
 
 
 def voltage(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
@@ -24,6 +24,6 @@ TERM = Term(
     confounders={
         "resonance-drift": "the carrier changes the stiffness by a constant within the tolerance of k: change the bias"
     },
-    applies=lambda axis, scales: axis.capacitance is not None and scales.voltage_mean**2 + scales.voltage_rms**2 > 0,
+    applies=lambda axis, scales: driven_by_comb(axis) and scales.voltage_mean**2 + scales.voltage_rms**2 > 0,
     voltage=voltage,
 )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scanner.arrays import Array
-from scanner.terms.term import Parameter, SignalContext, Term
+from scanner.terms.term import Parameter, SignalContext, Term, driven_by_comb
 
 
 def voltage(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
@@ -26,7 +26,7 @@ TERM = Term(
     ),
     source="Wibbeler, Pfeifer & Hietschold, Sens. Actuators A 71, 74 (1998)",
     confounders={"resonance-drift": "a drift leaves modulation and current unchanged: change the bias"},
-    applies=lambda axis, scales: axis.capacitance is not None and abs(scales.voltage_mean) + scales.voltage_rms > 0,
+    applies=lambda axis, scales: driven_by_comb(axis) and abs(scales.voltage_mean) + scales.voltage_rms > 0,
     voltage=voltage,
     drifts=True,
 )

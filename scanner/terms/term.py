@@ -243,3 +243,8 @@ class Term:
     def free_parameters(self) -> tuple[Parameter, ...]:
         """The parameters that are not fixed."""
         return tuple(p for p in self.parameters if p.kind != "fixed")
+
+
+def driven_by_comb(axis: Axis) -> bool:
+    """Whether the voltage of an axis is on its comb: a coil or a piezo may drive a mirror that a comb senses."""
+    return axis.capacitance is not None and (axis.drive is None or axis.drive.kind == "electrostatic")

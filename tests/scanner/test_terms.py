@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from scanner import devices
 from scanner.active_terms import ActiveTerm, stated_terms
 from scanner.device import Axis
 from scanner.errors import BadInput
@@ -333,3 +334,12 @@ def test_a_further_mode_is_an_oscillation_whatever_a_fit_tries(effect: str) -> N
     (quality,) = (parameter for parameter in catalogue()[effect].parameters if parameter.name == "Q2")
     assert all(quality.value(x, scales) >= 0.5 for x in np.linspace(-30.0, 5.0, 36))
     assert quality.value(0.0, scales) > 20.0
+
+
+@pytest.mark.parametrize("effect", ["carrier-torque", "charging"])
+def test_a_comb_that_only_senses_has_no_part_in_a_linear_drive(effect: str) -> None:
+    """A carrier under a root would rectify the voltage of a coil."""
+    scales = NaturalScales(0.1, W, 1e-12, 1e-14, 1e-5, 0.1, 10.0, 5.0)
+    comb = devices.find("imaging").axis("x")
+    assert catalogue()[effect].applies(comb, scales)
+    assert not catalogue()[effect].applies(replace(comb, drive=Drive("linear", 1e-7)), scales)
