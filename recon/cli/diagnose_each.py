@@ -47,13 +47,12 @@ def diagnose_each(
     """
     from recon.io.output import finite, replacing_folder, write_json
     from recon.report.fleet import fleet_report
-    from recon.runtime.fleet import find_recordings, plan_fleet, run_fleet
+    from recon.runtime.fleet import find_recordings, plan_fleet, run_fleet, state_inputs
     from scanner import devices
 
     started, paths = time.perf_counter(), find_recordings(places)
     nominal = None if device is None else devices.find(device)
-    stated = f"{nominal and nominal.to_toml()} mapping={mapping and mapping.absolute()}"
-    fleet = plan_fleet(paths, output, stated, "diagnosis.json", overwrite)
+    fleet = plan_fleet(paths, output, state_inputs(nominal, mapping), "diagnosis.json", overwrite)
     where = device if nominal is None or not Path(str(device)).is_file() else Path(str(device)).absolute()
     work = partial(_diagnose_one, where, mapping and mapping.absolute())
     failures = run_fleet(fleet, work, "diagnose", scheduler, workers)

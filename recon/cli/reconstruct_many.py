@@ -65,12 +65,12 @@ def reconstruct_files(
 
     from recon.io.output import finite, replacing_folder, write_json
     from recon.report.many import reconstructions_report
-    from recon.runtime.fleet import find_recordings, plan_fleet, run_fleet
+    from recon.runtime.fleet import find_recordings, plan_fleet, run_fleet, state_inputs
     from recon.sequences.recording_stack import read_planes, write_recording_stack
 
     started, paths = time.perf_counter(), find_recordings(paths)
     alone = options if options.wants_frames else replace(options, zarr=False, movie=None)  # a stack's own options
-    stated = f"{alone} mapping={mapping and mapping.absolute()}"
+    stated = f"{replace(alone, device=None)} {state_inputs(options.device, mapping)}"
     fleet = plan_fleet(paths, output, stated, "summary.json", overwrite)
     work = partial(_reconstruct_one, options, mapping and mapping.absolute())
     failures = run_fleet(fleet, work, "reconstruct", scheduler, workers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -18,8 +19,10 @@ from typing import Any
 from recon.io.output import check_folder, write_json
 from recon.io.readers import register, registered
 from recon.runtime.executors import open_executor, picklable_task
+from scanner import devices
+from scanner.device import Device
 from scanner.errors import BadInput, line_of
-from scanner.files import replacing
+from scanner.files import read_toml, replacing
 
 JOB_FILE = "job.json"
 """File of the output folder that states which recordings and options its folders were made with."""
@@ -70,6 +73,32 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
     if not any(path.exists() for path in found):
         raise BadInput("no such file or folder", file=places[0], hint="name recordings (HDF5), or their folder")
     return list(dict.fromkeys(found))
+
+
+def state_inputs(device: Device | str | Path | None, mapping: Path | None) -> str:
+    """Return a text that states the contents of device and mapping, for the options of :func:`plan_fleet`.
+
+    A path alone would not: results of a file that was edited since would be taken as results of the file as it is.
+
+    Args:
+        device: in place of that of the recordings; None for none.
+        mapping: of all recordings; None for none.
+
+    Raises:
+        BadInput: there is no such device, or a file cannot be read.
+    """
+    content = {
+        "device": None if device is None else devices.find(device).to_toml(),
+        "mapping": None if mapping is None else read_toml(mapping),
+    }
+    return " ".join(f"{name}={_digest(each)}" for name, each in content.items())
+
+
+def _digest(content: object) -> str | None:
+    """SHA-256 of the text of a value, which does not depend on the order of keys; None for None."""
+    if content is None:
+        return None
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, overwrite: bool) -> Fleet:

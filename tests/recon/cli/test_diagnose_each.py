@@ -8,7 +8,7 @@ import pytest
 
 from recon.cli import main
 from recon.cli.diagnose_each import COLUMNS, diagnose_each
-from recon.runtime.fleet import plan_fleet
+from recon.runtime.fleet import plan_fleet, state_inputs
 
 FINDING = {
     "axis": "x",
@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     for name in ("a", "b", "c"):
         (recordings / f"{name}.h5").write_text("no recording", encoding="utf-8")
     paths = [recordings / "a.h5", recordings / "b.h5"]
-    fleet = plan_fleet(paths, tmp_path / "out", "None mapping=None", "diagnosis.json", False)
+    fleet = plan_fleet(paths, tmp_path / "out", state_inputs(None, None), "diagnosis.json", False)
     for path, findings in zip(paths, ([FINDING], []), strict=True):
         place = fleet.folders[path]
         place.mkdir()

@@ -1,0 +1,51 @@
+"""The plan of work on many recordings: whose results are kept, and whose are done anew."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from recon.cli.diagnose_each import diagnose_each
+from recon.cli.reconstruct_many import reconstruct_files
+from recon.runtime.fleet import state_inputs
+from recon.steps.reconstruction import Options
+from scanner import devices
+from scanner.errors import BadInput
+
+MAPPING = '[channels.intensity]\nvariable = "light"\nunit = "V"\nsample_rate = {rate}\n'
+
+
+def reconstruct(recording: Path, output: Path, device: Path, mapping: Path) -> None:
+    reconstruct_files([recording], output, Options(device=device), mapping, workers=1)
+
+
+def diagnose(recording: Path, output: Path, device: Path, mapping: Path) -> None:
+    diagnose_each([recording], output, device, mapping, workers=1)
+
+
+@pytest.mark.parametrize("command", [reconstruct, diagnose])
+@pytest.mark.parametrize("edited", ["device", "mapping"])
+def test_results_of_a_file_that_was_edited_since_are_not_mixed_in(
+    tmp_path: Path, command: Callable[[Path, Path, Path, Path], None], edited: str
+) -> None:
+    files = {"device": tmp_path / "device.toml", "mapping": tmp_path / "mapping.toml"}
+    files["device"].write_text(devices.load("imaging").to_toml(), encoding="utf-8")
+    files["mapping"].write_text(MAPPING.format(rate=1e6), encoding="utf-8")
+    recording = tmp_path / "a.npz"
+    recording.write_bytes(b"no recording")  # which the summary lists as failed
+    command(recording, tmp_path / "out", **files)
+    command(recording, tmp_path / "out", **files)
+    text = files[edited].read_text(encoding="utf-8")
+    files[edited].write_text(text.replace("sample_rate = 1", "sample_rate = 2").replace("k = 9", "k = 8"))
+    assert files[edited].read_text(encoding="utf-8") != text
+    with pytest.raises(BadInput, match="other options"):
+        command(recording, tmp_path / "out", **files)
+
+
+def test_the_same_contents_elsewhere_are_the_same_options(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(MAPPING.format(rate=1e6), encoding="utf-8")
+    (tmp_path / "b.toml").write_text("# a comment\n" + MAPPING.format(rate=1e6), encoding="utf-8")
+    (tmp_path / "imaging.toml").write_text(devices.load("imaging").to_toml(), encoding="utf-8")
+    stated = state_inputs("imaging", tmp_path / "a.toml")
+    assert stated == state_inputs(tmp_path / "imaging.toml", tmp_path / "b.toml")
+    assert stated != state_inputs(None, tmp_path / "a.toml") != state_inputs(None, None)
