@@ -109,7 +109,8 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
         output: folder of the folders; it is made.
         options: of the work, as text. Folders that were made with others are neither used nor replaced.
         result: file that a completed folder holds.
-        overwrite: do everything anew.
+        overwrite: do everything anew. The ``result`` of each recording is deleted, and no other file, before the new
+            options are written: after a kill, what is left of the old results is not taken as done.
 
     Raises:
         BadInput: ``output`` cannot be written, or holds results of other options or of a recording that has changed.
@@ -138,6 +139,9 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
         folders[path] = output.absolute() / known[key]["folder"]
         if not overwrite and (folders[path] / result).is_file():
             done.add(path)
+    if overwrite:
+        for folder in folders.values():
+            (folder / result).unlink(missing_ok=True)
     with replacing(output / JOB_FILE) as beside:
         write_json(beside, {"options": options, "recordings": known})
     return Fleet(folders, frozenset(done), made)

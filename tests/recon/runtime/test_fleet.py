@@ -7,7 +7,7 @@ import pytest
 
 from recon.cli.diagnose_each import diagnose_each
 from recon.cli.reconstruct_many import reconstruct_files
-from recon.runtime.fleet import state_inputs
+from recon.runtime.fleet import plan_fleet, state_inputs
 from recon.steps.reconstruction import Options
 from scanner import devices
 from scanner.errors import BadInput
@@ -49,3 +49,19 @@ def test_the_same_contents_elsewhere_are_the_same_options(tmp_path: Path) -> Non
     stated = state_inputs("imaging", tmp_path / "a.toml")
     assert stated == state_inputs(tmp_path / "imaging.toml", tmp_path / "b.toml")
     assert stated != state_inputs(None, tmp_path / "a.toml") != state_inputs(None, None)
+
+
+@pytest.mark.parametrize("options", ["first", "second"])
+def test_old_results_are_not_done_after_an_overwrite_that_was_killed(tmp_path: Path, options: str) -> None:
+    recordings = [tmp_path / "a.h5", tmp_path / "b.h5"]
+    for path in recordings:
+        path.write_bytes(b"as it was")
+    for folder in plan_fleet(recordings, tmp_path / "out", "first", "summary.json", False).folders.values():
+        folder.mkdir()
+        for name in ("summary.json", "image.tif"):
+            (folder / name).write_text("old", encoding="utf-8")
+    recordings[0].write_bytes(b"changed since")
+    plan_fleet(recordings[:1], tmp_path / "out", options, "summary.json", True)  # killed before the work
+    assert plan_fleet(recordings[:1], tmp_path / "out", options, "summary.json", False).done == frozenset()
+    assert sorted(path.name for path in (tmp_path / "out" / "a").iterdir()) == ["image.tif"]
+    assert (tmp_path / "out" / "b" / "summary.json").read_text(encoding="utf-8") == "old"
