@@ -92,7 +92,7 @@ def plan_experiment(experiment: Experiment) -> tuple[Plan, Scene]:
         drives=experiment.drives,
         duration=experiment.duration,
         sample_rate=experiment.sample_rate,
-        settle=_settling_time(experiment.device),
+        settle=settling_time(experiment.device),
         drift={axis: Drift(exponential(change, experiment.drift_tau)) for axis, change in experiment.drift.items()},
         references=("angle",) if experiment.angles else (),
     )
@@ -122,7 +122,7 @@ def simulate_experiment(
     return recording, truth | {"spot_sd": experiment.spot_um / experiment.field_um}
 
 
-def _settling_time(device: Device) -> float:
-    """Time that the drives have been running before the recording starts [s]."""
+def settling_time(device: Device) -> float:
+    """Return the time after which the amplitudes of a device have settled [s]."""
     decays = [axis.quality / (np.pi * axis.resonance) for axis in device.axes.values() if axis.mechanics]
     return max(MIN_SETTLING_S, SETTLING_TIME_CONSTANTS * max(decays, default=0.0))

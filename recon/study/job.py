@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from phantoms.experiment import Experiment, plan_experiment, simulate_experiment
+from phantoms.experiment import Experiment, plan_experiment, settling_time, simulate_experiment
 from phantoms.forward import Plan, simulate
 from phantoms.optics import Detector
-from phantoms.waveforms import Sine, Waveform
+from phantoms.waveforms import Sine
 from recon.evaluation import truth_from_simulation
 from recon.io.output import finite
 from recon.pipeline import reconstruct
@@ -23,8 +23,9 @@ from scanner.device import AXES, Device
 from scanner.recording import Recording
 from scanner.stages import Amdm, Readout
 
-CALIBRATION_TIME_S = 2e-3
-"""Duration of the noiseless signal whose rms defines the signal-to-noise ratio: dozens of periods of a fast axis."""
+CALIBRATION_TIME_S, CALIBRATION_PERIODS = 2e-3, 10.0
+"""Least duration [s] of the noiseless signal whose rms defines the signal-to-noise ratio, and its least number of
+periods of the slowest axis: a part of a period changes the rms by less than 1 %."""
 
 
 def run_job(job: Job) -> list[dict[str, Any]]:
@@ -95,10 +96,18 @@ def _experiment(scenario: Scenario, device: Device) -> Experiment:
 
 @lru_cache(maxsize=16)
 def sense_rms(design: StudyDesign, sample_rate: float) -> dict[str, float]:
-    """Return the rms of the noiseless sense signals about their mean, by channel [V]."""
+    """Return the rms of the noiseless sense signals of settled axes about their mean, by channel [V]."""
     device = _replace_readouts(Device.from_toml(design.device), lambda name, readout: _set_noise(readout, 0.0, None))
-    recording, _ = simulate(device, Plan(_drive_waveforms(design), CALIBRATION_TIME_S, sample_rate))
+    drives = _drive_waveforms(design)
+    duration = max(CALIBRATION_TIME_S, CALIBRATION_PERIODS / _slowest_frequency(device, drives))
+    recording, _ = simulate(device, Plan(drives, duration, sample_rate, settle=settling_time(device)))
     return {name: float(np.std(channel.read())) for name, channel in recording.channels.items() if "sense" in name}
+
+
+def _slowest_frequency(device: Device, drives: Mapping[str, Sine]) -> float:
+    """Lowest frequency of a motion [Hz]: an axis follows its drive, or moves near its resonance."""
+    resonances = [axis.resonance for axis in device.axes.values() if axis.mechanics]
+    return min([*resonances, *(drive.frequency for drive in drives.values() if drive.frequency > 0)])
 
 
 def with_noise(device: Device, rms: dict[str, float], snr_db: float) -> Device:
@@ -126,7 +135,7 @@ def _replace_readouts(device: Device, change: Callable[[str, Readout], Readout])
     return replace(device, axes=axes)
 
 
-def _drive_waveforms(design: StudyDesign) -> dict[str, Waveform]:
+def _drive_waveforms(design: StudyDesign) -> dict[str, Sine]:
     return {"x": Sine(*design.drive_x), "y": Sine(*design.drive_y)}
 
 

@@ -23,13 +23,21 @@ from recon.pipeline import reconstruct
 from recon.report.summary import summarise
 from recon.steps.reconstruction import Options
 from recon.study.job import run_job, sense_rms, simulate_scenario
-from recon.study.plan import cell_key, plan_jobs, read_study, remaining_jobs
+from recon.study.plan import StudyDesign, cell_key, plan_jobs, read_study, remaining_jobs
 from recon.study.table import table_columns, table_rows
 from scanner.device import Device
 from scanner.errors import BadInput
 from tests.support.study import CELLS, assert_study_is_complete, read_journal, small_study, wait_until
 
 ROOT = Path(__file__).parent.parent.parent.parent
+
+SLOW_AXIS = """
+[{name}]
+mechanics = {{J = 1e-10, b = {b}, k = 1.42122e-5}}
+drive = {{kind = "linear", torque_per_volt = 5.685e-9}}
+readout = {{kind = "position", gain = 20.0, noise_sd = 0.0}}
+"""
+"""An axis of 60 Hz with a position sensor."""
 
 
 @pytest.fixture(scope="module")
@@ -183,6 +191,18 @@ def test_a_failed_reconstruction_is_a_record_of_the_study(tmp_path: Path) -> Non
     assert all("does not sustain" in each["failed"] for each in records)
     data = table_columns(table_rows(records))
     assert np.isnan(data["phase_rmse_deg"]).all()
+
+
+@pytest.mark.parametrize("quality", [20.0, 200.0])
+def test_the_rms_of_a_slow_axis_is_that_of_its_settled_motion(quality: float) -> None:
+    mechanics = {"J": 1e-10, "k": 1.42122e-5, "b": 1e-10 * 2.0 * np.pi * 60.0 / quality}
+    drive = (60.0, 10.0, 0.0)
+    text = "".join(SLOW_AXIS.format(name=name, b=mechanics["b"]) for name in "xy")
+    rate = 2.0 * np.pi * drive[0]
+    stiffness = abs(mechanics["k"] - mechanics["J"] * rate**2 + 1j * rate * mechanics["b"])
+    amplitude_v = 20.0 * 5.685e-9 * drive[1] / stiffness
+    rms = sense_rms(StudyDesign("slow", text, drive, drive), 2e4)
+    assert rms == pytest.approx(dict.fromkeys(("sense_x", "sense_y"), amplitude_v / np.sqrt(2.0)), rel=0.03)
 
 
 @settings(max_examples=5)
