@@ -66,7 +66,7 @@ def simulate(
         drift_tau: time constant of the drift [s].
         field_um: width of the field of view on the sample [um].
         spot_um: standard deviation of the beam's spot [um].
-        photons: photons a sample at full brightness.
+        photons: photons a sample at full brightness, which gives 1 mV a photon, above 1000 photons 1 V.
         angles: record the true angles as the reference channels ``angle_x`` and ``angle_y`` too.
         seed: of all noise, a whole number, 0 or greater.
         nominal: the device that the recording states, where the calibration differs from the true device.
@@ -75,7 +75,7 @@ def simulate(
         BadInput: an argument has no meaning, the device cannot be simulated, or there is no such target.
     """
     from phantoms.experiment import Experiment, simulate_experiment
-    from phantoms.optics import Detector
+    from phantoms.optics import imaging_detector
 
     if not isinstance(seed, Integral) or seed < 0:
         raise BadInput(f"is {seed!r}", channel="seed", hint="give a whole number, 0 or greater")
@@ -91,7 +91,7 @@ def simulate(
         drift_tau=drift_tau,
         field_um=field_um,
         spot_um=spot_um,
-        detector=Detector(photons_per_sample=photons, bits=12),
+        detector=imaging_detector(photons),
         angles=angles,
     )
     return Simulation(*simulate_experiment(experiment, seed, None if nominal is None else load_device(nominal)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from phantoms.forward import Plan, Scene, check_plan, simulate
-from phantoms.optics import Detector, blur_by_spot
+from phantoms.optics import Detector, blur_by_spot, imaging_detector
 from phantoms.targets import make_target
 from phantoms.waveforms import Sine, Waveform
 from scanner import devices
@@ -56,7 +56,7 @@ class Experiment:
     drift_tau: float = field(default=0.025, metadata=POSITIVE)
     field_um: float = field(default=250.0, metadata=POSITIVE)
     spot_um: float = field(default=0.4, metadata=NOT_NEGATIVE)
-    detector: Detector = field(default_factory=lambda: Detector(photons_per_sample=1000.0, bits=12))
+    detector: Detector = field(default_factory=lambda: imaging_detector(1000.0))
     angles: bool = False
 
     def __post_init__(self) -> None:

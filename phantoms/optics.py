@@ -23,6 +23,9 @@ MIN_SPOT_PX = 0.5
 MAX_PHOTONS = 1e18
 """Most photons in a sample: numpy draws numbers of a Poisson distribution up to a mean of 9e18."""
 
+PHOTONS_AT_ONE_VOLT = 1000.0
+"""Photons in a sample up to which the gain of an imaging detector is 1 mV a photon."""
+
 MAX_BITS = 24
 """Most bits of a converter: float32 represents their codes exactly."""
 
@@ -98,7 +101,7 @@ class Detector:
     full_scale: float = 1.25
 
     def __post_init__(self) -> None:
-        positive = {"gain": self.gain, "photons_per_sample": self.photons_per_sample, "full_scale": self.full_scale}
+        positive = {"photons_per_sample": self.photons_per_sample, "gain": self.gain, "full_scale": self.full_scale}
         if self.bandwidth_hz is not None:
             positive["bandwidth_hz"] = self.bandwidth_hz
         check_numbers(**positive, read_noise_sd=self.read_noise_sd)
@@ -114,6 +117,21 @@ class Detector:
             raise BadInput(f"the detector's read_noise_sd is {self.read_noise_sd}", hint="give zero or more")
         if self.bits is not None and not 1 <= self.bits <= MAX_BITS:
             raise BadInput(f"the detector has {self.bits} bits", hint="give 1 to 24, what float32 holds exactly")
+
+
+def imaging_detector(photons: float) -> Detector:
+    """Return a detector with a converter of 12 bits whose range holds the light and its photon noise.
+
+    Its gain is 1 mV a photon, and above ``PHOTONS_AT_ONE_VOLT`` the one with which full light gives 1 V. A gain of 1 V
+    at full light for few photons would clip their noise.
+
+    Args:
+        photons: mean count in a sample at full light.
+
+    Raises:
+        BadInput: as :class:`Detector`.
+    """
+    return Detector(gain=1.0 / max(PHOTONS_AT_ONE_VOLT, photons), photons_per_sample=photons, bits=12)
 
 
 def detect(light: Array, rate: float, detector: Detector, rng: np.random.Generator) -> NDArray[np.float32]:

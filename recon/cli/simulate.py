@@ -42,7 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--spot-um", type=parse_not_negative, default=0.4, help="sd of the beam spot, um (0.4)")
     parser.add_argument(
-        "--photons", type=parse_positive, default=1000.0, help="photons a sample at full brightness (1000)"
+        "--photons",
+        type=parse_positive,
+        default=1000.0,
+        help="photons a sample at full brightness (1000), 1 mV each; above 1000, full brightness is 1 V",
     )
     parser.add_argument("--angles", action="store_true", help="record the true angles as reference channels too")
     parser.add_argument("--seed", type=parse_whole, default=0, help="of all noise (0)")
@@ -50,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from phantoms.experiment import Experiment, simulate_experiment
-    from phantoms.optics import Detector
+    from phantoms.optics import imaging_detector
     from scanner import devices
     from scanner.files import check_no_input, check_place
 
@@ -69,7 +72,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         drift_tau=args.drift_tau,
         field_um=args.field_um,
         spot_um=args.spot_um,
-        detector=Detector(photons_per_sample=args.photons, bits=12),
+        detector=imaging_detector(args.photons),
         angles=args.angles,
     )
     recording, truth = simulate_experiment(experiment, args.seed)

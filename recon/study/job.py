@@ -11,7 +11,7 @@ import numpy as np
 
 from phantoms.experiment import Experiment, plan_experiment, settling_time, simulate_experiment
 from phantoms.forward import Plan, simulate
-from phantoms.optics import Detector
+from phantoms.optics import imaging_detector
 from phantoms.waveforms import Sine
 from recon.evaluation import truth_from_simulation
 from recon.io.output import finite
@@ -90,7 +90,7 @@ def _experiment(scenario: Scenario, device: Device) -> Experiment:
         drift_tau=conditions.drift_tau,
         field_um=conditions.field_um,
         spot_um=conditions.spot_um,
-        detector=Detector(gain=1.0 / conditions.photons, photons_per_sample=conditions.photons, bits=12),
+        detector=imaging_detector(conditions.photons),
     )
 
 
