@@ -30,6 +30,10 @@ PICTURE_KINDS: tuple[str, ...] = get_args(PictureKind)
 MIN_SPREAD_PX = 1.0
 """Smallest standard deviation of the visited pixels across any direction. Below it the samples lie on one line."""
 
+MIN_SPREAD_SHARE = 0.6
+"""The same, for a grid of few rows or columns, as a share of the standard deviation of positions over its height or
+width. A line from corner to corner of two rows has 0.43 of it, all pixels of two rows have 0.87."""
+
 MAX_FLAT_EXCESS_SD = 4.0
 """Scatter of the pixels' means beyond their noise, in its standard deviations, up to which a scene is called flat."""
 
@@ -200,6 +204,9 @@ def _check_determined(
     Raises:
         BadInput: they do not.
     """
+    if not means.coverage.any():
+        hint = "check that the intensity covers this time, and the half angles"
+        raise BadInput("no sample lies in the field of view", channel="intensity", hint=hint)
     if _lies_on_one_line(means):
         hint = "check the motion of both axes or use --picture mean"
         raise BadInput(f"{ONE_LINE}, which determines no picture", channel="intensity", hint=hint)
@@ -227,7 +234,7 @@ def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:
 
 
 def _lies_on_one_line(means: Picture) -> bool:
-    """Whether the visited pixels, of which there is at least one, spread in one direction at most."""
+    """Whether the visited pixels spread in one direction at most; False without any."""
     visited = (means.coverage > 0).astype(np.float64)
     total = visited.sum()
     if not total:
@@ -237,7 +244,8 @@ def _lies_on_one_line(means: Picture) -> bool:
     centre = np.array([row @ by_row, column @ by_column]) / total
     cross = row @ visited @ column
     squares = np.array([[row**2 @ by_row, cross], [cross, column**2 @ by_column]]) / total
-    return not np.linalg.eigvalsh(squares - np.outer(centre, centre))[0] > MIN_SPREAD_PX**2
+    least = min(MIN_SPREAD_PX, MIN_SPREAD_SHARE * min(visited.shape) / np.sqrt(12.0))
+    return not np.linalg.eigvalsh(squares - np.outer(centre, centre))[0] > least**2
 
 
 def _describe_flat(means: Picture, noise: Sequence[SampleNoise | None]) -> list[str]:

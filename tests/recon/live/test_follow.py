@@ -338,6 +338,25 @@ def test_a_frame_in_parts_is_the_frame(kind: str) -> None:
     assert np.nanmedian(scan.estimate.sd / whole.picture_sd) == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.parametrize("kind", ["kernel", "posterior"])
+def test_a_frame_without_samples_is_refused_and_the_next_one_is_shown(kind: str) -> None:
+    recording, _ = imaging()
+    light = recording["intensity"].read().astype(float)
+    light[light.size // 3 : 2 * light.size // 3] = np.nan
+    channels = {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
+    dark = Recording.from_arrays(channels | {"intensity": (light, *channels["intensity"][1:])}, recording.device)
+    options, scan, third = Options(pixels=(60, 60), picture=kind), None, 0.02 / 3
+    for number in range(3):
+        scan, frame = add_part(dark, number * third, (number + 1) * third, scan, None, options)
+        if number == 1:
+            with pytest.raises(BadInput, match="no sample lies in the field"):
+                finish_frame(scan, frame, options)
+        else:
+            first_picture(scan, frame, options)
+            scan = finish_frame(scan, frame, options)
+            assert np.isfinite(scan.estimate.picture.image).mean() > 0.9
+
+
 def test_a_continued_track_is_as_good_as_a_long_one() -> None:
     recording, truth = imaging(0.06)
     angles, previous, errors = truth_from_simulation(truth).angles, None, {"x": [], "y": []}

@@ -57,6 +57,20 @@ def test_frames_are_written_in_every_format(result: Reconstruction, tmp_path: Pa
     assert labels == ["green", "red", "green, standard deviation", "red, standard deviation"]
 
 
+@pytest.mark.parametrize("kind", ["mean", "kernel", "posterior"])
+def test_a_frame_without_samples_is_empty(kind: str) -> None:
+    rate, size = 1e6, 120_000
+    time = np.arange(size) / rate
+    x, y = (0.1 * np.sin(2.0 * np.pi * f * time) for f in (5010.0, 3030.0))
+    light = 1.0 + 0.5 * np.sin(60.0 * x) * np.cos(45.0 * y) + 0.05 * np.random.default_rng(0).standard_normal(size)
+    light[size // 3 : 2 * size // 3] = np.nan
+    device = Device.from_toml('[scan]\nhalf_angle_x = 0.1001\nhalf_angle_y = 0.1001\nangle = "mechanical"\n[x]\n[y]\n')
+    angles = {"angle_x": x, "angle_y": y, "intensity": light}
+    whole = lissajous.reconstruct(angles, device, sample_rate=rate, pixels=(40, 40), picture=kind)
+    shares = [float(np.isfinite(frame.image).mean()) for frame in lissajous.frames(whole, 3)]
+    assert shares == pytest.approx([1.0, 0.0, 1.0], abs=0.1)
+
+
 def test_the_ome_zarr_is_valid_by_its_schema(result: Reconstruction, tmp_path: Path) -> None:
     import zarr
     from ome_zarr_models import v05 as models

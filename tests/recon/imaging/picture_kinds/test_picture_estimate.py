@@ -9,9 +9,14 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from recon.imaging.intensity_gridding import grid_intensity
-from recon.imaging.picture import Grid
+from recon.imaging.picture import Grid, Picture
 from recon.imaging.picture_kinds.held_out import HELD_OUT_FRACTION, SplitSums, held_out_ranges
-from recon.imaging.picture_kinds.picture_estimate import PICTURE_KINDS, EstimatedPicture, estimate_picture
+from recon.imaging.picture_kinds.picture_estimate import (
+    PICTURE_KINDS,
+    EstimatedPicture,
+    estimate_picture,
+    picture_of_sums,
+)
 from recon.imaging.picture_kinds.posterior_sd import draw_noise
 from recon.imaging.picture_kinds.posterior_solver import LANES, build_stencil, multiply, solve
 from recon.imaging.pixel_noise import measure_noise
@@ -176,6 +181,19 @@ def test_a_mean_of_equal_samples_or_of_one_line_says_so() -> None:
     assert estimate("mean", *scan(discs(), 20.0, 0.005)).limits == []
 
 
+@pytest.mark.parametrize("shape", [(2, 100), (3, 400), (100, 2), (5, 60), (1, 60)])
+def test_a_grid_of_few_rows_is_no_line_unless_its_samples_lie_on_one(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).random(shape).astype(np.float32)
+    row, column = np.indices(shape)
+    grid = Grid(shape[1], shape[0], 0.1, 0.1)
+    row, column = (row, column) if shape[0] < shape[1] else (column, row)
+    corner_to_corner = row == column * min(shape) // max(shape)
+    for visited, is_line in ((np.ones(shape, bool), min(shape) == 1), (row == 0, True), (corner_to_corner, True)):
+        means = Picture(np.where(visited, image, np.nan), 50 * visited.astype(np.uint32), grid)
+        limits = picture_of_sums("mean", means, None, [None]).limits
+        assert any("one line" in limit for limit in limits) == is_line
+
+
 @pytest.mark.parametrize("kind", ["kernel", "posterior"])
 def test_scans_that_determine_no_picture_are_refused(kind: str) -> None:
     with pytest.raises(BadInput, match="one line"):
@@ -184,6 +202,10 @@ def test_scans_that_determine_no_picture_are_refused(kind: str) -> None:
         estimate(kind, *scan(np.zeros((96, 96)), 20.0, 0.005))
     with pytest.raises(BadInput, match="too short"):
         estimate(kind, *scan(discs(), 20.0, 0.0002))
+    motion, recording = scan(discs(), 20.0, 0.005)
+    nothing = Recording.from_arrays({"intensity": (np.full(recording["intensity"].size, np.nan), "1", RATE_HZ)})
+    with pytest.raises(BadInput, match="no sample lies in the field"):
+        estimate(kind, motion, nothing)
     with pytest.raises(BadInput, match="no picture is called"):
         estimate("best", *scan(discs(), 20.0, 0.001))
 
