@@ -12,11 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.io.tiff_size import needs_bigtiff
 from scanner.errors import BadInput
-
-MAX_CLASSIC_TIFF_BYTES = (1 << 32) - (1 << 25)
-"""Films of more bytes are written as BigTIFF; the margin is for the descriptions of the pages."""
-
 
 COLOURS = (2, 3, 6, 8)
 """Photometric interpretations of colour pictures: RGB, palette, YCbCr, CIELAB (TIFF 6.0)."""
@@ -150,7 +147,7 @@ def write_film(path: Path, film: Film, planes: Iterable[NDArray[Any]]) -> None:
     """Write planes, each of shape (rows, columns), as a TIFF file of the form, shape and type of ``film``."""
     import tifffile
 
-    large = math.prod(film.shape) * film.dtype.itemsize > MAX_CLASSIC_TIFF_BYTES
+    large = needs_bigtiff(film.shape, film.dtype)
     description = {**film.description, "metadata": {"axes": film.axes, **film.description.get("metadata", {})}}
     if large:  # ImageJ's form ends at 4 GB
         description["imagej"] = False

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from recon.imaging.frame_axis import FrameAxis
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
+from recon.io.tiff_size import needs_bigtiff
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.files import HAS_REPLACED, IS_REPLACING, check_no_input, check_writable
@@ -200,6 +201,7 @@ def write_frames(path: Path, frames: Iterable[Picture], axis: FrameAxis) -> None
         dtype=np.float32,
         ome=True,
         photometric="minisblack",
+        bigtiff=needs_bigtiff(shape, np.float32),
         metadata={"axes": axes, **metadata},
     )
 

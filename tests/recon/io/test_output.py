@@ -15,6 +15,7 @@ from recon.imaging.frame_axis import FrameAxis
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
 from recon.io.output import replacing_folder, write_frames, write_tiff
+from recon.io.tiff_size import needs_bigtiff
 from recon.pipeline import reconstruct
 from recon.sequences.frames import write_scan_frames
 from recon.steps.reconstruction import Options, Reconstruction
@@ -124,6 +125,20 @@ def test_frames_of_a_known_sample_and_several_detectors(tmp_path: Path) -> None:
     assert float(attributes["PhysicalSizeX"]) == pytest.approx(250 / 80)
     assert float(attributes["PhysicalSizeY"]) == pytest.approx(250 * 0.15 / 0.18 / 60)
     assert attributes["PhysicalSizeXUnit"] == attributes["PhysicalSizeYUnit"] == "µm"
+
+
+def test_frames_beyond_4_gb_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not needs_bigtiff((1000, 1000, 1000), np.float32)
+    assert needs_bigtiff((1100, 1000, 1000), np.float32)
+    images = np.random.default_rng(1).random((3, 60, 80)).astype(np.float32)
+    for limit, is_big in ((images.nbytes, False), (images.nbytes - 1, True)):
+        monkeypatch.setattr("recon.io.tiff_size.MAX_CLASSIC_TIFF_BYTES", limit)
+        pictures = (Picture(each, np.ones((60, 80), np.uint32), SAMPLE) for each in images)
+        write_frames(tmp_path / "frames.ome.tif", pictures, FrameAxis("t", [0.0, 0.01, 0.02], 0.01))
+        with tifffile.TiffFile(tmp_path / "frames.ome.tif") as file:
+            assert file.is_bigtiff == is_big
+            assert file.is_ome
+            np.testing.assert_array_equal(file.asarray(), images)
 
 
 def test_frames_shorter_than_a_sample_are_refused(result: Reconstruction, tmp_path: Path) -> None:
