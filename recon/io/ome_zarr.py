@@ -41,7 +41,7 @@ def write_ome_zarr(path: Path, frames: Iterable[tuple[Picture, NDArray[np.float3
     first = next(pairs)
     detectors = np.atleast_3d(first[0].image).shape[2]
     height, width = first[0].image.shape[:2]
-    group = zarr.create_group(store=path, attributes={"ome": _metadata(first[0], detectors, axis)})
+    group = zarr.create_group(store=path)
     array = group.create_array(
         "0",
         shape=(*_ordered(axis, len(axis.values), 2 * detectors), height, width),
@@ -50,10 +50,22 @@ def write_ome_zarr(path: Path, frames: Iterable[tuple[Picture, NDArray[np.float3
         fill_value=np.nan,
         dimension_names=[*_ordered(axis, axis.name, "c"), "y", "x"],
     )
+    limits = None
     for k, (picture, sd) in enumerate(chain([first], pairs)):
+        limits = limits or _display_limits(picture)
         for part, values in enumerate((picture.image, sd)):
             channels = slice(part * detectors, (part + 1) * detectors)
             array[_ordered(axis, k, channels)] = np.atleast_3d(values).transpose(2, 0, 1)
+    group.update_attributes({"ome": _metadata(first[0], detectors, axis, limits or (0.0, 1.0))})
+
+
+def _display_limits(picture: Picture) -> tuple[float, float] | None:
+    """Values between which a viewer shows the frames, in the intensity's unit; None for a picture without a value."""
+    values = picture.image[np.isfinite(picture.image)]
+    if not values.size:
+        return None
+    low, high = np.percentile(values, [0.5, 99.5])
+    return float(low), float(high)
 
 
 def _ordered(axis: FrameAxis, frame: First, channel: Second) -> tuple[First | Second, First | Second]:
@@ -61,9 +73,9 @@ def _ordered(axis: FrameAxis, frame: First, channel: Second) -> tuple[First | Se
     return (frame, channel) if axis.name == "t" else (channel, frame)
 
 
-def _metadata(picture: Picture, detectors: int, axis: FrameAxis) -> dict[str, Any]:
+def _metadata(picture: Picture, detectors: int, axis: FrameAxis, limits: tuple[float, float]) -> dict[str, Any]:
     """Attributes of the group by the specification; the specification has no unit for angles, which is therefore a
-    separate attribute."""
+    separate attribute. ``limits``: of the display."""
     width, height, unit = pixel_size(picture.grid)
     length = {"unit": "micrometer"} if unit == "um" else {}
     numbered = [f"detector {k + 1}" for k in range(detectors)] if detectors > 1 else ["intensity"]
@@ -83,7 +95,7 @@ def _metadata(picture: Picture, detectors: int, axis: FrameAxis) -> dict[str, An
     if not time:
         transformations.append({"type": "translation", "translation": [0.0, 1e6 * axis.values[0], 0.0, 0.0]})
         metadata["z_um"] = [1e6 * z for z in axis.values]  # the scale is the mean spacing
-    low, high = (float(edge) for edge in np.nanpercentile(picture.image, [0.5, 99.5]))
+    low, high = limits
     window = {"start": low, "end": high, "min": low, "max": high}
     return {
         "version": VERSION,

@@ -12,6 +12,9 @@ import tifffile
 import lissajous
 from lissajous.napari_reader import get_reader
 from recon.cli import main
+from recon.imaging.frame_axis import FrameAxis
+from recon.imaging.picture import Grid, Picture
+from recon.io.ome_zarr import write_ome_zarr
 from recon.pipeline import reconstruct
 from recon.report.movie import draw_frame
 from recon.sequences.frames import frames, write_scan_frames
@@ -79,6 +82,22 @@ def test_the_ome_zarr_is_valid_by_its_schema(result: Reconstruction, tmp_path: P
     image = models.Image.from_zarr(zarr.open_group(tmp_path / "frames.ome.zarr", mode="r"))
     (scale,) = image.attributes.ome.multiscales[0].datasets[0].coordinateTransformations
     assert scale.scale[2] == pytest.approx(2 * result.picture.grid.half_angle_y / 50)
+
+
+@pytest.mark.parametrize("filled", [(), (1,), (1, 2)])
+def test_the_ome_zarr_is_json_if_frames_are_empty(filled: tuple[int, ...], tmp_path: Path) -> None:
+    empty = Picture(np.full((4, 4), np.nan, np.float32), np.zeros((4, 4), np.uint32), Grid(4, 4, 0.1, 0.1))
+    values = {k: np.linspace(0.0, k, 16, dtype=np.float32).reshape(4, 4) for k in filled}
+    pictures = [replace(empty, image=values.get(k, empty.image)) for k in range(3)]
+    axis = FrameAxis("t", [0.0, 1.0, 2.0], 1.0)
+    write_ome_zarr(tmp_path / "f.zarr", [(each, each.image) for each in pictures], axis)
+
+    def refuse(constant: str) -> None:
+        pytest.fail(f"{constant} is no JSON")
+
+    text = (tmp_path / "f.zarr" / "zarr.json").read_text(encoding="utf-8")
+    channel = json.loads(text, parse_constant=refuse)["attributes"]["ome"]["omero"]["channels"][0]
+    assert [channel["window"][key] for key in ("start", "end")] == pytest.approx([0.0, 1.0], abs=0.01)
 
 
 def test_an_mp4_shows_every_frame(result: Reconstruction, tmp_path: Path) -> None:
