@@ -207,6 +207,15 @@ def _accumulate_detectors(theta_x, theta_y, intensity, half_x, half_y, sums, cou
                 sums[row, column, d] += intensity[i, d]
 
 
+def _to_native(values: NDArray[Any]) -> NDArray[Any]:
+    """Return real numbers in the machine's byte order, floats of 4 or 8 bytes, as compiled loops need them; the same
+    array if it has them."""
+    dtype = values.dtype
+    if dtype.kind == "f":
+        dtype = np.dtype(np.float32 if dtype.itemsize <= 4 else np.float64)
+    return values.astype(dtype.newbyteorder("="), copy=False)
+
+
 def accumulate_samples(
     theta_x: NDArray[Any],
     theta_y: NDArray[Any],
@@ -241,6 +250,7 @@ def accumulate_samples(
     for name, values in (("theta_x", theta_x), ("theta_y", theta_y), ("intensity", intensity)):
         if values.dtype.kind not in "biuf":
             raise BadInput(f"holds {values.dtype}, not real numbers", channel=name, hint="give integers or floats")
+    theta_x, theta_y, intensity = _to_native(theta_x), _to_native(theta_y), _to_native(intensity)
     one_clock = theta_x.ndim == 1 and theta_x.shape == theta_y.shape == intensity.shape[:1]
     if not one_clock or intensity.ndim > 2:
         raise BadInput(

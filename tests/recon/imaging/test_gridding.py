@@ -134,6 +134,19 @@ def test_integer_and_single_precision_samples_are_accepted():
     assert_allclose(picture.image, [[3, 62767.5]])
 
 
+@pytest.mark.parametrize("dtype", [">f8", ">f4", ">i2", ">u4", "f2", "g"])
+def test_samples_of_any_byte_order_and_float_are_accepted(dtype):
+    x = np.linspace(-0.09, 0.09, 9)
+    values = np.arange(9).astype(dtype)
+    grid = Grid(3, 3, 0.1, 0.1)
+    expected = map_samples(x, x, np.arange(9.0), grid).image
+    np.testing.assert_array_equal(map_samples(x, x, values, grid).image, expected)
+    np.testing.assert_array_equal(map_samples(x, x, np.stack([values] * 2, axis=1), grid).image[..., 1], expected)
+    angle, wide = np.arange(9).astype(dtype), Grid(3, 3, 5.5, 5.5)
+    expected = map_samples(np.arange(9.0), np.arange(9.0), values, wide).image
+    np.testing.assert_array_equal(map_samples(angle, angle, values, wide).image, expected)
+
+
 def test_invalid_samples_and_grids_are_refused():
     grid = Grid(4, 4, 1.0, 1.0)
     with pytest.raises(BadInput, match="one angle of each axis"):
