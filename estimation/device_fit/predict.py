@@ -9,7 +9,7 @@ import numpy as np
 
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.open_loop import fit_start_only
-from estimation.device_fit.undriven import steady_without_drive
+from estimation.device_fit.undriven import axes_without_drive, steady_without_drive
 from estimation.held_samples import held_runs_while_driven, without_samples
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
@@ -64,7 +64,7 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
             without a recorded drive.
     """
     run = prepare_run(recording, device)
-    if (steady := steady_without_drive(recording, device)) is not None:
+    if axes_without_drive(recording, device) and (steady := steady_without_drive(recording, device)) is not None:
         hint = "record the voltage that drives it; without one a free decay is predicted"
         raise BadInput(f"has no drive to predict from: {steady}", file=recording.path, hint=hint)
     model, x = fit_start_only([run], device)
