@@ -12,11 +12,11 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import TextIOWrapper
 from pathlib import Path
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from recon.runtime.interrupts import StopRequest, handle_interrupts
 
@@ -152,9 +152,7 @@ def _run(module: ModuleType, args: argparse.Namespace, prog: str, stop: StopRequ
             announce_compilation()
         summary = module.run(args)
         stop.ended = True
-        from recon.io.output import finite
-
-        print(json.dumps(finite(summary), indent=1) if args.json else _printable(module.format_summary(summary)))
+        print(_format_json(summary) if args.json else _printable(module.format_summary(summary)))
         return int(summary.get("exit", 0))  # of several recordings, some may have failed
     except BadInput as error:
         if stop.came:  # an interrupt may have caused it
@@ -176,6 +174,13 @@ def _inputs(args: argparse.Namespace) -> str | None:
     given = next((value for name in INPUTS if (value := getattr(args, name, None)) is not None), None)
     paths = given if isinstance(given, list) else [given]
     return None if given is None else ", ".join(map(str, paths[:3])) + (" and others" if len(paths) > 3 else "")
+
+
+def _format_json(summary: Mapping[str, Any]) -> str:
+    """A summary as JSON, with null for numbers that are not finite."""
+    from recon.io.output import finite
+
+    return json.dumps(finite(summary), indent=1)
 
 
 def _printable(text: str) -> str:
