@@ -48,7 +48,6 @@ from recon.quality.resonance_check import describe_resonance_mismatch
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.quality.sensor_sign import describe_unconfirmed_signs, without_contradicted_signs
 from recon.quality.structure import describe_missing_structure
-from recon.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from recon.steps.estimated_motion import EstimatedMotion
 from recon.steps.estimator_choice import choose_estimator
 from recon.steps.field_check import check_field, check_units, own_half_angle
@@ -71,6 +70,7 @@ from scanner.device import AXES, Device
 from scanner.errors import BadInput
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.sample_ranges import SampleRanges, subtract_ranges, to_sample_ranges
 from scanner.wording import counted
 
 

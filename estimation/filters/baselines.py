@@ -43,6 +43,7 @@ from scanner.errors import BadInput, ChannelMissing
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
 from scanner.replaced_samples import with_replaced
+from scanner.sample_ranges import runs_of_true
 from scanner.signal_check import check_signal
 from scanner.stages import Position
 from scanner.wording import counted, percent
@@ -132,10 +133,10 @@ def _measure_axis(recording: Recording, device: Device, name: str) -> _MeasuredA
         values, missing = lock_in_angle(recording, device.axis(name), light.time())
         angle = make_channel(f"phase_{name}", values, unit="rad", sample_rate=light.sample_rate, start=light.start)
         reference = reference_of_any_waveform(recording, device, name, angle)
-        ends = np.flatnonzero(np.diff(missing, prepend=False, append=False))
-        gaps = list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
         clock = intensity_clock(recording, angle)
-        measure = partial(axis_motion_from_angle, reference=reference, noise_sd=None, clock=clock, held=gaps)
+        measure = partial(
+            axis_motion_from_angle, reference=reference, noise_sd=None, clock=clock, held=runs_of_true(missing)
+        )
         return _MeasuredAxis(measure(angle), measure, angle, angle, notes=_describe_missing_lock_in(name, missing))
     channel, scale, zero, noise_sd = find_position_signal(recording, device.axis(name), name)
     check_signal(channel, gaps_ok=True)

@@ -23,6 +23,7 @@ from estimation.tracker.process_noise import INITIAL_DENSITIES
 from scanner.channel import Channel
 from scanner.device import Device
 from scanner.recording import Recording
+from scanner.sample_ranges import runs_of_true
 
 PAUSE_CYCLES = 1
 """Cycles of the drive in whose blocks a pause is searched: a shorter one changes the motion by 1 / Q at most."""
@@ -89,7 +90,7 @@ def _find_pauses(drive: Channel, reference: PhaseReference) -> list[tuple[int, i
     off = size < DRIVE_ON_RATIO * np.nanmax(size)  # False in gaps
     return [
         (max(first - 1, 0) * block, drive.size if stop >= size.size - 1 else (stop + 1) * block)
-        for first, stop in np.flatnonzero(np.diff(off, prepend=False, append=False)).reshape(-1, 2).tolist()
+        for first, stop in runs_of_true(off)
     ]
 
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from recon.imaging.gridding import accumulate_samples, mean_picture
 from recon.imaging.phasor_gridding import accumulate_phasors
 from recon.imaging.picture import Grid, Picture
-from recon.sample_ranges import SampleRanges, merge_ranges, subtract_ranges
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.lock_in import contiguous_samples
 from scanner.motion import Motion
+from scanner.sample_ranges import SampleRanges, merge_ranges, subtract_ranges
 
 CHUNK_SAMPLES = 1 << 22
 """Samples gridded at a time. It bounds the memory (some 100 MB) for recordings of any length."""

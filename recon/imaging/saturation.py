@@ -13,10 +13,10 @@ from estimation.rail import upper_rail, upper_rail_of_counts
 from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid
 from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, usable_samples, wild_limits
-from recon.sample_ranges import SampleRanges
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples
 from scanner.motion import Motion
+from scanner.sample_ranges import SampleRanges
 
 COUNT_UNITS = ("count", "counts", "photon", "photons")
 """Units of an intensity that cannot be negative and has the noise of photons."""

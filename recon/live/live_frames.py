@@ -34,7 +34,6 @@ from recon.pipeline import estimate_motion
 from recon.quality.defects import unrecoverable_intervals
 from recon.quality.sensor_noise import check_sensor_noise
 from recon.report.figures import save_picture
-from recon.sample_ranges import subtract_ranges, to_sample_ranges
 from recon.steps.estimated_motion import EstimatedMotion
 from recon.steps.phase_and_drift import measure_picture_phase_errors, wants_readout_phase
 from recon.steps.preparation import prepare_frame, select_device
@@ -45,6 +44,7 @@ from scanner.device import Device
 from scanner.files import replacing
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
+from scanner.sample_ranges import subtract_ranges, to_sample_ranges
 
 LAST_PART_PERIODS = 50.0
 """Periods of the slower axis in each of the last two parts of a frame: tracking one takes less time than it lasts. The

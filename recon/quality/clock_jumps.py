@@ -16,7 +16,6 @@ from estimation.reference import dominant_frequency
 from recon.imaging.gridding import accumulate_samples
 from recon.imaging.picture import Grid
 from recon.quality.defects import PHASE_JUMP, Defect
-from recon.sample_ranges import merge_ranges, runs_of_true
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
@@ -24,6 +23,7 @@ from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
 from scanner.motion import AxisMotion, Motion
 from scanner.recording import Recording
+from scanner.sample_ranges import merge_ranges, runs_of_true
 
 CYCLES_PER_PHASE = 8.0
 """Cycles of a spectral line per phase sample: enough to average the noise, and at 10 kHz shorter than a millisecond."""

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.held_samples import find_held_runs, slowest_motions
-from recon.sample_ranges import SampleRanges, merge_ranges, runs_of_true, subtract_ranges, to_sample_ranges
 from scanner.angle_tracks import AngleTrack
 from scanner.channel import MIN_CLIPPED_RUN_SAMPLES, READ_CHUNK_SAMPLES, Channel
 from scanner.device import Device
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.sample_ranges import SampleRanges, merge_ranges, runs_of_true, subtract_ranges, to_sample_ranges
 from scanner.wording import percent
 
 MERGE_GAP_S = 1e-3

@@ -8,10 +8,10 @@ from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Grid, Picture
 from recon.imaging.scan_phase.bidirectional_phase import quadrature, slow_period
 from recon.imaging.wild_samples import MAX_CHECKED_SAMPLES, WildLimits, usable_samples, wild_limits
-from recon.sample_ranges import SampleRanges, runs_of_true, subtract_ranges
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.motion import Motion
+from scanner.sample_ranges import SampleRanges, runs_of_true, subtract_ranges
 
 BLOCK_PERIODS = 2.0
 """Periods of the slower axis in a block: it crosses the whole field, so that most blocks scatter alike."""

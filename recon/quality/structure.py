@@ -8,10 +8,10 @@ from recon.imaging.intensity_gridding import grid_intensity
 from recon.imaging.picture import Picture, detector_names
 from recon.imaging.picture_kinds.picture_estimate import EstimatedPicture, picture_of_sums
 from recon.imaging.pixel_noise import measure_noise
-from recon.sample_ranges import SampleRanges
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel
 from scanner.motion import Motion
+from scanner.sample_ranges import SampleRanges
 
 MAX_FLAT_EXCESS_SD = 4.0
 """Excess of the scatter between pixels over that of noise, in its standard deviations, up to which they are alike."""

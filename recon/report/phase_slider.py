@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from recon.quality.defects import unrecoverable_intervals
 from recon.report.figures import contrast_limits
-from recon.sample_ranges import to_sample_ranges
 from recon.steps.reconstruction import Reconstruction
 from recon.steps.registration_segments import MAX_REGISTERED_PERIODS
 from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.lock_in import block_length, block_phasors
 from scanner.motion import AxisMotion
+from scanner.sample_ranges import to_sample_ranges
 
 MAX_SAMPLES = 300_000
 """Samples in a page: as base64 they take 0.4 MB."""

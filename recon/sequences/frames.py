@@ -25,11 +25,11 @@ from recon.io.ome_zarr import write_ome_zarr
 from recon.io.output import write_frames
 from recon.quality.defects import unrecoverable_intervals
 from recon.report.movie import write_movie
-from recon.sample_ranges import SampleRanges, to_sample_ranges
 from recon.steps.reconstruction import Options, Reconstruction
 from recon.steps.z_slices import ZSlices, find_z_slices
 from scanner.arguments import check_numbers, check_type, check_whole_numbers
 from scanner.errors import BadInput
+from scanner.sample_ranges import SampleRanges, to_sample_ranges
 
 if TYPE_CHECKING:
     import xarray

@@ -17,13 +17,13 @@ from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.picture import Grid
 from recon.imaging.pixel_noise import MAX_NOISE_SAMPLES, measure_sample_noise
 from recon.quality.defects import LOST, Defect
-from recon.sample_ranges import runs_of_true, subtract_ranges, to_sample_ranges
 from recon.steps.sign_after_rest import REST_AMPLITUDE
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion, Motion, typical_amplitude
 from scanner.recording import Recording
+from scanner.sample_ranges import runs_of_true, subtract_ranges, to_sample_ranges
 
 MIN_EXCESS_SDS = 4.0
 """Excess of the scatter in its standard deviations from which it is none by chance: probability 3e-5."""

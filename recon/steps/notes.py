@@ -15,13 +15,13 @@ from recon.quality.defects import Defect, describe_clipped_positions, describe_h
 from recon.quality.detector_gaps import describe_blanked_directions, describe_detector_gaps
 from recon.quality.pulsed_light import describe_pulsed_light
 from recon.quality.wrapped_integers import describe_wrapped_integers
-from recon.sample_ranges import SampleRanges
 from recon.steps.intensity_notes import describe_lower_rail, describe_running_sums, describe_saturation
 from recon.steps.preparation import PreparedRecording
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
 from scanner.recording import Recording
+from scanner.sample_ranges import SampleRanges
 
 MAX_FRAME_EXCESS = 1e-3
 """Relative excess of a frame over the recording up to which it is the whole recording: durations are stated rounded."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from recon.imaging.scan_phase.bidirectional_phase import PERIODS_PER_SLICE, slow_period
-from recon.sample_ranges import SampleRanges, to_sample_ranges
 from recon.steps.sign_after_rest import REST_AMPLITUDE
 from recon.steps.z_rests import rest_ranges
 from scanner.channel import Channel
 from scanner.motion import Motion, typical_amplitude
+from scanner.sample_ranges import SampleRanges, to_sample_ranges
 
 MAX_REGISTERED_PERIODS = 200
 """Periods of the slower axis in which phase errors are measured. A scan of 60 ms has as many; in a longer recording

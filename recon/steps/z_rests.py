@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.sample_ranges import SampleRanges, to_sample_ranges
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
+from scanner.sample_ranges import SampleRanges, to_sample_ranges
 
 MAX_BLOCKS = 2048
 """Blocks into which z is divided: of 100 slices, each has twenty. A rest loses up to a block at both ends."""

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.sample_ranges import SampleRanges
 from recon.steps.z_rests import PositionBlocks, cut_to_intensity, find_z_rests, read_blocks, rest_times
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel, LazySamples
 from scanner.errors import BadInput
+from scanner.sample_ranges import SampleRanges
 from scanner.wording import counted
 
 MAX_TRAVEL_M = 0.1

@@ -15,10 +15,10 @@ from recon.imaging.picture_kinds.held_out import SplitSums, held_out_ranges, hol
 from recon.imaging.picture_kinds.kernel_picture import PictureEstimate, choose_width, kernel_image, kernel_picture
 from recon.imaging.picture_kinds.recursive_frames import CarriedFrames, recursive_picture
 from recon.imaging.pixel_noise import SampleNoise, pixel_sd
-from recon.sample_ranges import SampleRanges, subtract_ranges
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.motion import Motion
+from scanner.sample_ranges import SampleRanges, subtract_ranges
 from scanner.wording import percent
 
 PictureKind = Literal["mean", "kernel", "posterior"]

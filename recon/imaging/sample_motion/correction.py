@@ -12,12 +12,12 @@ from recon.imaging.picture import Grid
 from recon.imaging.sample_motion.block_equations import PlacedSamples
 from recon.imaging.sample_motion.rigid_motion import SampleMotion, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
-from recon.sample_ranges import SampleRanges
 from scanner.angle_tracks import DerivedAngle
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES, Channel
 from scanner.device import AXES
 from scanner.motion import Motion
+from scanner.sample_ranges import SampleRanges
 
 MAX_CELLS_ACROSS = 512
 """Cells across the field at most: pictures and sums of all folds then take 150 MB."""

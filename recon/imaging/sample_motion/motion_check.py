@@ -20,10 +20,10 @@ from recon.imaging.sample_motion.motion_smoother import part_shift
 from recon.imaging.sample_motion.residual import remaining_motion_variance
 from recon.imaging.sample_motion.rigid_motion import MIN_BLOCKS, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
-from recon.sample_ranges import SampleRanges
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
+from scanner.sample_ranges import SampleRanges
 
 MAX_CHECKED_SAMPLES = 1 << 20
 """Samples that are compared, in periods of the slower axis spread over the scan: 0.5 s of computing time."""

@@ -24,11 +24,11 @@ from recon.quality.clock_jumps import detect_clock_jumps
 from recon.quality.defects import Defect, describe_defects, find_defects
 from recon.quality.dropped_samples import first_late_slice, slice_delays
 from recon.report.summary import summarise
-from recon.sample_ranges import subtract_ranges, to_sample_ranges
 from recon.steps.preparation import prepare
 from recon.steps.reconstruction import Options, Reconstruction
 from scanner.device import Device
 from scanner.recording import Recording
+from scanner.sample_ranges import subtract_ranges, to_sample_ranges
 from tests.support import two_axis_scan
 from tests.support.simulated import imaging, separate_electrodes
 

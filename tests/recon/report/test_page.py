@@ -21,8 +21,8 @@ from recon.report.page import Section, render
 from recon.report.phase_slider import MISSING_CODE, phase_slider_data
 from recon.report.reconstruction import phase_slider_section, reconstruction_report
 from recon.report.summary import summarise
-from recon.sample_ranges import to_sample_ranges
 from recon.steps.reconstruction import Options, Reconstruction
+from scanner.sample_ranges import to_sample_ranges
 from tests.support.simulated import imaging
 
 SCRIPT = Path(recon.report.phase_slider.__file__).parent / "templates" / "sweeps.js"
