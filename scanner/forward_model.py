@@ -131,17 +131,20 @@ def simulate_batch(
 ) -> list[AxisTrajectory]:
     """Return :func:`simulate_axis` of several (axis, terms, start) in one call of the integrator.
 
-    The cases have the same terms and differ in numbers only. The values of their drive terms do not differ. Up to
-    ``scanner.integrator.abi.LANES`` cases take little longer than one.
+    The cases have the same terms and differ in numbers only. Up to ``scanner.integrator.abi.LANES`` cases take little
+    longer than one.
     """
     # Imported here because loading the compiled kernels takes half a second.
     from scanner.integrator.trajectories import CapacitanceTerm, TorqueTerm, TrajectorySpec, integrate_batch
 
-    voltage, specs = None, []
+    specs, drives, of_values = [], [], dict[tuple[object, ...], tuple[Array, Array]]()
     for nominal, terms, start in cases:
         axis = with_constants(nominal, terms)
-        if voltage is None:
+        values = tuple(active.values for active in terms if active.term.voltage is not None)
+        if values not in of_values:
             voltage = effective_drive(axis, terms, drive)
+            of_values[values] = voltage, nodes_to_samples(voltage)
+        drives.append(of_values[values])
         torques = [
             TorqueTerm(
                 active.term.torque, active.values, active.hidden_state if active.term.hidden_state_scales else None
@@ -155,12 +158,10 @@ def simulate_batch(
             if active.term.capacitance is not None
         ]
         specs.append(TrajectorySpec(axis, start, torques, capacitances))
-    assert voltage is not None
-    motions = integrate_batch(specs, voltage, drive.step, drive.t0, other_angle)
-    at_samples = nodes_to_samples(voltage)
+    motions = integrate_batch(specs, [voltage for voltage, _ in drives], drive.step, drive.t0, other_angle)
     return [
         AxisTrajectory(spec.axis, tuple(terms), drive, angle, rate, at_samples)
-        for spec, (_, terms, _), (angle, rate) in zip(specs, cases, motions, strict=True)
+        for spec, (_, terms, _), (angle, rate), (_, at_samples) in zip(specs, cases, motions, drives, strict=True)
     ]
 
 

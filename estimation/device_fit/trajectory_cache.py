@@ -48,11 +48,6 @@ class MotionRequest(NamedTuple):
         )  # fmt: skip
 
     @property
-    def drive_values(self) -> tuple[object, ...]:
-        """Values of the terms that change the drive's voltage, which all motions of a batch share."""
-        return tuple(active.values for active in self.motion_terms if active.term.voltage is not None)
-
-    @property
     def motion(self) -> tuple[Axis, tuple[ActiveTerm, ...], tuple[float, float]]:
         """Input of ``simulate_batch``."""
         return self.axis, self.motion_terms, self.start
@@ -92,10 +87,10 @@ class TrajectoryCache:
             requests: of the motions.
             parallel_steps: integration steps of the model if the batches may run on several processors, else 0.
         """
-        groups: dict[tuple[object, ...], dict[_Key, MotionRequest]] = {}
+        groups: dict[tuple[int, str], dict[_Key, MotionRequest]] = {}
         for request in requests:
             if (key := request.key) not in self._kept:
-                groups.setdefault((request.run, request.axis.name, request.drive_values), {})[key] = request
+                groups.setdefault((request.run, request.axis.name), {})[key] = request
 
         def simulate_part(part: list[tuple[_Key, MotionRequest]]) -> None:
             trajectories = simulate_batch([request.motion for _, request in part], part[0][1].inputs)

@@ -95,28 +95,32 @@ def integrate(
     Args:
         axis: nominal values.
         start: angle [rad] and rate [rad/s].
-        voltage, step, t0, other_angle: as in :func:`integrate_batch`.
+        voltage: drive, shape (n, 3) [V]; step, t0, other_angle: as in :func:`integrate_batch`.
         torques, capacitances: terms, at most ``MAX_TERMS_PER_STAGE`` of each.
 
     Returns:
         (angle [rad], rate [rad/s]), each of shape (n + 1,), the start included.
 
     Raises:
-        ValueError: more terms than ``MAX_TERMS_PER_STAGE``.
+        ValueError: more terms than ``MAX_TERMS_PER_STAGE``, or drives of other lengths.
         DeviceInvalid: the device states no mechanics of the axis.
     """
-    return integrate_batch([TrajectorySpec(axis, start, torques, capacitances)], voltage, step, t0, other_angle)[0]
+    return integrate_batch([TrajectorySpec(axis, start, torques, capacitances)], [voltage], step, t0, other_angle)[0]
 
 
 def integrate_batch(
-    specs: Sequence[TrajectorySpec], voltage: Array, step: float, t0: float = 0.0, other_angle: Array | None = None
+    specs: Sequence[TrajectorySpec],
+    voltages: Sequence[Array],
+    step: float,
+    t0: float = 0.0,
+    other_angle: Array | None = None,
 ) -> list[tuple[Array, Array]]:
-    """Integrate up to ``LANES`` motions with the same laws, whose numbers may differ, under one drive.
+    """Integrate up to ``LANES`` motions with the same laws, whose numbers and drives may differ.
 
     Args:
         specs: of the motions. The kinds of drive and the laws of the first one hold for all.
-        voltage: drive at the start, middle and end of every step, shape (n, 3) [V]. A jump between two
-            steps is represented exactly.
+        voltages: drive of each motion at the start, middle and end of every step, shape (n, 3) [V]. A jump between
+            two steps is represented exactly.
         step: length of a step [s].
         t0: time of the start [s].
         other_angle: angle of the other axis, shape (n, 3) [rad]; zero by default.
@@ -124,10 +128,11 @@ def integrate_batch(
     Returns:
         For each motion what :func:`integrate` returns. Raises as that.
     """
-    steps, motions, first = len(voltage), len(specs), specs[0]
+    steps, motions, first = len(voltages[0]), len(specs), specs[0]
     if motions > LANES:
         raise ValueError(f"{motions} motions, at most {LANES} are integrated together")
-    angle, rate = np.empty((motions, steps + 1)), np.empty((motions, steps + 1))
+    # An array each, so that a caller who keeps one motion does not keep the memory of all.
+    results = [(np.empty(steps + 1), np.empty(steps + 1)) for _ in specs]
     start = np.zeros((motions, 2 + 2 * MAX_TERMS_PER_STAGE))
     for row, spec in zip(start, specs, strict=True):
         row[:2] = spec.start
@@ -148,9 +153,15 @@ def integrate_batch(
     )
     others = np.zeros((steps, 3)) if other_angle is None else _float64(other_angle)
     width = _LANES_PER_VECTOR * -(-motions // _LANES_PER_VECTOR)
-    run_kernel(start, _float64(voltage), others, float(t0), float(step), laws, width, angle, rate)
-    # Copied, so that a caller who keeps one motion does not keep the memory of all.
-    return [(a.copy(), r.copy()) for a, r in zip(angle, rate, strict=True)]
+    drives = [_float64(voltage) for voltage in voltages]
+    if len(drives) != motions or any(drive.shape != others.shape for drive in drives):
+        raise ValueError(f"drives of shapes {[drive.shape for drive in drives]} for {motions} motions of {steps} steps")
+    of_drives = np.array([drive.ctypes.data for drive in drives])
+    if np.all(of_drives == of_drives[0]):
+        of_drives = of_drives[:1]
+    of_results = np.array([[array.ctypes.data for array in result] for result in results])
+    run_kernel(start, of_drives, others, float(t0), float(step), laws, width, of_results)
+    return results
 
 
 def _float64(values: Array) -> Array:

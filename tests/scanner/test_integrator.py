@@ -69,11 +69,21 @@ def test_too_many_motions_or_terms_are_refused() -> None:
 
     voltage = np.zeros((10, 3))
     with pytest.raises(ValueError, match="at most 8"):
-        integrate_batch([TrajectorySpec(AXIS, (0.1, 0.0))] * (LANES + 1), voltage, 1e-6)
+        integrate_batch([TrajectorySpec(AXIS, (0.1, 0.0))] * (LANES + 1), [voltage] * (LANES + 1), 1e-6)
     cubic = catalogue()["cubic-stiffness"].torque
     assert cubic
     with pytest.raises(ValueError, match="5 terms of one stage"):
         integrate(AXIS, (0.1, 0.0), voltage, 1e-6, 0.0, [TorqueTerm(cubic, (0.0,))] * 5)
+
+
+def test_drives_of_other_lengths_are_refused() -> None:
+    from scanner.integrator.trajectories import TrajectorySpec, integrate_batch
+
+    motions = [TrajectorySpec(AXIS, (0.1, 0.0))] * 2
+    with pytest.raises(ValueError, match="for 2 motions of 10 steps"):
+        integrate_batch(motions, [np.zeros((10, 3)), np.zeros((9, 3))], 1e-6)
+    with pytest.raises(ValueError, match="for 2 motions of 10 steps"):
+        integrate_batch(motions, [np.zeros((10, 3))], 1e-6)
 
 
 def test_values_at_nodes_preserve_a_jump_between_two_steps() -> None:

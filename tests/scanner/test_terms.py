@@ -241,7 +241,8 @@ def test_changed_law_is_compiled_again(tmp_path: Path) -> None:
             np.testing.assert_allclose(*made, rtol=1e-12, atol=1e-15)
 
 
-def test_batch_of_motions_equals_the_single_motions() -> None:
+@pytest.mark.parametrize("same_drive", [True, False])
+def test_batch_of_motions_equals_the_single_motions(same_drive: bool) -> None:
     known = catalogue()
     comb = Capacitance(C0=5e-12, Cb=1e-11, theta0=0.2, theta_th=0.01)
     voltage = 20.0 + 10.0 * np.sin(2 * W * STEP * (np.arange(4000)[:, None] + [0.0, 0.5, 1.0]))
@@ -252,8 +253,9 @@ def test_batch_of_motions_equals_the_single_motions() -> None:
         cubic = TorqueTerm(known["cubic-stiffness"].torque, (1e-6 * i,))
         bell = CapacitanceTerm(known["profile-shape"].capacitance, (0.1 * i,))
         motions.append(TrajectorySpec(replace(axis, drive=None), (0.1, 1.0 + i), [mode, cubic], [bell]))
-    together = integrate_batch(motions, voltage, STEP, 0.1)
-    for (axis, start, torques, bells), (angle, rate) in zip(motions, together, strict=True):
+    voltages = [voltage if same_drive else (1.0 + 0.01 * i) * voltage for i in range(len(motions))]
+    together = integrate_batch(motions, voltages, STEP, 0.1)
+    for (axis, start, torques, bells), voltage, (angle, rate) in zip(motions, voltages, together, strict=True):
         alone = integrate(axis, start, voltage, STEP, 0.1, torques, bells)
         np.testing.assert_array_equal(angle, alone[0])
         np.testing.assert_array_equal(rate, alone[1])
