@@ -142,7 +142,7 @@ class Likelihood:
         compared = np.concatenate([whitener.keep for whitener in flat])
         validation = _is_held_out(self.time)
         self.rows, self.validation_rows = compared & ~validation, compared & validation
-        self._whitened: dict[tuple[int, str, str, float], Array] = {}
+        self._whitened: dict[tuple[object, ...], Array] = {}
 
     def fitted(self, stop: float) -> Mask:
         """Mask of the samples that are fitted over a window, the fraction ``stop`` of the recordings."""
@@ -174,7 +174,7 @@ class Likelihood:
         for r, (run, whiteners) in enumerate(zip(self.runs, self.whiteners, strict=True)):
             for output, whitener in zip(run.outputs, whiteners, strict=True):
                 for i, values in zip(*model.basis[(r, output.name)], strict=True):
-                    key = (r, output.name, model.parameters[i].name, stop)
+                    key = (r, output.name, model.parameters[i].name, model.mains, stop)
                     if key not in self._whitened:
                         difference = -values.copy()
                         difference[int(stop * values.size) if stop < 1.0 else values.size :] = 0.0

@@ -143,8 +143,12 @@ class Model:
         return Model(self.runs, self.device, candidates, self.mains)
 
     def scales(self, axis: str) -> NaturalScales:
-        """Natural scales of an axis, from the first recording that contains it."""
-        return next(run.scales[axis] for run in self.runs if axis in run.scales)
+        """Natural scales of an axis, from the recording with the strongest drive, then with the largest motion.
+
+        A ringdown among driven recordings has no drive, with whose scales no term of the drive would apply.
+        """
+        of_runs = (run.scales[axis] for run in self.runs if axis in run.scales)
+        return max(of_runs, key=lambda scales: (scales.voltage_rms, scales.amplitude))
 
     def values(self, candidate: Candidate, x: Array) -> tuple[float, ...]:
         """Physical values of the parameters of a candidate."""
@@ -196,10 +200,10 @@ class Model:
         with np.errstate(over="ignore", invalid="ignore"):
             return [self._run_outputs(r, x, stop) for r in range(len(self.runs))]
 
-    def full_signals(self, x: Array) -> list[Array]:
-        """Every channel of the first run on the integration grid, shape (n + 1,), without additive waveforms."""
+    def full_signals(self, x: Array, r: int = 0) -> list[Array]:
+        """Every channel of a run on the integration grid, shape (n + 1,), without additive waveforms."""
         without_additive = np.where([spec.kind == "additive" for spec in self.parameters], 0.0, x)
-        return self._signals(0, without_additive, 1.0)
+        return self._signals(r, without_additive, 1.0)
 
     def _run_outputs(self, r: int, x: Array, stop: float) -> list[Array]:
         signals = zip(self.runs[r].outputs, self._signals(r, x, stop), strict=True)

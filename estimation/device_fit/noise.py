@@ -31,6 +31,10 @@ EXTRAPOLATION_SLOPE_SD = 0.3
 """Standard deviation of the power-law exponent with which the spectrum is extrapolated below its first band. It widens
 the noise there by the mean of a log-normal level, so that slow noise is not reported as a drift."""
 
+WIDE_EXCLUSION_BINS, NARROW_EXCLUSION_BINS = 3.0, 2.5
+"""Bins on either side of a line that are excluded, and where these cover the whole compared band. The main lobe of the
+window is two bins wide on either side."""
+
 EXCLUDED_LOW_HALF_BINS = 6
 """Number of half bins, from 0 Hz on, in which no noise is measured: such slow variation may be an effect, a drift."""
 
@@ -144,13 +148,23 @@ def noise_psd(
         variances, shape (bins,), and the lowest bin that was measured.
     """
     power = periodogram(_remove_slow_variation(residual))
-    frequency = np.arange(power.size) / (residual.size * step)
-    excluded = near_lines(frequency, lines, max(width, 3.0 / (residual.size * step)))
-    excluded[: EXCLUDED_LOW_HALF_BINS // 2] = True  # their noise is extrapolated from higher bins
-    usable = np.flatnonzero(~excluded)
+    bin_width = 1.0 / (residual.size * step)
+    frequency = np.arange(power.size, dtype=np.float64) * bin_width
+    usable = _bins_off_lines(frequency, lines, max(width, WIDE_EXCLUSION_BINS * bin_width))
+    if not np.any(usable < bins):  # the lines of a multisine over few periods
+        usable = _bins_off_lines(frequency, lines, NARROW_EXCLUSION_BINS * bin_width)
     if usable.size < 16:
         usable = np.arange(1, power.size)
-    return _running_median(usable.astype(float), power[usable], np.arange(bins, dtype=float))
+    psd, first = _running_median(usable.astype(float), power[usable], np.arange(bins, dtype=float))
+    return psd, min(first, bins - 1.0)
+
+
+def _bins_off_lines(frequency: Array, lines: Sequence[float] | Array, width: float) -> NDArray[np.intp]:
+    """Bins in which noise is measured: farther than ``width`` from all lines and above the lowest ones, whose noise is
+    extrapolated."""
+    excluded = near_lines(frequency, lines, width)
+    excluded[: EXCLUDED_LOW_HALF_BINS // 2] = True
+    return np.flatnonzero(~excluded)
 
 
 def _remove_slow_variation(residual: Array) -> Array:

@@ -42,7 +42,7 @@ def phase_portrait(
     output = likelihood.runs[run_index].outputs[channel_index]
     of_channel = likelihood.channel == outputs_before + channel_index
     trajectory = final.model.trajectories(run_index, final.x)[output.axes[0]]
-    at = likelihood.time[of_channel] * output.data.size * output.stride + output.first
+    at = (likelihood.time[of_channel] * output.data.size - 0.5) * output.stride + output.first
     grid = np.arange(trajectory.angle.size)
     row, column = (
         np.clip((np.interp(at, grid, v) / np.abs(v).max() + 1.0) / 2.0 * PORTRAIT_CELLS, 0, PORTRAIT_CELLS - 1)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimation.device_fit.data import Run, prepare_run
+from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import fit_start_only
 from estimation.device_fit.undriven import axes_without_drive, steady_without_drive
 from estimation.held_samples import held_runs_while_driven, without_samples
@@ -96,7 +97,8 @@ def beyond_measured_laws(recording: Recording, device: Device) -> dict[str, floa
     run = prepare_run(recording, device)
     model, x = fit_start_only([run], device)
     trajectories = model.trajectories(0, x)
-    sensed = dict(zip((output.name for output in run.outputs), model.full_signals(x), strict=True))
+    before = Model([run], _without_readout_laws(device), mains=())
+    sensed = dict(zip((output.name for output in run.outputs), before.full_signals(x), strict=True))
     fractions = {}
     for name, law in laws.items():
         if name in trajectories:
@@ -107,8 +109,17 @@ def beyond_measured_laws(recording: Recording, device: Device) -> dict[str, floa
                 "optics": [trajectory.angle],
                 "readout": [signal],
             }
-            fractions[name] = beyond(law, variables.get(law["stage"], [trajectory.voltage]))
+            fractions[name] = beyond(law, variables.get(law["stage"], [trajectory.drive.samples]))
     return fractions
+
+
+def _without_readout_laws(device: Device) -> Device:
+    """The device without the measured laws of its readouts, whose variable is the signal before them."""
+    axes = {
+        name: replace(axis, terms={effect: law for effect, law in axis.terms.items() if law.get("stage") != "readout"})
+        for name, axis in device.axes.items()
+    }
+    return replace(device, axes=axes)
 
 
 def _at_sample_times(

@@ -28,6 +28,11 @@ MAX_SLOPE = 2.0
 of electronics exceeds for long."""
 
 
+MAX_SLOW_HALF_BINS = 1000
+"""Largest number of half bins below the lowest measured one that count as slow noise. Where the lines of a multisine
+leave only high frequencies to measure noise in, all below is unknown, and the products of the bins need much memory."""
+
+
 class _SlowPart(NamedTuple):
     """The slowest cosines of one whitened channel, in which the noise is extrapolated.
 
@@ -109,7 +114,7 @@ def _slow_parts(whiteners: Sequence[Whitener], columns: Array, rows: Mask) -> li
         samples = slice(first, first + whitener.samples)
         first += whitener.samples
         half_bins = np.arange(1, 2 * int(np.ceil(whitener.first)) - 1)
-        if not half_bins.size:
+        if not 0 < half_bins.size <= MAX_SLOW_HALF_BINS:
             continue
         values, used = columns[samples], rows[samples]
         parts.append(

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from estimation.candidate_terms.significance import residual_is_noise
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.further_modes import describe_modes, with_driven_modes
@@ -120,7 +121,7 @@ def diagnose(
     runs = [prepare_run(recording, nominal) for recording in recordings]
     check_units_and_signs(recordings, runs, nominal)
     diagnosis = _diagnose_with_modes(runs, nominal, progress, excluded)
-    return replace(diagnosis, findings=with_held_drives(diagnosis.findings, recordings))
+    return replace(diagnosis, findings=with_held_drives(diagnosis.findings, recordings, nominal))
 
 
 def _diagnose_with_modes(
@@ -215,13 +216,14 @@ def _prior_tension_finding(fit: Fit) -> Finding | None:
         return None
     pulls = _pulls(fit)
     size, axis, name = pulls[0]
+    rest = "; the residual is noise" if residual_is_noise(fit) else ""
     return Finding(
         axis=axis,
         stage=name.partition(".")[0],
         effect="unknown",
         equation=f"{name} off by {size:+.1f} tolerances",
         parameters=(),
-        where=f"{name} must deviate by {size:+.1f} tolerances to explain the recording; the residual is noise",
+        where=f"{name} must deviate by {size:+.1f} tolerances to explain the recording{rest}",
         probability=1.0,
         rivals=(),
         heldout={"metric": METRIC, "before": fit.validation_chi2, "after": fit.validation_chi2},

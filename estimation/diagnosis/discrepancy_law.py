@@ -40,13 +40,14 @@ class Section(NamedTuple):
     x_label: str
 
 
-def correction_curve(fit: Fit) -> dict[str, Any]:
+def correction_curve(fit: Fit) -> dict[str, Any] | None:
     """Curve of the last term of a fit, a discrepancy term, with its band of one standard deviation.
 
     It is drawn along the section on which the law is largest relative to its possible contributions.
 
     Returns:
-        the content of ``curve`` in diagnosis.json: labels, units and points.
+        the content of ``curve`` in diagnosis.json: labels, units and points; None if nothing of the term can be drawn,
+        as a law with memory.
     """
     candidate = fit.model.candidates[-1]
     scales = fit.model.scales(candidate.axis)
@@ -64,7 +65,11 @@ def correction_curve(fit: Fit) -> dict[str, Any]:
         return float(np.mean((basis(section) @ fit.x[indices] / largest) ** 2))
 
     is_curve = candidate.term.effect in CURVE_TERMS
-    section = _curve_section(fit) if is_curve else max(_sections(candidate.term.effect, scales), key=share)
+    sections = [_curve_section(fit)] if is_curve else _sections(candidate.term.effect, scales)
+    drawable = [section for section in sections if not section.columns.keys().isdisjoint(names)]
+    if not drawable:
+        return None
+    section = max(drawable, key=share)
     columns = basis(section)
     value = columns @ fit.x[indices]
     band = np.sqrt(
@@ -85,6 +90,7 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
     u = np.linspace(-1.0, 1.0, 121)
     phase = 0.5 * np.pi * (u + 1.0)
     time = s.duration * phase / np.pi
+    x, v = np.cos(np.pi * u), -np.sin(np.pi * u)  # angle and rate of an oscillation
 
     def waves(letter: str) -> dict[str, Array]:
         return {f"{letter}{j}": np.cos(j * phase) for j in range(GAIN_COSINES + 1)}  # of all terms the most
@@ -95,13 +101,19 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
             powers = range(2, FORCE_DEGREE + 1)
             angle = {f"f{n}0": torque * u**n for n in powers}
             rate = {f"f0{n}": torque * u**n for n in powers}
+            mixed = {f"f{i}{j}": torque * x**i * v**j for i, j in FORCE_POWERS if i and j}
             return [
                 Section(angle, "torque at zero rate", "N m", s.amplitude * u, "angle (rad)"),
                 Section(rate, "torque at zero angle", "N m", s.amplitude * s.rate * u, "rate (rad/s)"),
+                Section(mixed, "torque of angle and rate together", "N m", np.pi * u, "phase of the oscillation (rad)"),
                 Section({n: torque * c for n, c in waves("k").items()}, "change of k A", "N m", time, "time (s)"),
+                Section({n: torque * c for n, c in waves("b").items()}, "change of b A ω", "N m", time, "time (s)"),
             ]
         case "free-stiffness":
-            return [Section(waves("k"), "stiffness error / k", "1", time, "time (s)")]
+            return [
+                Section(waves("k"), "stiffness error / k", "1", time, "time (s)"),
+                Section(waves("b"), "damping error · rate / k", "1", time, "time (s)"),
+            ]
         case "free-capacitance":
             span = 1.5 * u
             profile = {f"a{n}": np.exp(-(span**2)) * span**n for n in PROFILE_POWERS}
@@ -111,11 +123,11 @@ def _sections(effect: str, s: NaturalScales) -> list[Section]:
             return [
                 Section(static, "drive error / rms", "1", u, "drive / rms"),
                 Section(slopes, "drive error / rms", "1", u, "slope / (rms · rate)"),
+                Section({"v4": x * v}, "drive error / rms", "1", np.pi * u, "phase of the drive (rad)"),
                 Section(waves("g"), "gain error", "1", time, "time (s)"),
                 Section(waves("o"), "offset / rms", "1", time, "time (s)"),
             ]
         case "free-readout":
-            x, v = np.cos(np.pi * u), -np.sin(np.pi * u)
             by_rate = {"w0": v, "w1": v * x, "w2": v, "w3": v**3, "w4": v**5}
             steady_oscillation = np.sqrt(2.0) * np.tile(x, 2)  # the second period is the steady loop
             loops = {
@@ -163,28 +175,29 @@ STATIC_PARAMETERS = {
 def measured_law_table(fit: Fit) -> dict[str, Any] | None:
     """The static part of the last term of a fit, a discrepancy term, as table ``[x.terms.measured-law]`` in SI units.
 
-    None if the term has no static law that a device file can state: a delay, a capacitance, or a dependence on time
-    only.
+    None if the term has no static law that a device file can state: a delay, a capacitance, or a dependence on time or
+    previous states only.
     """
     model, candidate = fit.model, fit.model.candidates[-1]
     term, scales = candidate.term, model.scales(candidate.axis)
     static = STATIC_PARAMETERS.get(term.effect, ())
+    if {parameter.name for parameter in term.free_parameters}.isdisjoint(static):
+        return None
     value, covariance = _static_parameters(fit, static)
     sd = np.sqrt(np.diag(covariance))
     if term.effect == "free-mechanics":
         angle, rate = scales.amplitude, scales.amplitude * scales.rate
         powers = [list(exponents) for exponents in FORCE_POWERS]
-        factors = [scales.k * angle / (angle**i * rate**j) for i, j in FORCE_POWERS]
+        stiffness = model.nominal(candidate.axis, fit.x).require_mechanics().k
+        factors = [stiffness * angle / (angle**i * rate**j) for i, j in FORCE_POWERS]
         motions = _motions(fit, candidate.axis)
         radius = max(float(np.hypot(theta / angle, omega / rate).max()) for theta, omega in motions)
         variables, centre, half_width = ["angle", "rate"], [0.0, 0.0], [radius * angle, radius * rate]
-    elif static:
+    else:
         powers = [[1], [2], [3]] if term.effect == "free-drive" else [[2], [3]]
         variables, (signal, rms) = ["signal" if term.stage == "readout" else "voltage"], _signal_before_law(fit)
         factors = [1.0 / rms ** (power - 1) for (power,) in powers]
         centre, half_width = [float(signal.mean())], [float(np.abs(signal - signal.mean()).max())]
-    else:
-        return None
     n = len(powers)
     law = {
         "stage": term.stage,
@@ -221,19 +234,24 @@ def _static_parameters(fit: Fit, names: Sequence[str]) -> tuple[Array, Array]:
 
 
 def _signal_before_law(fit: Fit) -> tuple[Array, float]:
-    """Signal of the first run to which the last term of a fit, a law of drive or readout, adds, and its rms [V].
+    """Signal, of all runs, to which the last term of a fit, a law of drive or readout, adds, and its rms [V].
 
     A readout that folds a signal reaches larger values of it than the recording shows.
     """
     model, candidate = fit.model, fit.model.candidates[-1]
     scales = model.scales(candidate.axis)
     if candidate.term.stage == "drive":
-        run = next(run for run in model.runs if candidate.axis in run.inputs)
-        return run.inputs[candidate.axis].voltage, scales.voltage_rms
+        voltages = [run.inputs[candidate.axis].voltage.ravel() for run in model.runs if candidate.axis in run.inputs]
+        return np.concatenate(voltages), scales.voltage_rms
     without = model.with_candidates(model.candidates[:-1])
-    signals = zip(model.runs[0].outputs, without.full_signals(without.map_parameters_from(model, fit.x)), strict=True)
-    signal = next(each for output, each in signals if output.kind == "sense" and candidate.axis in output.axes)
-    return signal, scales.sense_rms
+    x = without.map_parameters_from(model, fit.x)
+    signals = [
+        signal
+        for r, run in enumerate(model.runs)
+        for output, signal in zip(run.outputs, without.full_signals(x, r), strict=True)
+        if output.kind == "sense" and candidate.axis in output.axes
+    ]
+    return np.concatenate(signals), scales.sense_rms
 
 
 def _motions(fit: Fit, axis: str) -> list[tuple[Array, Array]]:

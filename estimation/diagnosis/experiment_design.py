@@ -126,12 +126,13 @@ def _with_angle(run: Run, axis: str) -> Run:
 def _variations(model: Model, run: Run, axis: str) -> Iterator[tuple[str, Run, float]]:
     """Second recordings: description, recording, and factor of the initial amplitude."""
     drive, scales = model.device.axis(axis).drive, run.scales[axis]
-    if drive is not None and drive.kind == "linear":
-        yield "a recording at half the drive", _scale_drive(run, 0.5, 0.5), 0.5
-    elif scales.voltage_rms <= 1e-6 * abs(scales.voltage_mean):
+    is_linear = drive is not None and drive.kind == "linear"
+    if scales.voltage_rms <= 1e-6 * abs(scales.voltage_mean):
         yield "a ringdown from half the amplitude", run, 0.5
-        if scales.voltage_mean:
+        if scales.voltage_mean and not is_linear:
             yield "a ringdown at 1.5 times the bias", _scale_drive(run, 1.5, 1.5), 1.0
+    elif is_linear:
+        yield "a recording at half the drive", _scale_drive(run, 0.5, 0.5), 0.5
     else:
         yield "a recording at 0.9 of the drive", _scale_drive(run, 0.9, 0.9), 1.0
         yield "a ringdown at the drive's mean voltage", _scale_drive(run, 1.0, 0.0), 1.0

@@ -271,7 +271,7 @@ def parameter_estimates(
             interval = profile_interval(likelihood, fit, index)
             interval = corrected.widen(index, interval) if corrected else interval
             # along nominal values that the recording does not determine, the value may leave the interval of the fit
-            ends = [value, *(parameter.value(end, scales) for end in interval)]
+            ends = [value, *(parameter.value(parameter.possible(end), scales) for end in interval)]
         estimates.append(
             ParameterEstimate(parameter.name, float(value), (float(min(ends)), float(max(ends))), parameter.unit)
         )

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import pi
 
+from estimation.device_fit.data import output_channels
 from estimation.diagnosis.finding import Finding
+from scanner.device import Device
 from scanner.recording import Recording
 
 DELAYS = ("channel-delay", "drive-lag", "readout-lag")
@@ -17,10 +19,14 @@ MAX_RELATIVE_DEVIATION = 0.1
 samples a period the delay of fitted low-pass filters was 4 % below half a sample."""
 
 
-def with_held_drives(findings: Sequence[Finding], recordings: Sequence[Recording]) -> tuple[Finding, ...]:
+def with_held_drives(
+    findings: Sequence[Finding], recordings: Sequence[Recording], device: Device
+) -> tuple[Finding, ...]:
     """The findings, the first delay of an axis with the advice that half a sample of its drive calls for."""
     found = list(findings)
     for axis in dict.fromkeys(finding.axis for finding in findings):
+        if any(len(_outputs(recording, device, axis)) > 1 for recording in recordings):
+            continue  # a late drive delays all channels alike, and neither of them alone
         delays = {i: delay for i, each in enumerate(found) if each.axis == axis and (delay := _delay(each))}
         name = f"drive_{axis}"
         halves = {0.5 / recording[name].sample_rate for recording in recordings if name in recording}
@@ -34,6 +40,11 @@ def with_held_drives(findings: Sequence[Finding], recordings: Sequence[Recording
         )
         found[min(delays)] = replace(first, advice="; ".join(filter(None, (text, first.advice))))
     return tuple(found)
+
+
+def _outputs(recording: Recording, device: Device, axis: str) -> list[str]:
+    """The compared channels that show an axis."""
+    return [name for name, (_, axes) in output_channels(recording, device).items() if axis in axes]
 
 
 def _delay(finding: Finding) -> float:

@@ -167,7 +167,8 @@ def _without(result: SelectionResult, removed: SelectionStep) -> SelectionResult
     final = refit_without(result.likelihood, result.final, removed.candidate) if remaining else result.nominal
 
     def refit(step: SelectionStep) -> SelectionStep:
-        before = refit_without(result.likelihood, final, step.candidate) if len(remaining) > 1 else result.nominal
+        is_only_fitted = len(remaining) == 1 and step.candidate.term.free_parameters
+        before = result.nominal if is_only_fitted else refit_without(result.likelihood, final, step.candidate)
         return replace(step, before=before, after=final)
 
     return replace(result, final=final, steps=tuple(map(refit, remaining)))

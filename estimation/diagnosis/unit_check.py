@@ -53,12 +53,20 @@ def check_units_and_signs(recordings: Sequence[Recording], runs: Sequence[Run], 
             if found is None or found.correlation_square < MIN_CORRELATION_SQUARE:
                 continue
             what = f"has the waveform that the device gives, times {found.factor:.3g}"
-            if not 1.0 / MAX_FACTOR < abs(found.factor) < MAX_FACTOR:
+            is_tone = any(_is_steady_tone(run.inputs[axis]) for axis in output.axes)
+            most = MAX_FACTOR * (max(_resonance_in_widths(device, axis) for axis in output.axes) if is_tone else 1.0)
+            if not 1.0 / most < abs(found.factor) < most:
                 hint = "check the unit and the gain of this channel, and the unit of the drive"
                 raise BadInput(what, file=recording.path, channel=output.name, hint=hint)
-            if found.factor < 0.0 and not any(_is_steady_tone(run.inputs[axis]) for axis in output.axes):
+            if found.factor < 0.0 and not is_tone:
                 hint = "check the sign of this channel, of its gain, and of the drive"
                 raise BadInput(what, file=recording.path, channel=output.name, hint=hint)
+
+
+def _resonance_in_widths(device: Device, axis: str) -> float:
+    """Uncertainty of a resonance in its own widths, 1 at least: by this factor the response to a tone is unknown."""
+    tolerance = max(device.tolerance(axis, key) for key in ("J", "k"))
+    return max(1.0, tolerance * device.axis(axis).quality)
 
 
 def compare(data: Array, signal: Array) -> Comparison | None:

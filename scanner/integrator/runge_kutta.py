@@ -230,8 +230,8 @@ def _integrate(start, voltages, other, t, step, laws, width, results):  # type: 
 
     ``start``: angle, rate and hidden states, shape (motions, 2 + 2 MAX_TERMS_PER_STAGE). ``voltages``: addresses of the
     drives at the nodes of every step, arrays of shape (n, 3): one of each motion, or a single one of all. ``other``: at
-    the nodes, shape (n, 3). ``width``: lanes computed; those beyond the number of motions fill a vector. ``results``: of
-    the two arrays of each motion, with n + 1 places each, shape (motions, 2).
+    the nodes, shape (n, 3). ``width``: lanes computed; those beyond the number of motions fill a vector. ``results``:
+    of the two arrays of each motion, with n + 1 places each, shape (motions, 2).
     """
     half, used, any_term, hidden_states = 0.5 * step, start.shape[0], laws[2] + laws[5] > 0, laws[8]
     electrostatic = laws[7] > 0.0

@@ -35,6 +35,10 @@ from scanner.stages import Readout
 STAGES = ("drive", "mechanics", "capacitance", "readout", "timing", "optics")
 """Stages of the instrument, in the order in which a signal passes them."""
 
+SMALLEST_INVERSE = 1e-3
+"""Smallest x of an inverse parameter at the end of an interval. A corner frequency a thousand times its natural size
+has no effect that a recording shows; an infinite one could not be written as a number."""
+
 AMPLITUDE_KINDS = ("linear", "inverse", "factor")
 """Kinds of parameter that are the size of an effect: the effect vanishes at x = 0."""
 
@@ -116,6 +120,11 @@ class Parameter:
     sign: int = 0
     starts: tuple[float, ...] = (0.0,)
     minimum: float = 0.0
+
+    def possible(self, x: float) -> float:
+        """Return ``x``, or its nearest value that physics allows, at which an inverse parameter is finite."""
+        nearest = SMALLEST_INVERSE if self.kind == "inverse" else 0.0
+        return self.sign * max(self.sign * x, nearest) if self.sign else x
 
     def value(self, x: float, scales: NaturalScales) -> float:
         """Return the physical value for ``x`` in a recording with the given scales."""

@@ -9,12 +9,13 @@ import pytest
 
 from estimation.candidate_terms.curves import CURVE_TERMS
 from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
-from estimation.device_fit.data import prepare_run
-from estimation.device_fit.fit import Likelihood, fit_model
+from estimation.device_fit.data import Run, prepare_run
+from estimation.device_fit.fit import Fit, Likelihood, fit_model, linearise_at
 from estimation.device_fit.initial import flat_whiteners
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis.discrepancy_law import correction_curve, measured_law_table
+from estimation.diagnosis.pruning import with_free_parameters
 from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, simulate_axis
 from scanner.recording import Recording
@@ -76,3 +77,60 @@ def test_the_table_of_a_readout_follows_a_fold_over_signals_that_the_recording_d
     signal, error, _ = np.array(curve["points"]).T * run.scales["x"].sense_rms
     assert np.allclose(signal[[0, -1]], np.array([table["lower"][0], table["upper"][0]]) - table["centre"][0])
     assert np.allclose(error, added(signal + table["centre"][0], measured_law(table)[1]), atol=1e-9)
+
+
+def driven_run(size: float = 1.0, seed: int = 4) -> Run:
+    """A tone at half the resonance and its response."""
+    rate, resonance = 5e4, 2 * np.pi * 1e3
+    time = np.arange(5000) / rate
+    drive = size * np.sin(0.5 * resonance * time)
+    sensed = 1.333 * drive + 1e-3 * np.random.default_rng(seed).standard_normal(time.size)
+    channels = {"drive_x": (drive, "V", rate, 0.0), "sense_x": (sensed, "V", rate, 0.0)}
+    return prepare_run(Recording.from_arrays(channels, STAGE), STAGE)
+
+
+RESONANCE = 2 * np.pi * 1e3
+STAGE = Device(
+    "stage",
+    {
+        "x": Axis(
+            Mechanics(1.0, RESONANCE, RESONANCE**2),
+            drive=Drive("linear", RESONANCE**2),
+            readout=Position(1.0, 1e-3),
+            name="x",
+        )
+    },
+)
+
+
+def fit_of(effect: str, names: list[str], *runs: Run) -> Fit:
+    """A fit of some parameters of a discrepancy term, each at its natural size."""
+    model = Model(runs, STAGE, [with_free_parameters(Candidate(DISCREPANCY_TERMS[effect], "x", "sense"), names)])
+    x = np.zeros(len(model.parameters))
+    x[model.indices("term")] = 1.0
+    return linearise_at(Likelihood(runs, flat_whiteners(model)), model, x)
+
+
+@pytest.mark.parametrize(
+    ("effect", "name"), [("free-mechanics", "f21"), ("free-stiffness", "b3"), ("free-drive", "v4")]
+)
+def test_the_curve_of_a_correction_shows_what_was_fitted(effect: str, name: str) -> None:
+    curve = correction_curve(fit_of(effect, [name], driven_run()))
+    assert curve is not None
+    assert max(abs(value) for _, value, _ in curve["points"]) > 0.0
+
+
+def test_a_correction_with_memory_alone_has_no_curve_and_no_table() -> None:
+    fit = fit_of("free-timing", ["m0", "m1"], driven_run())
+    assert correction_curve(fit) is None
+    assert measured_law_table(fit) is None
+    assert measured_law_table(fit_of("free-drive", ["g1"], driven_run())) is None
+
+
+def test_a_table_covers_all_recordings_in_any_order() -> None:
+    weak, strong = driven_run(0.3), driven_run(1.0)
+    tables = [measured_law_table(fit_of("free-drive", ["v3"], *runs)) for runs in ((weak, strong), (strong, weak))]
+    for table in tables:
+        assert table is not None
+        assert table["upper"][0] - table["centre"][0] == pytest.approx(1.0, rel=1e-2)
+    assert tables[0]["coefficients"] == pytest.approx(tables[1]["coefficients"])  # type: ignore[index]

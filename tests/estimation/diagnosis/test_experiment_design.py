@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -12,7 +14,13 @@ from estimation.device_fit.initial import fit_progressively, flat_whiteners, win
 from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.profile_likelihood import Z_95, profile_interval
-from estimation.diagnosis.experiment_design import discrimination_advice, distances_to_rivals, rank_experiments
+from estimation.diagnosis.experiment_design import (
+    _scale_drive,
+    _variations,
+    discrimination_advice,
+    distances_to_rivals,
+    rank_experiments,
+)
 from scanner.terms import catalogue
 from tests.support.bench import DEVICE, STIFFNESS, bench_recording, bench_signals
 
@@ -136,3 +144,11 @@ def test_a_curved_ridge_is_followed_to_both_interval_ends() -> None:
     assert profile_interval(bent, fit, 0) == pytest.approx((1.0 - 0.5 * Z_95, 1.0 + 0.5 * Z_95), rel=1e-3)  # type: ignore[arg-type]
     _, high = profile_interval(bent, fit, 1)  # type: ignore[arg-type]
     assert high == pytest.approx((1.0 + 0.5 * Z_95) ** 2, rel=0.1)
+
+
+def test_a_decay_under_a_linear_drive_of_zero_is_repeated_from_another_amplitude() -> None:
+    run = prepare_run(bench_recording(k3=0.0, seed=6), DEVICE)
+    silent = _scale_drive(run, 0.0, 0.0)
+    scales = {"x": replace(run.scales["x"], voltage_rms=0.0, voltage_mean=0.0)}
+    (only,) = _variations(Model([run], DEVICE), replace(silent, scales=scales), "x")
+    assert only[0] == "a ringdown from half the amplitude"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,3 +75,14 @@ def test_the_diagnosis_lists_it_with_the_measurement_that_separates_them(monkeyp
     assert finding.effect == "cubic-damping"
     assert {"gain-drift", "damping-drift"} <= {rival.effect for rival in finding.rivals}
     assert "record another amplitude" in str(finding.advice)
+
+
+@pytest.mark.parametrize(("size", "driven"), [(1e-4, False), (1.0, True)])
+def test_the_noise_of_a_recorded_drive_does_not_drive(size: float, driven: bool) -> None:
+    linear = replace(NOMINAL, drive=Drive("linear", RATE**2))
+    device, free = Device("lever", {"x": linear}), decay(0.2)
+    drive = size * np.random.default_rng(4).standard_normal(free["sense_x"].size)
+    channels = {"sense_x": (free["sense_x"].read(), "V", SAMPLE_RATE, 0.0), "drive_x": (drive, "V", SAMPLE_RATE, 0.0)}
+    assert listed(Recording.from_arrays(channels, device), device=device) == (
+        () if driven else ("gain-drift", "damping-drift")
+    )

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from estimation.diagnosis.diagnose import diagnose
+from estimation.diagnosis.finding import Finding, ParameterEstimate
+from estimation.diagnosis.held_drive import with_held_drives
 from scanner.active_terms import stated_terms
 from scanner.device import Axis, Device
 from scanner.forward_model import DriveInput, sense_signal, simulate_axis
@@ -46,3 +48,16 @@ def test_a_delay_of_half_a_sample_of_the_drive_is_that_of_a_converter(rate: floa
     advice = findings[0].advice or ""
     assert ("holds drive_x" in advice) == held
     assert (f"{0.5e6 / rate:.3g} µs" in advice) == held
+
+
+def test_a_delay_of_one_of_two_channels_is_not_that_of_a_converter() -> None:
+    """A late drive delays both."""
+    rate, values = 4e4, np.zeros(100)
+    delay = ParameterEstimate("delay", 0.5 / rate, (0.4 / rate, 0.6 / rate), "s")
+    finding = Finding("x", "timing", "channel-delay", "", (delay,), "", 1.0, (), {}, "sense", "")
+    channels = {name: (values, unit, rate, 0.0) for name, unit in (("drive_x", "V"), ("sense_x", "V"))}
+    (alone,) = with_held_drives([finding], [Recording.from_arrays(channels, DEVICE)], DEVICE)
+    channels["angle_x"] = (values, "rad", rate, 0.0)
+    (beside,) = with_held_drives([finding], [Recording.from_arrays(channels, DEVICE)], DEVICE)
+    assert "holds drive_x" in (alone.advice or "")
+    assert beside.advice is None

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import chirp, lsim
 
 from estimation.device_fit.data import prepare_run
-from estimation.diagnosis.unit_check import check_units_and_signs
+from estimation.diagnosis.unit_check import _resonance_in_widths, check_units_and_signs
 from scanner.arrays import Array
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
@@ -56,3 +56,10 @@ def test_a_steady_tone_shows_no_sign() -> None:
 
 def test_a_device_with_another_resonance_is_accepted() -> None:
     check(SWEEP, 1000.0, device(0.9 * RESONANCE))
+
+
+def test_the_size_of_the_response_to_a_tone_is_as_uncertain_as_the_resonance() -> None:
+    """At Q = 10 000, a stiffness 2 % off, its tolerance, changes the response to a tone at the resonance 200 times."""
+    nominal = Axis(Mechanics(1.0, RESONANCE / 1e4, RESONANCE**2), Drive("linear", 1.0), Position(1.0, 1.0), name="x")
+    assert _resonance_in_widths(Device("d", {"x": nominal}), "x") == pytest.approx(200.0)
+    assert _resonance_in_widths(device(), "x") == 1.0
