@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.candidate_terms.discrepancy import is_discrepancy
+from estimation.device_fit.data import sense_channel
 from estimation.device_fit.fit import Fit
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.posterior import draw_parameters
@@ -18,6 +19,7 @@ from scanner.forward_model import AxisTrajectory, apply_channel_terms, effective
 from scanner.integrator.abi import nominal_values
 from scanner.integrator.nodes import nodes_to_samples
 from scanner.integrator.trajectories import CapacitanceTerm
+from scanner.stages import Readout
 
 CURVE_SAMPLES = 4000
 """Number of times of the run at which the change by an effect is evaluated: a hundred per bin of its curve."""
@@ -97,6 +99,43 @@ def _timing_curve(
 
 
 @dataclass(frozen=True)
+class _MotionWithout:
+    """The fitted motion without an effect.
+
+    Attributes:
+        axis: name of the axis of the effect.
+        motions: by name of the axes that the sense channel of ``axis`` shows, ``axis`` among them.
+        readout: of that channel, with nominal values; None where the device states none.
+    """
+
+    axis: str
+    motions: Mapping[str, AxisTrajectory]
+    readout: Readout | None
+
+    @property
+    def trajectory(self) -> AxisTrajectory:
+        """Of the axis of the effect."""
+        return self.motions[self.axis]
+
+    def sense(self, readout: Readout, trajectory: AxisTrajectory) -> Array:
+        """The sense channel with another trajectory of the axis, shape (n + 1,) [V]."""
+        return sense_signal(readout, list({**self.motions, self.axis: trajectory}.values()))
+
+
+def _motion_without(fit: Fit, candidate: Candidate, run_index: int) -> _MotionWithout:
+    """The fitted motion of one run, in which other terms than the candidate's act."""
+    model, trajectories = fit.model, fit.model.trajectories(run_index, fit.x)
+    channel = sense_channel(model.device, candidate.axis)
+    sensed = {name: each for name, each in trajectories.items() if sense_channel(model.device, name) == channel}
+    trajectory = trajectories[candidate.axis]
+    others = tuple(active for active in trajectory.active_terms if active.term is not candidate.term)
+    nominal = model.nominal(candidate.axis, fit.x)
+    without = replace(trajectory, axis=with_constants(nominal, others), active_terms=others)
+    readout = model.nominal(next(iter(sensed)), fit.x).readout
+    return _MotionWithout(candidate.axis, {**sensed, candidate.axis: without}, readout)
+
+
+@dataclass(frozen=True)
 class _Representation:
     """Representation of a change d(t) by a coefficient c: d = c(variable) · regressor.
 
@@ -133,11 +172,8 @@ def _state_curve(
     fit: Fit, candidate: Candidate, values: Callable[[Array], tuple[float, ...]], run_index: int
 ) -> EffectCurve | None:
     """The change by an effect over the variable that explains most of its variance."""
-    trajectory = fit.model.trajectories(run_index, fit.x)[candidate.axis]
-    other_terms = tuple(active for active in trajectory.active_terms if active.term is not candidate.term)
-    nominal = fit.model.nominal(candidate.axis, fit.x)
-    without = replace(trajectory, axis=with_constants(nominal, other_terms), active_terms=other_terms)
-    size = trajectory.angle.size
+    without = _motion_without(fit, candidate, run_index)
+    size = without.trajectory.angle.size
     samples = np.linspace(0, size - 1, min(CURVE_SAMPLES, size)).astype(np.intp)
 
     def change(x: Array) -> Array:
@@ -159,23 +195,25 @@ def _state_curve(
     return EffectCurve(x[not_empty], y[not_empty], band, representation.x_label, representation.y_label)
 
 
-def _representations(without: AxisTrajectory, candidate: Candidate, samples: NDArray[np.intp]) -> list[_Representation]:
+def _representations(without: _MotionWithout, candidate: Candidate, samples: NDArray[np.intp]) -> list[_Representation]:
     """Plain curves first, then time-dependent coefficients, whose regressor is not constant."""
-    time, angle, rate = without.drive.time[samples], without.angle[samples], without.rate[samples]
+    motion = without.trajectory
+    time, angle, rate = motion.drive.time[samples], motion.angle[samples], motion.rate[samples]
     ones, quantity = np.ones(samples.size), _changed_quantity(candidate)
     variables = {"angle (mrad)": 1e3 * angle, "rate (rad/s)": rate, "time (ms)": 1e3 * time}
-    variables["voltage (V)"] = without.voltage[samples]
-    if candidate.term.coupled and without.other is not None:
-        variables["angle of the other axis (mrad)"] = 1e3 * without.other.angle[samples]
+    variables["voltage (V)"] = motion.voltage[samples]
+    if candidate.term.coupled and motion.other is not None:
+        variables["angle of the other axis (mrad)"] = 1e3 * motion.other.angle[samples]
     modulations = {}
     if candidate.term.torque is not None:
-        mechanics = without.axis.require_mechanics()
+        mechanics = motion.axis.require_mechanics()
         modulations["change of stiffness (%)"] = angle, -100.0 / mechanics.k
         modulations["change of damping (%)"] = rate, -100.0 / mechanics.b
-    elif candidate.term.output is not None and not candidate.channel.startswith("angle") and without.axis.readout:
-        level = sense_signal(without.axis.readout, [without])[samples]
+    elif candidate.term.output is not None and not candidate.channel.startswith("angle") and without.readout:
+        level = without.sense(without.readout, motion)[samples]
         variables = {"level of the sense signal (V)": level} | variables
-        modulations["change of gain (%)"] = level - level.mean(), 100.0
+        modulations["change of gain (%)"] = level, 100.0
+        modulations["change of gain about the mean level (%)"] = level - level.mean(), 100.0
     usable = {name: v for name, v in variables.items() if np.ptp(v) > 1e-9 * np.abs(v).max()}
     plain = [_Representation(name, quantity, v, ones) for name, v in usable.items()]
     products = [_Representation("time (ms)", name, 1e3 * time, r, scale) for name, (r, scale) in modulations.items()]
@@ -207,34 +245,32 @@ def _changed_quantity(candidate: Candidate) -> str:
     return "change of the sense signal (V)"
 
 
-def _change(without: AxisTrajectory, active: ActiveTerm, samples: NDArray[np.intp]) -> NDArray[np.float64]:
+def _change(without: _MotionWithout, active: ActiveTerm, samples: NDArray[np.intp]) -> NDArray[np.float64]:
     """What one effect changes at its stage along a fixed motion, shape of ``samples``."""
-    term, nominal = active.term, nominal_values(without.axis)
+    motion = without.trajectory
+    term, nominal = active.term, nominal_values(motion.axis)
     if term.torque is not None:
-        values, time = np.asarray(active.values, float), without.drive.time
-        other_angle = np.zeros(time.size) if without.other is None else without.other.angle
+        values, time = np.asarray(active.values, float), motion.drive.time
+        other_angle = np.zeros(time.size) if motion.other is None else motion.other.angle
         torque = [
-            term.torque(time[i], without.angle[i], without.rate[i], other_angle[i], without.voltage[i], 0.0, 0.0,
+            term.torque(time[i], motion.angle[i], motion.rate[i], other_angle[i], motion.voltage[i], 0.0, 0.0,
                         values, nominal)[0]
             for i in samples
         ]  # fmt: skip
         return np.array(torque)
     if term.capacitance is not None:
         law = CapacitanceTerm(term.capacitance, active.values)
-        return law.evaluate(without.angle[samples], without.axis)[0]
+        return law.evaluate(motion.angle[samples], motion.axis)[0]
     if term.voltage is not None:
-        change = effective_drive(without.axis, [active], without.drive) - without.drive.voltage
+        change = effective_drive(motion.axis, [active], motion.drive) - motion.drive.voltage
         return nodes_to_samples(change)[samples]
-    changed = replace(
-        without, axis=with_constants(without.axis, [active]), active_terms=(*without.active_terms, active)
-    )
+    changed = replace(motion, axis=with_constants(motion.axis, [active]), active_terms=(*motion.active_terms, active))
     if active.channel.startswith("angle"):
-        after, before = (apply_channel_terms("angle", t.angle, [t], t.axis.readout) for t in (changed, without))
+        after, before = (apply_channel_terms("angle", t.angle, [t], t.axis.readout) for t in (changed, motion))
         return (after - before)[samples]
-    readout = without.axis.readout
-    if readout is None:
+    if without.readout is None:
         return np.zeros(samples.size)
-    return (sense_signal(readout, [changed]) - sense_signal(readout, [without]))[samples]
+    return (without.sense(without.readout, changed) - without.sense(without.readout, motion))[samples]
 
 
 def _bin_indices(variable: Array) -> NDArray[np.intp]:
