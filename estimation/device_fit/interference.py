@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import percentile_filter
 
+from estimation.device_fit.data import Run
 from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.model import Model
 from estimation.device_fit.noise import MEDIAN_TO_MEAN_POWER, near_lines, noise_psd, periodogram
@@ -24,9 +27,51 @@ MIN_LINES_OF_BROAD_DRIVE = 50
 """Number of lines of a drive from which an interfering tone may coincide with one of them. Such a tone is searched
 among the lines of the drive, as a line that exceeds its neighbours in the residual."""
 
+MIN_LINES_OF_DENSE_DRIVE = 200
+"""Number of lines of a drive from which only bins next to a line are excluded: wider intervals would leave none."""
+
 NEIGHBOUR_BINS = 64
 """Bins on either side of a line that it has to exceed. Their median distinguishes it from a resonance of an amplifier,
 which is narrower than a band of the noise spectrum; among the lines of a broad drive it is their 90 % quantile."""
+
+
+@dataclass(frozen=True)
+class _AxisLines:
+    """Lines that an axis causes in a channel.
+
+    Attributes:
+        motion: harmonics of its motion, shape (h,) [Hz].
+        drive: lines of its drive, shape (n,) [Hz].
+        width: excluded on either side of each [Hz].
+    """
+
+    motion: Array
+    drive: Array
+    width: float
+
+    @property
+    def all(self) -> Array:
+        return np.concatenate([self.motion, self.drive])
+
+    @property
+    def is_broad(self) -> bool:
+        """Whether the drive has so many lines that a tone may coincide with one of them."""
+        return self.drive.size > MIN_LINES_OF_BROAD_DRIVE
+
+    def without_broad_drive(self, width: float) -> _AxisLines:
+        """Harmonics of the motion alone, with another width, where the drive is broad; else the same lines."""
+        return _AxisLines(self.motion, self.drive[:0], width) if self.is_broad else self
+
+
+def _axis_lines(run: Run, axis: str, duration: float) -> _AxisLines:
+    motion, drive = run.scales[axis].rate / (2 * np.pi), run.lines[axis]
+    width = max(0.06 * motion, 4.0 / duration) if drive.size < MIN_LINES_OF_DENSE_DRIVE else 4.0 / duration
+    return _AxisLines(motion * np.arange(1.0, MOTION_HARMONICS + 1), drive, width)
+
+
+def _near_any(frequency: Array, known: Sequence[_AxisLines]) -> NDArray[np.bool_]:
+    """Which frequencies lie near a line of an axis, shape of ``frequency``."""
+    return np.any([near_lines(frequency, lines.all, lines.width) for lines in known], axis=0)
 
 
 def strongest_interfering_line(fit: Fit) -> float | None:
@@ -52,19 +97,17 @@ def strongest_interfering_line(fit: Fit) -> float | None:
             power = periodogram(residual - residual.mean())[: output.bins]
             duration = residual.size * output.step
             frequency = np.arange(power.size) / duration
-            motion = run.scales[output.axes[0]].rate / (2 * np.pi)
-            lines = [*(motion * np.arange(1, MOTION_HARMONICS + 1)), *run.lines[output.axes[0]]]
-            width = max(0.06 * motion, 4.0 / duration) if run.lines[output.axes[0]].size < 200 else 4.0 / duration
-            noise = noise_psd(residual, power.size, output.step, lines, width)[0]
+            known = [_axis_lines(run, axis, duration) for axis in output.axes]
+            all_lines, width = np.concatenate([lines.all for lines in known]), max(lines.width for lines in known)
+            noise = noise_psd(residual, power.size, output.step, all_lines, width)[0]
             around = percentile_filter(power, 50, 2 * NEIGHBOUR_BINS + 1) / MEDIAN_TO_MEAN_POWER
             ratio = power / np.maximum(noise, around)
-            ratio[near_lines(frequency, lines, width) | (frequency < 2.5 / duration)] = 0.0
+            ratio[_near_any(frequency, known) | (frequency < 2.5 / duration)] = 0.0
             off_lines = max(off_lines, _strongest(ratio, power, duration))
-            if run.lines[output.axes[0]].size > MIN_LINES_OF_BROAD_DRIVE:
+            if any(lines.is_broad for lines in known):
+                known = [lines.without_broad_drive(4.0 / duration) for lines in known]
                 ratio = power / percentile_filter(power, 90, 2 * NEIGHBOUR_BINS + 1)
-                ratio[
-                    near_lines(frequency, lines[:MOTION_HARMONICS], 4.0 / duration) | (frequency < 2.5 / duration)
-                ] = 0.0
+                ratio[_near_any(frequency, known) | (frequency < 2.5 / duration)] = 0.0
                 among_lines = max(among_lines, _strongest(ratio, power, duration))
     for height, line in (off_lines, among_lines):
         if height > LINE_DETECTION_RATIO:

@@ -30,17 +30,22 @@ def _chi2_reduction_by_time(likelihood: Likelihood, before: Fit, after: Fit) -> 
     return np.bincount(slot, fall, TIME_BINS) / np.maximum(np.bincount(slot, minlength=TIME_BINS), 1)
 
 
-def _chi2_reduction_by_harmonic(likelihood: Likelihood, before: Fit, after: Fit) -> dict[int, float]:
-    """Share of the fall of chi-square around multiples 0 to ``MAX_HARMONIC`` of the motion's frequency."""
+def _chi2_reduction_by_harmonic(likelihood: Likelihood, axis: str, before: Fit, after: Fit) -> dict[int, float]:
+    """Share of the fall of chi-square around multiples 0 to ``MAX_HARMONIC`` of the frequency at which an axis moves.
+
+    It is that of the recordings which contain the axis.
+    """
     reduction = dict.fromkeys(range(MAX_HARMONIC + 1), 0.0)
     first = 0
     for run, whiteners in zip(likelihood.runs, likelihood.whiteners, strict=True):
         for output, whiten in zip(run.outputs, whiteners, strict=True):
             part = slice(first, first + whiten.samples)
             first += whiten.samples
+            if axis not in run.scales:
+                continue
             power = np.abs(np.fft.rfft(before.residual[part])) ** 2 - np.abs(np.fft.rfft(after.residual[part])) ** 2
             frequency = np.arange(power.size) / (output.data.size * output.step)
-            motion = run.scales[output.axes[0]].rate / (2 * np.pi)
+            motion = run.scales[axis].rate / (2 * np.pi)
             nearest = np.rint(frequency / motion).astype(int)
             for n in reduction:
                 reduction[n] += float(power[nearest == n].sum())
@@ -60,7 +65,7 @@ def describe_localisation(likelihood: Likelihood, candidate: Candidate, before: 
     by_time = np.maximum(_chi2_reduction_by_time(likelihood, before, after), 0.0)
     centre = float(by_time @ (np.arange(by_time.size) + 0.5) / by_time.size / max(by_time.sum(), 1e-300))
     when = "throughout" if 0.35 < centre < 0.65 else "mostly early" if centre < 0.5 else "mostly late"
-    harmonics = _chi2_reduction_by_harmonic(likelihood, before, after)
+    harmonics = _chi2_reduction_by_harmonic(likelihood, candidate.axis, before, after)
     top = sorted(harmonics.items(), key=lambda item: -item[1])[:3]
     around = ", ".join(f"{n}f {share:.0%}" for n, share in top if share > 0.05)
     return f"{place}: {shares} of the misfit, {when} (centre at {centre:.0%}), around {around}"

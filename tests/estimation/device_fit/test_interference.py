@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from estimation.device_fit.data import prepare_run
-from estimation.device_fit.fit import Likelihood, fit_model
+from estimation.device_fit.fit import Likelihood, fit_model, linearise_at
 from estimation.device_fit.initial import flat_whiteners
 from estimation.device_fit.interference import strongest_interfering_line
 from estimation.device_fit.model import Model
 from scanner.arrays import Array
 from scanner.recording import Recording
 from tests.support.bench import DEVICE, RESONANCE_HZ, SAMPLE_RATE_HZ, SAMPLES
+from tests.support.simulated import shared_electrode
 
 TIME = np.arange(SAMPLES) / SAMPLE_RATE_HZ
 NOISE_SD = 2e-3
@@ -57,3 +58,19 @@ def test_a_resonance_of_the_amplifier_is_no_tone_and_hides_none(seed: int) -> No
     assert strongest_line(drive, noise) is None
     line = strongest_line(drive, noise + 3e-3 * np.cos(2 * np.pi * 4260.0 * TIME))
     assert line == pytest.approx(4260.0, abs=5.0)
+
+
+@pytest.mark.parametrize(("axis", "multiple", "detected"), [("x", 3, False), ("y", 2, False), ("y", 3.5, True)])
+def test_harmonics_of_both_axes_of_a_shared_channel_are_no_tones(axis: str, multiple: float, detected: bool) -> None:
+    recording, _ = shared_electrode()
+    assert recording.device is not None
+    run = prepare_run(recording, recording.device)
+    model = Model([run], recording.device, mains=())
+    starts = [spec.kind == "start" and spec.name == "angle" for spec in model.parameters]
+    x, output, frequency = np.where(starts, 0.7, 0.0), run.outputs[0], multiple * run.scales[axis].rate / (2 * np.pi)
+    noise = np.random.default_rng(3).normal(0, 1e-3, output.data.size)
+    tone = 5e-3 * np.cos(2 * np.pi * frequency * output.step * np.arange(output.data.size))
+    data = model.outputs(x)[0][0] + noise + tone
+    disturbed = Model([replace(run, outputs=(replace(output, data=data),))], recording.device, mains=())
+    fit = linearise_at(Likelihood(disturbed.runs, flat_whiteners(disturbed)), disturbed, x)
+    assert strongest_interfering_line(fit) == (pytest.approx(frequency, rel=1e-3) if detected else None)

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.fit import Likelihood
+from estimation.device_fit.initial import flat_whiteners
+from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import finding
 from estimation.diagnosis.finding import _advice, beside_imperfections, find_probabilities, parameter_estimates
+from estimation.diagnosis.localisation import describe_localisation
 from scanner.terms import catalogue
+from tests.support.simulated import shared_electrode
 
 
 def step(effect: str, *rivals: tuple[str, float], gain: float = 100.0) -> SimpleNamespace:
@@ -112,3 +120,16 @@ def test_the_interval_contains_the_value_of_the_improved_device(monkeypatch: pyt
     monkeypatch.setattr(finding, "determined_parameters", lambda fit: None)
     (estimate,) = parameter_estimates(SimpleNamespace(runs=()), SimpleNamespace(model=model), delay, None)  # type: ignore[arg-type]
     assert estimate.ci95[0] <= estimate.value <= estimate.ci95[1]
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_misfit_is_located_around_multiples_of_the_frequency_of_its_own_axis(axis: str) -> None:
+    recording, _ = shared_electrode()
+    assert recording.device is not None
+    run = prepare_run(recording, recording.device)
+    likelihood = Likelihood([run], flat_whiteners(Model([run], recording.device, mains=())))
+    ((whiten,),), output = likelihood.whiteners, run.outputs[0]
+    tone = 5e-2 * np.cos(2 * run.scales[axis].rate * output.step * np.arange(output.data.size))
+    before, after = (SimpleNamespace(residual=whiten(size * tone), penalty=0.0) for size in (1.0, 0.0))
+    candidate = Candidate(catalogue()["cubic-stiffness"], axis, "sense")
+    assert describe_localisation(likelihood, candidate, cast(Any, before), cast(Any, after)).endswith("around 2f 100%")
