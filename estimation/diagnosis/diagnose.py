@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 from estimation.candidate_terms.significance import residual_is_noise
-from estimation.device_fit.data import Run, prepare_run
+from estimation.device_fit.data import Run, prepare_run, sense_channel
 from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.further_modes import describe_modes, with_driven_modes
 from estimation.device_fit.hum import describe_strong_hum
@@ -20,6 +21,7 @@ from estimation.diagnosis.remainder_law import with_remainder_law
 from estimation.diagnosis.selection import Progress, SelectionResult, select_terms
 from estimation.diagnosis.shares import (
     best_correction,
+    channel_of_share,
     describe_unexplained,
     find_corrections,
     find_remainder,
@@ -129,19 +131,18 @@ def _diagnose_with_modes(
 ) -> Diagnosis:
     """The diagnosis of prepared recordings, with further modes where they show them."""
     extended = with_driven_modes(runs, nominal)
-    diagnosis = _diagnose_runs(runs, extended, progress, excluded)
+    diagnosis = _diagnose_runs(runs, nominal, extended, progress, excluded)
     if extended is nominal and _leaves_most(diagnosis):
         extended = with_driven_modes(runs, nominal, unexplained=True)
         if extended is not nominal:
-            without_modes, diagnosis = diagnosis, _diagnose_runs(runs, extended, progress, excluded)
+            without_modes, diagnosis = diagnosis, _diagnose_runs(runs, nominal, extended, progress, excluded)
             if not is_worse(open_loop(runs, diagnosis.device), open_loop(runs, without_modes.device)):
                 return without_modes
     if extended is nominal:
         return diagnosis
     nominal_loops = {name: loop.to_json() for name, loop in open_loop(runs, nominal).items()}
     loops = {name: {**both, "nominal": nominal_loops[name]} for name, both in diagnosis.open_loop.items()}
-    modes = describe_modes(runs, nominal, extended)
-    return replace(diagnosis, verdict="mismatch", open_loop=loops, further_modes=modes)
+    return replace(diagnosis, verdict="mismatch", open_loop=loops)
 
 
 def _leaves_most(diagnosis: Diagnosis) -> bool:
@@ -153,21 +154,34 @@ def _leaves_most(diagnosis: Diagnosis) -> bool:
     return bool(diagnosis.findings) and (diagnosis.remainder or {}).get("share", 0.0) >= explained
 
 
-def _diagnose_runs(runs: Sequence[Run], device: Device, progress: Progress, excluded: Collection[str]) -> Diagnosis:
-    """The diagnosis of prepared recordings. Where every selected law is rejected, the others are selected from."""
+def _diagnose_runs(
+    runs: Sequence[Run], nominal: Device, device: Device, progress: Progress, excluded: Collection[str]
+) -> Diagnosis:
+    """The diagnosis of prepared recordings. Where every selected law is rejected, the others are selected from.
+
+    Args:
+        nominal: the stated device.
+        device: the same one, with further modes if the recordings show them.
+    """
+    modes = describe_modes(runs, nominal, device)
+    left = {sense_channel(nominal, axis): 1.0 - of_axis["share"] for axis, of_axis in modes.items()}
     terms: Mapping[str, Term] = {effect: term for effect, term in catalogue().items() if effect not in excluded}
     while True:
         result = select_terms(runs, device, terms, progress)
         progress("prediction of held-out samples, values and shares")
-        diagnosis = build_diagnosis(result)
+        diagnosis = build_diagnosis(result, left)
         if not result.steps or (diagnosis.search and diagnosis.search.steps):
-            return diagnosis
+            return replace(diagnosis, further_modes=modes)
         rejected = {step.candidate.term.effect for step in result.steps}
         terms = {effect: term for effect, term in terms.items() if effect not in rejected}
 
 
-def build_diagnosis(result: SelectionResult) -> Diagnosis:
-    """Verdict, findings and improved device from the result of a selection."""
+def build_diagnosis(result: SelectionResult, left: Mapping[str, float] = MappingProxyType({})) -> Diagnosis:
+    """Verdict, findings and improved device from the result of a selection.
+
+    Args:
+        left: by channel, the fraction of the nominal device's misfit that further modes leave; 1 for other channels.
+    """
     improvement = improve(result)
     result = improvement.search
     corrections = find_corrections(result)
@@ -178,6 +192,14 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
     findings = map_fits(
         lambda step: find_effect(result, step, correction, corrected), result.steps, result.likelihood.steps
     )
+    # The nominal fit of the selection has the further modes already; shares are of the misfit without them.
+    findings = [
+        replace(finding, share=(finding.share or 0.0) * left.get(channel_of_share(result, step), 1.0))
+        for finding, step in zip(findings, result.steps, strict=True)
+    ]
+    remainder = find_remainder(result, correction, improvement.remainder_fit is not None)
+    if remainder is not None:
+        remainder["share"] *= left.get(remainder["channel"], 1.0)
     findings = beside_imperfections(findings, [bool(step.candidate.term.free_parameters) for step in result.steps])
     tension = None if findings else _prior_tension_finding(result.final)
     if tension is not None:
@@ -190,7 +212,7 @@ def build_diagnosis(result: SelectionResult) -> Diagnosis:
         improvement.device,
         result,
         {f"{axis}.{name}": {"pull": pull} for pull, axis, name in _pulls(result.final)},
-        find_remainder(result, correction, improvement.remainder_fit is not None),
+        remainder,
         improvement.to_json(),
         hum=describe_strong_hum(result.final),
         remainder_fit=improvement.remainder_fit,

@@ -67,10 +67,15 @@ def noise_by_channel(likelihood: Likelihood) -> dict[str, float]:
     return {name: float(np.mean(runs)) for name, runs in values.items()}
 
 
-def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
-    """Share that a finding alone explains of the misfit of the channel whose whitened misfit it lowers most."""
+def channel_of_share(result: SelectionResult, step: SelectionStep) -> str:
+    """Name of the channel whose whitened misfit a finding lowers most."""
     reduction = chi2_reduction_by_channel(result.likelihood, step.before, result.final)
-    name, noise = max(reduction, key=lambda key: reduction[key]), noise_by_channel(result.likelihood)
+    return max(reduction, key=lambda key: reduction[key])
+
+
+def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
+    """Share that a finding alone explains of the misfit of :func:`channel_of_share`."""
+    name, noise = channel_of_share(result, step), noise_by_channel(result.likelihood)
     reference = step.before if _is_rail(result, step) else result.nominal
     without, complete, nominal = (misfit_by_channel(fit)[name] for fit in (step.before, result.final, reference))
     return explained_share(without, complete, nominal, noise[name])

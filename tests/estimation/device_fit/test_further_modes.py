@@ -127,6 +127,8 @@ def test_a_diagnosis_states_further_modes_and_the_law_beside_them(monkeypatch: p
     assert diagnosis.findings[0].parameters[0].value == pytest.approx(softening["k3"], rel=0.1)
     modes = diagnosis.further_modes["x"]
     assert modes["share"] > 0.5
+    left = (diagnosis.remainder or {}).get("share", 0.0)
+    assert modes["share"] + sum(finding.share or 0.0 for finding in diagnosis.findings) + left < 1.02
     assert {round(f, 1) for f in modes["frequency"]} >= {3.4, 5.1, 9.0}
     errors = diagnosis.open_loop["sense_x"]
     assert errors["improved"]["rmse"] < 0.2 * errors["nominal"]["rmse"]

@@ -16,8 +16,10 @@ from estimation.device_fit.fit import Likelihood, fit_model, linearise_at
 from estimation.device_fit.initial import flat_whiteners
 from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
+from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import shares
 from estimation.diagnosis.clipping import find_rail
+from estimation.diagnosis.diagnose import build_diagnosis
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 from estimation.diagnosis.shares import (
@@ -31,6 +33,7 @@ from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.stages import Mechanics, Position
+from scanner.terms import catalogue
 from tests.support.bench import DEVICE, bench_recording
 from tests.support.simulated import separate_electrodes
 
@@ -107,6 +110,19 @@ def test_the_share_of_a_rail_and_the_remainder_are_of_the_fit_without_the_rail(m
     remainder = find_remainder(cast(SelectionResult, result), None)
     assert remainder is not None
     assert remainder["share"] == pytest.approx(0.25)
+
+
+def test_shares_beside_further_modes_are_of_the_misfit_of_the_device_without_them() -> None:
+    run = prepare_run(bench_recording(k3=3e-4), DEVICE)
+    candidate = Candidate(catalogue()["cubic-stiffness"], "x", "sense")
+    model = Model([run], DEVICE, [candidate], mains=())
+    likelihood = Likelihood([run], flat_whiteners(model))
+    nominal = fit_model(likelihood, model.with_candidates([]), np.zeros(len(model.parameters) - 1), max_iterations=6)
+    final = fit_model(likelihood, model, model.map_parameters_from(nominal.model, nominal.x))
+    result = SelectionResult(likelihood, nominal, final, (SelectionStep(candidate, nominal, final, ()),))
+    (alone,), (beside,) = build_diagnosis(result).findings, build_diagnosis(result, {"sense_x": 0.25}).findings
+    assert alone.share == pytest.approx(1.0, abs=0.1)
+    assert beside.share == pytest.approx(0.25 * alone.share)
 
 
 def _one_channel(*squares: float) -> dict[str, OpenLoop]:
@@ -197,7 +213,6 @@ def test_a_law_without_a_name_is_written_and_predicts(measured_data: Path) -> No
     from estimation.candidate_terms.discrepancy import DISCREPANCY_TERMS
     from estimation.device_fit.fit import Fit
     from estimation.device_fit.initial import estimate_whiteners, fit_progressively, window_schedule
-    from estimation.device_fit.parameters import Candidate
     from estimation.diagnosis.improvement import improve
 
     (recording,), _, device = ROWS["pendulum-45"](measured_data)
