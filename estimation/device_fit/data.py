@@ -285,7 +285,8 @@ def _scales(device: Device, name: str, inputs: DriveInput, outputs: tuple[Output
     line = strongest_line(voltage, 1 / inputs.step)
     resonance = 2 * np.pi * mechanics.resonance
     parametric = axis.drive is not None and axis.drive.kind == "electrostatic"
-    sensed = next((o for o in outputs if o.kind == "sense" and name in o.axes), outputs[0])
+    shown = [o for o in outputs if name in o.axes]
+    sensed = next((o for o in shown if o.kind == "sense"), shown[0])
     follows = not parametric and 0.8 < strongest_line(sensed.data, 1 / sensed.step) / (line or np.inf) < 1.25
     rate = np.pi * line if parametric and line else 2 * np.pi * line if line else resonance
     if line and not is_steady(line, voltage, 1 / inputs.step):

@@ -1,6 +1,8 @@
-"""Recordings prepared for the fit: the band in which an axis without a noticeable spring is compared."""
+"""Recordings prepared for the fit: the band of an axis without a noticeable spring, and natural scales."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,3 +33,21 @@ def test_the_band_of_an_overdamped_axis_contains_its_fastest_pole() -> None:
 def test_the_fastest_pole_of_an_axis_that_is_not_overdamped_is_its_resonance(quality: float) -> None:
     mechanics = Mechanics(1.0, 10.0 / quality, 100.0)
     assert mechanics.fastest_pole == pytest.approx(mechanics.resonance)
+
+
+def test_the_scales_of_an_axis_without_a_recorded_readout_are_those_of_its_angle() -> None:
+    """A fast axis with a sense signal beside a slow one, far below its resonance, with an angle."""
+    rate, resonance = 50e3, 1e3
+    axis = Axis(
+        Mechanics(1e-9, 1e-6, 1e-9 * (2 * np.pi * resonance) ** 2),
+        drive=Drive("linear", 1e-4),
+        readout=Position(10.0, 1e-3),
+    )
+    time, noise = np.arange(20_000) / rate, np.random.default_rng(0).standard_normal(20_000)
+    fast, slow = np.sin(2 * np.pi * resonance * time), np.cos(2 * np.pi * 20.0 * time)
+    signals = {"drive_x": fast, "drive_y": slow, "sense_x": 0.1 * fast + 1e-3 * noise, "angle_y": 2.5e-3 * slow}
+    channels = {key: (each, "rad" if key == "angle_y" else "V", rate, 0.0) for key, each in signals.items()}
+    device = Device("stage", {"x": replace(axis, name="x"), "y": replace(axis, name="y")})
+    scales = prepare_run(Recording.from_arrays(channels), device).scales["y"]
+    assert scales.rate == pytest.approx(2 * np.pi * 20.0, rel=1e-3)
+    assert scales.sense_rms == pytest.approx(2.5e-3 / np.sqrt(2.0), rel=0.01)
