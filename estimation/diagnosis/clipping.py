@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
-from estimation.device_fit.data import Run
+from estimation.device_fit.data import Output, Run
 from estimation.device_fit.parameters import Candidate
-from estimation.rail import upper_rail
+from estimation.rail import MIN_CLIPPED_SAMPLES, upper_rail
 from scanner.arrays import Array
+from scanner.errors import BadInput
 from scanner.terms import Parameter, Term
 
 SAME_LIMIT = 0.02
@@ -69,15 +71,39 @@ def clipped_readouts(runs: Sequence[Run], saturation: Term | None) -> list[Candi
 
     Args:
         saturation: the catalogue's term; None if saturation is not a candidate.
+
+    Raises:
+        BadInput: a recording exceeds the rail of another: they have different ranges, and no limit is that of both.
     """
     if saturation is None:
         return []
-    by_axis: dict[str, Candidate] = {}
+    recorded: dict[str, list[tuple[str, Output]]] = {}
     for run in runs:
         for output in run.outputs:
-            rail = find_rail(output.full) if output.kind == "sense" else None
-            if rail is not None:
-                fixed = Parameter("limit", "V", lambda scales, limit=rail.limit: limit, kind="fixed")  # type: ignore[misc]
-                term = replace(saturation, parameters=(fixed,), channels=saturation.variants)
-                by_axis.setdefault(output.axes[0], Candidate(term, output.axes[0], rail.channel))
-    return list(by_axis.values())
+            if output.kind == "sense":
+                recorded.setdefault(output.axes[0], []).append((run.name, output))
+    candidates = []
+    for axis, of_axis in recorded.items():
+        _check_ranges(of_axis)
+        rail = find_rail(np.concatenate([output.full for _, output in of_axis]))
+        if rail is not None:
+            candidates.append(_at_rail(saturation, axis, rail))
+    return candidates
+
+
+def _check_ranges(recorded: Sequence[tuple[str, Output]]) -> None:
+    """Refuse recordings of one readout, by their names, of which one lies beyond the rail of another."""
+    for (name, output), side in product(recorded, (1.0, -1.0)):
+        rail = upper_rail(side * output.full)
+        if rail is None:
+            continue
+        limit = rail[0] + SAME_LIMIT * abs(rail[0])
+        beyond = [each for each, o in recorded if np.count_nonzero(side * o.full > limit) >= MIN_CLIPPED_SAMPLES]
+        if beyond:
+            what = f"is clipped at {side * rail[0]:.4g} V in {name}, which {beyond[0]} exceeds"
+            raise BadInput(what, channel=output.name, hint="diagnose recordings of different ranges one by one")
+
+
+def _at_rail(saturation: Term, axis: str, rail: Rail) -> Candidate:
+    fixed = Parameter("limit", "V", lambda scales: rail.limit, kind="fixed")
+    return Candidate(replace(saturation, parameters=(fixed,), channels=saturation.variants), axis, rail.channel)

@@ -18,7 +18,7 @@ from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import OpenLoop, has_larger_error, is_worse, open_loop
 from estimation.device_fit.parameters import Candidate
 from estimation.diagnosis import shares
-from estimation.diagnosis.clipping import find_rail
+from estimation.diagnosis.clipping import clipped_readouts, find_rail
 from estimation.diagnosis.diagnose import build_diagnosis
 from estimation.diagnosis.identifiability import determined_parameters
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
@@ -171,6 +171,25 @@ def test_a_rail_is_detected_from_samples_at_one_value() -> None:
     assert unreached[:2] == (pytest.approx(1.2), "sense")
     assert find_rail(wave) is None
     assert find_rail(np.round(wave * 64) / 64) is None  # a converter's steps are no rail
+
+
+@pytest.mark.parametrize("others_level", [0.8, np.inf])
+@pytest.mark.parametrize("order", [1, -1])
+def test_recordings_of_different_ranges_are_not_diagnosed_together(others_level: float, order: int) -> None:
+    """The limit of one would be that of both."""
+    size = float(np.abs(bench_recording().channels["sense_x"].read()).max())
+    runs = [prepare_run(bench_recording(clip_level=level * size), DEVICE) for level in (0.5, others_level)[::order]]
+    with pytest.raises(BadInput, match=r"sense_x: is clipped at .* V in bench <b>, which bench <b> exceeds"):
+        clipped_readouts(runs, catalogue()["saturation"])
+
+
+def test_recordings_of_one_range_have_its_limit() -> None:
+    """An upper limit that the first recording does not reach is not the lower one where the second lies beyond it."""
+    run, saturation = prepare_run(bench_recording(), DEVICE), catalogue()["saturation"]
+    signals = [np.maximum(run.outputs[0].full + offset, -0.07) for offset in (-0.02, 0.02)]
+    runs = [replace(run, outputs=(replace(run.outputs[0], full=signal),)) for signal in signals]
+    assert [candidate.channel for candidate in clipped_readouts(runs[:1], saturation)] == ["sense"]
+    assert [candidate.channel for candidate in clipped_readouts(runs, saturation)] == ["sense:lower"]
 
 
 def test_gain_and_torque_stay_nominal_where_only_their_product_shows() -> None:
