@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from estimation.device_fit.data import Run
 from estimation.device_fit.fit import Fit
 from estimation.device_fit.posterior import PredictionPhaseError, phase_error, phase_portrait, waveform
 from estimation.diagnosis.diagnose import Diagnosis
@@ -149,25 +150,33 @@ def _improved_fit(diagnosis: Diagnosis, search: SelectionResult) -> Fit:
     return diagnosis.remainder_fit or search.final
 
 
+def _run_names(runs: Sequence[Run]) -> list[str]:
+    """Name of every recording, with a number where several have the same."""
+    names = [run.name for run in runs]
+    return [f"{name} ({names[: r + 1].count(name)})" if names.count(name) > 1 else name for r, name in enumerate(names)]
+
+
 def _phase_errors(search: SelectionResult, improved: Fit) -> dict[str, PredictionPhaseError]:
     """Phase errors of open-loop predictions by recording and axis."""
     errors = {}
-    for r, run in enumerate(search.likelihood.runs):
+    runs = search.likelihood.runs
+    for r, (name, run) in enumerate(zip(_run_names(runs), runs, strict=True)):
         for axis in run.inputs:
             error = phase_error(search.nominal, improved, axis, r)
             if error is not None:
-                errors[f"{run.name}, axis {axis}"] = error
+                errors[f"{name}, axis {axis}"] = error
     return errors
 
 
 def _waveforms(search: SelectionResult, improved: Fit) -> Section:
+    runs = search.likelihood.runs
     figures = [
         waveform_figure(
             waveform(search.nominal, improved, r, channel),
-            f"{run.name}, {output.name}" if len(search.likelihood.runs) > 1 else output.name,
+            f"{name}, {output.name}" if len(runs) > 1 else output.name,
             UNITS.get(output.kind, ""),
         )
-        for r, run in enumerate(search.likelihood.runs)
+        for r, (name, run) in enumerate(zip(_run_names(runs), runs, strict=True))
         for channel, output in enumerate(run.outputs)
     ]
     return Section("Measured and simulated waveforms", figures=figures, least="26rem")
@@ -175,14 +184,14 @@ def _waveforms(search: SelectionResult, improved: Fit) -> Section:
 
 def _residuals(search: SelectionResult, improved: Fit) -> Section:
     figures = []
-    first = 0
-    for run, whiteners in zip(search.likelihood.runs, search.likelihood.whiteners, strict=True):
+    first, runs = 0, search.likelihood.runs
+    for run_name, run, whiteners in zip(_run_names(runs), runs, search.likelihood.whiteners, strict=True):
         for output, whitener in zip(run.outputs, whiteners, strict=True):
             part = slice(first, first + whitener.samples)
             first += whitener.samples
             pair = [search.nominal.residual[part], improved.residual[part]]
             frequency = np.arange(whitener.psd.size) / (output.data.size * output.step)
-            name = f"{run.name}, {output.name}"
+            name = f"{run_name}, {output.name}"
             figures.append(residual_over_time_figure(name, whitener.time * run.duration, pair))
             figures.append(residual_spectrum_figure(name, frequency, pair))
     text = "Differences between recording and simulation, divided by the noise at each frequency: noise alone gives 1."
@@ -191,11 +200,11 @@ def _residuals(search: SelectionResult, improved: Fit) -> Section:
 
 def _portraits(search: SelectionResult, improved: Fit) -> Section:
     pair = (search.nominal.residual, improved.residual)
-    figures = []
-    for r, run in enumerate(search.likelihood.runs):
+    figures, runs = [], search.likelihood.runs
+    for r, (name, run) in enumerate(zip(_run_names(runs), runs, strict=True)):
         for channel, output in enumerate(run.outputs):
             before, after = phase_portrait(search.likelihood, improved, pair, r, channel)
-            caption = f"{run.name}, {output.name}: residual over angle and rate of axis {output.axes[0]}"
+            caption = f"{name}, {output.name}: residual over angle and rate of axis {output.axes[0]}"
             figures.append(portrait_figure(before, after, caption))
     return Section("Residuals over the state of the mirror", figures=figures, least="24rem")
 

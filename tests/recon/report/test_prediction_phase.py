@@ -1,11 +1,14 @@
 """A phase error is stated as a blur where the device has a field of view, and in degrees where it has none."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from estimation.device_fit.posterior import PredictionPhaseError
+from recon.report import diagnosis
 from recon.report.prediction_phase import (
     ANGLE_SCALE,
     PICTURE_SCALE,
@@ -47,3 +50,13 @@ def test_the_largest_error_is_stated_in_the_unit_of_the_device(scale: PhaseError
 def test_an_error_within_its_uncertainty_is_not_stated() -> None:
     assert describe_largest_error({"a, axis x": constant_error(0.001, 0.02)}, PICTURE_SCALE) == ""
     assert describe_largest_error({}, PICTURE_SCALE) == ""
+
+
+def test_recordings_of_one_name_have_their_own_phase_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = [SimpleNamespace(name=name, inputs=dict.fromkeys("xy")) for name in ("scan", "decay", "scan")]
+    search = cast(Any, SimpleNamespace(nominal=None, likelihood=SimpleNamespace(runs=runs)))
+    monkeypatch.setattr(diagnosis, "phase_error", lambda nominal, improved, axis, r: constant_error(float(r), 0.0))
+    errors = diagnosis._phase_errors(search, cast(Any, None))
+    names = [f"{name}, axis {axis}" for name in ("scan (1)", "decay", "scan (2)") for axis in "xy"]
+    assert list(errors) == names
+    assert [error.before[0] for error in errors.values()] == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
