@@ -250,15 +250,18 @@ def _find_gaps(channel: Channel) -> SampleRanges:
 
 
 def _find_clipped_runs(channel: Channel) -> SampleRanges:
-    """Runs of equal samples at the smallest and the largest value of the channel, where these are rails.
+    """Runs of equal samples at the smallest and the largest finite value of the channel, where these are rails.
 
     The steps of a converter give such runs at the peaks of a sine too, which are left out.
     """
     extremes = [np.inf, -np.inf]
     clipped: tuple[SampleRanges, SampleRanges] = ([], [])
     for first, values in _read_chunks(channel):
-        for side, reduce_extreme, is_beyond in ((0, np.fmin, np.less), (1, np.fmax, np.greater)):
-            extreme = float(reduce_extreme.reduce(values))
+        finite = values[np.isfinite(values)]
+        if not finite.size:
+            continue
+        for side, find_extreme, is_beyond in ((0, np.min, np.less), (1, np.max, np.greater)):
+            extreme = float(find_extreme(finite))
             if is_beyond(extreme, extremes[side]):
                 extremes[side] = extreme
                 clipped[side].clear()

@@ -23,3 +23,14 @@ def test_short_runs_at_the_rail_are_clipped(step_v: float, rail_v: float, expect
     device = Device.from_toml(readout)
     defects = find_defects(Recording.from_arrays(channels, device), device)
     assert any(each.kind == "clipped" for each in defects) == expected
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("rail_v", [1.0, -1.0])
+def test_a_sample_that_is_not_finite_hides_no_rail(value: float, rail_v: float) -> None:
+    volts = np.sin(2 * np.pi * FREQUENCY_HZ * TIME + 0.3)
+    volts = np.minimum(volts, 0.9) if rail_v > 0 else np.maximum(volts, -0.9)
+    volts[5000] = value
+    channels = {"sense_x": (volts, "V", RATE_HZ), "intensity": (np.ones(TIME.size), "V", RATE_HZ)}
+    device = Device.from_toml('[x.readout]\nkind = "position"\ngain = 20.0\nnoise_sd = 1e-3\n')
+    assert {each.kind for each in find_defects(Recording.from_arrays(channels, device), device)} == {"gap", "clipped"}
