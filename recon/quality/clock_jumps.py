@@ -129,7 +129,10 @@ def mark_path_during_jumps(motion: Motion, jumps: Sequence[Defect], grid: Grid) 
 
 
 def _extrapolated_angle(axis: AxisMotion, time: Array) -> Array:
-    """Angles [rad] before the first or after the last sample of a motion, by a sine fitted to the nearest cycles."""
+    """Angles [rad] before the first or after the last sample of a motion, by a sine fitted to the nearest cycles.
+
+    Samples of unknown angle are left out of the fit. The sine is NaN where all of them are unknown.
+    """
     track, behind = axis.angle, time[0] > axis.angle.start
     omega = 2 * np.pi * axis.frequency[-1 if behind else 0]
     count = min(track.size, round(CYCLES_PER_PHASE * 2 * np.pi / omega * track.sample_rate))
@@ -139,7 +142,11 @@ def _extrapolated_angle(axis: AxisMotion, time: Array) -> Array:
         return np.stack([np.ones_like(at), np.cos(omega * at), np.sin(omega * at)], -1)
 
     near = track.start + np.arange(first, first + count) / track.sample_rate
-    coefficients = np.linalg.lstsq(basis(near - near[0]), track.read(first, first + count), rcond=None)[0]
+    angle = track.read(first, first + count)
+    known = np.isfinite(angle)
+    if not known.any():
+        return np.full(time.size, np.nan)
+    coefficients = np.linalg.lstsq(basis(near - near[0])[known], angle[known], rcond=None)[0]
     return np.asarray(basis(time - near[0]) @ coefficients, np.float64)
 
 
