@@ -69,12 +69,19 @@ def describe_pulsed_light(beam: Motion, intensity: Channel, grid: Grid) -> list[
 def _dark_samples(values: Array) -> Mask:
     """Which samples of a period are dark in all parts, none where others are in each; shape (samples,).
 
+    Samples of which most values are missing do not count as dark.
+
     Args:
-        values: shape (parts, periods, samples, detectors).
+        values: shape (parts, periods, samples, detectors); missing ones are not finite.
     """
+    known = np.isfinite(values)
+    number = np.maximum(known.sum(axis=1, keepdims=True), 1)
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged samples
-        scatter = values.std(axis=1).max(axis=-1)
-    dark = scatter < QUIET_SD_SHARE * scatter.max(axis=1, keepdims=True)  # not where a sample is missing: NaN
+        mean = np.where(known, values, 0.0).sum(axis=1, keepdims=True) / number
+        squares = np.where(known, values - mean, 0.0) ** 2
+        scatter = np.sqrt(squares.sum(axis=1) / number[:, 0]).max(axis=-1)
+    mostly_known = (known.mean(axis=1) > 0.5).any(axis=-1)  # the scatter of few samples is small by chance
+    dark = mostly_known & (scatter < QUIET_SD_SHARE * scatter.max(axis=1, keepdims=True))
     return np.asarray(dark[0] & (dark == dark[0]).all())
 
 

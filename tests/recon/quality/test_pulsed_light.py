@@ -10,7 +10,7 @@ from tests.support.two_axis_scan import FIELD, HALF_RAD, RATE_HZ, READOUTS, angl
 LINE = "the light is pulsed"
 
 
-def limits(lit: np.ndarray, between: float) -> list[str]:
+def limits(lit: np.ndarray, between: float | np.ndarray) -> list[str]:
     values = np.where(lit, light(1), between)
     result = reconstruct({**sensors(1), "intensity": (values, "V", RATE_HZ)}, READOUTS + FIELD)
     return [limit for limit in result.limits if LINE in limit]
@@ -21,6 +21,13 @@ def test_dark_samples_between_pulses_are_named(period: int, lit: tuple[int, ...]
     is_lit = np.isin(np.arange(light(1).size) % period, lit)
     (line,) = limits(is_lit, 0.0)
     assert line.startswith(f"intensity: {period - len(lit)} of every {period} samples ")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e5])
+def test_a_missing_sample_or_an_electric_pulse_hides_no_pulsed_light(value: float) -> None:
+    is_lit = np.arange(light(1).size) % 4 < 2
+    (line,) = limits(is_lit, np.where(np.arange(is_lit.size) == 102, value, 0.0))
+    assert line.startswith("intensity: 2 of every 4 samples ")
 
 
 @pytest.mark.parametrize("seed", range(6))
