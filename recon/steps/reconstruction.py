@@ -112,7 +112,7 @@ class Reconstruction:
             the uncertainty of the readout's phase, which that of ``motion`` contains. Empty where no readout's phase
             was searched.
         intensity_drift: drift that was removed, by detector; empty unless it was asked for.
-        sample_motion: motion of the sample; None unless it was asked for and the scan has crossings.
+        sample_motion: motion of the sample; None unless it was asked for and can be determined.
         evaluation: estimate against the truth, by axis; empty without a truth.
         truth: of a simulation; None without one.
         defects: clock jumps, gaps, clipping and missing parts of the recording.

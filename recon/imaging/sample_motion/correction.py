@@ -58,7 +58,7 @@ class SampleAngle(DerivedAngle):
 
 
 def measure_sample_motion(beam: Motion, intensity: Channel, grid: Grid, unlocated: SampleRanges) -> SampleMotion | None:
-    """Motion of the sample; None where the scan has too few crossings.
+    """Motion of the sample; None where the scan has too few crossings, or the picture too few rows or columns.
 
     Args:
         beam: motion whose angles are on the intensity's clock.
@@ -132,7 +132,10 @@ def relative_to_sample(beam: Motion, motion: SampleMotion | None, grid: Grid) ->
 def describe_sample_motion(motion: SampleMotion | None, sample_rate: float) -> str:
     """What a reader has to know of the motion that was removed, in a line; sample rate of the intensity [Hz]."""
     if motion is None:
-        return "sample motion: the scan crosses itself too rarely to determine one; nothing was removed"
+        return (
+            "sample motion: the scan crosses itself too rarely, or the picture has too few rows or columns, to "
+            "determine one; nothing was removed"
+        )
     left = ""
     if motion.left.any():
         left = "; a motion of {:.2g} x {:.2g} pixels rms (x, y) beside it could not be followed".format(*motion.left)

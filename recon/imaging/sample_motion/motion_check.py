@@ -18,7 +18,7 @@ from recon.imaging.sample_motion.block_equations import PARTS, PlacedSamples
 from recon.imaging.sample_motion.correction import cell_width, cells, read_samples
 from recon.imaging.sample_motion.motion_smoother import part_shift
 from recon.imaging.sample_motion.residual import remaining_motion_variance
-from recon.imaging.sample_motion.rigid_motion import MIN_BLOCKS, estimate_sample_motion
+from recon.imaging.sample_motion.rigid_motion import MIN_BLOCKS, MIN_CELLS_ACROSS, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from scanner.channel import Channel
 from scanner.device import AXES
@@ -62,7 +62,9 @@ def describe_unremoved_motion(
     parts = [(first * length, (first + 1) * length) for first in range(0, blocks, step)]
     cell = cell_width(grid, len(parts) * length, CHECKED_CELLS_ACROSS)
     samples, shape = read_samples(beam, intensity, grid, cell, unlocated, parts), cells(grid, cell)
-    if len(parts) < MIN_BLOCKS or not _disagrees_with_rest(samples, len(parts), length, shape):
+    if len(parts) < MIN_BLOCKS or min(shape) < MIN_CELLS_ACROSS:
+        return []
+    if not _disagrees_with_rest(samples, len(parts), length, shape):
         return []
     motion = estimate_sample_motion(samples, period, shape, widths=(CHECK_WIDTH,))
     if motion is None or not motion.moving:

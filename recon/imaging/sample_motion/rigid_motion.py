@@ -21,7 +21,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.imaging.sample_motion.block_equations import PARTS, PlacedSamples, block_equations, sample_log_likelihoods
+from recon.imaging.sample_motion.block_equations import (
+    PARTS,
+    PLACE_PX,
+    PlacedSamples,
+    block_equations,
+    sample_log_likelihoods,
+)
 from recon.imaging.sample_motion.coarse_search import search_motion
 from recon.imaging.sample_motion.jumps import MotionKnots, place_jumps
 from recon.imaging.sample_motion.motion_smoother import SmoothedMotion, part_shift, smooth_motion
@@ -48,6 +54,10 @@ for the two variances of the walk (Wilks 1938)."""
 
 MIN_BLOCKS = 16
 """Least number of blocks: with fewer the noise of the equations is not known."""
+
+MIN_CELLS_ACROSS = 2 * PLACE_PX
+"""Least number of rows and of columns of cells: with less than two places across, sums over places are of too few to
+determine a variance. In pictures of 4 to 8 rows some samples at rest had one."""
 
 MIN_INFORMATION = 1e-8
 """Information on a position in a scene without structure [1/px²]: the field is narrower than 10^4 pixels."""
@@ -94,7 +104,7 @@ class SampleMotion:
 def estimate_sample_motion(
     samples: PlacedSamples, period: float, shape: tuple[int, int], widths: Sequence[float] = WIDTHS_PX
 ) -> SampleMotion | None:
-    """Estimate the motion of the sample; None where the scan has too few crossings.
+    """Estimate the motion of the sample; None where the scan has too few crossings or cells across.
 
     Args:
         samples: of the scan.
@@ -105,7 +115,7 @@ def estimate_sample_motion(
     part = max(round(period / PARTS), 1)
     length = part * PARTS
     blocks = -(-samples.x.size // length)
-    if blocks < MIN_BLOCKS:
+    if blocks < MIN_BLOCKS or min(shape) < MIN_CELLS_ACROSS:
         return None
     position = np.zeros((blocks, 2))
     at_rest = part_shift(position, [])

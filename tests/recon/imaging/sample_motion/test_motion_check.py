@@ -16,7 +16,9 @@ def scene(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.3 + 0.1 * x + sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * w * w)) for a, b, w in spots)
 
 
-def reconstruct(x_px: float, y_px: float, **options: bool) -> Reconstruction:
+def reconstruct(
+    x_px: float, y_px: float, pixels: tuple[int, int] = (PIXELS, PIXELS), **options: bool
+) -> Reconstruction:
     """A recording with angle channels of a sample that drifts by so many pixels during the scan."""
     time = np.arange(round(RATE * DURATION)) / RATE
     x, y = (np.sin(2 * np.pi * f * time) for f in (2011.0, 837.0))
@@ -28,7 +30,7 @@ def reconstruct(x_px: float, y_px: float, **options: bool) -> Reconstruction:
         f"[scan]\nhalf_angle_x = {HALF_ANGLE}\nhalf_angle_y = {HALF_ANGLE}\n"
     )
     recording = lissajous.Recording.from_arrays({**angles, "intensity": (counts, "counts", RATE)}, device)
-    return lissajous.reconstruct(recording, pixels=(PIXELS, PIXELS), **options)
+    return lissajous.reconstruct(recording, pixels=pixels, **options)
 
 
 @pytest.mark.parametrize(("x_px", "y_px"), [(6.0, -3.0), (0.0, 0.0), (0.0, 0.3)])
@@ -46,6 +48,14 @@ def test_a_motion_beyond_the_tolerance_is_a_limit_of_the_picture(x_px: float, y_
 
 def test_a_motion_that_is_removed_is_no_limit() -> None:
     assert reconstruct(6.0, -3.0, sample_motion=True).limits == []
+
+
+@pytest.mark.parametrize("pixels", [(128, 1), (500, 5), (2, 128), (1, 1), (3, 3), (8, 8)])
+def test_a_picture_of_few_rows_or_columns_shows_no_motion(pixels: tuple[int, int]) -> None:
+    assert not any("the sample moves" in limit for limit in reconstruct(6.0, -3.0, pixels).limits)
+    result = reconstruct(6.0, -3.0, pixels, sample_motion=True)
+    assert result.sample_motion is None
+    assert any("too few rows or columns" in note for note in result.notes)
 
 
 def test_residuals_without_noise_have_a_variance() -> None:
