@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from recon.imaging.picture_kinds.held_out import SplitSums, held_out_ranges, hol
 from recon.imaging.picture_kinds.kernel_picture import PictureEstimate, choose_width, kernel_image, kernel_picture
 from recon.imaging.picture_kinds.recursive_frames import CarriedFrames, recursive_picture
 from recon.imaging.pixel_noise import SampleNoise, pixel_sd
+from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.motion import Motion
@@ -57,7 +58,7 @@ class EstimatedPicture:
         resolution_px: distance between independent values [px]; None for a picture of means.
         notes: what a reader has to know of the picture, a line each.
         limits: reasons why it does not show the scene, or only a part, a line each.
-        carried: what the next frame can use of this one, by detector; empty for a kind whose frames are independent.
+        carried: what the next frame can use of this one, by detector; None where its frames are independent.
     """
 
     picture: Picture
@@ -66,7 +67,7 @@ class EstimatedPicture:
     resolution_px: float | None = None
     notes: list[str] = field(default_factory=list)
     limits: list[str] = field(default_factory=list)
-    carried: Sequence[CarriedFrames] = ()
+    carried: Sequence[CarriedFrames | None] = ()
 
     @property
     def sd_picture(self) -> Picture:
@@ -150,8 +151,7 @@ def picture_of_sums(
     if not np.isfinite(image).all():
         empty = percent(float(np.mean(np.isnan(image))))
         notes.append(f"{empty} of the pixels are too far from any sample and have no value")
-    following = [each for each in carry if each is not None]
-    return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes, limits, following)
+    return EstimatedPicture(replace(means, image=image), sd, share, resolution, notes, limits, carry)
 
 
 def picture_without_sd(
@@ -189,7 +189,13 @@ def kernel_widths(means: Picture, held: Picture, noise: Sequence[SampleNoise | N
 def _estimate_detector(
     kind: str, samples: SplitSums, noise: SampleNoise | None, before: CarriedFrames | None, width: float | None
 ) -> tuple[PictureEstimate, CarriedFrames | None]:
-    """Estimate of one detector, and what the next frame takes over."""
+    """Estimate of one detector, and what the next frame takes over; that of a constant detector is its level."""
+    visited = samples.counts > 0
+    level = _constant_level(samples.sums[visited] / samples.counts[visited], samples.counts[visited])
+    if level is not None:
+        variance = np.nan if noise is None else float(noise.variance(np.asarray(level)))
+        sd = np.sqrt(variance / np.maximum(samples.counts, 1.0))
+        return PictureEstimate(np.full(visited.shape, level), sd, visited.astype(np.float64), 0.0), None
     assert noise is not None
     if kind == "kernel":
         return kernel_picture(samples, noise, width), None
@@ -210,15 +216,22 @@ def _check_determined(
     if _lies_on_one_line(means):
         hint = "check the motion of both axes or use --picture mean"
         raise BadInput(f"{ONE_LINE}, which determines no picture", channel="intensity", hint=hint)
-    hint = "use --picture mean"
-    for samples, sample in zip(detectors, noise, strict=True):
-        values = samples.sums[samples.counts > 0] / samples.counts[samples.counts > 0]
-        if np.ptp(values) == 0.0:
-            what = f"every sample is {values[0]:g}: there is nothing to estimate"
-            raise BadInput(what, channel="intensity", hint=hint)
-        if sample is None or not samples.held_counts.any():
+    hint, counts = "use --picture mean", means.coverage[means.coverage > 0].astype(np.float64)
+    values = means.image[means.coverage > 0].reshape(counts.size, -1).T
+    levels = [_constant_level(each, counts) for each in values]
+    if None not in levels:
+        what = f"every sample is {levels[0]:g}: there is nothing to estimate"
+        raise BadInput(what, channel="intensity", hint=hint)
+    for samples, sample, level in zip(detectors, noise, levels, strict=True):
+        if level is None and (sample is None or not samples.held_counts.any()):
             what = f"the scan is too short for --picture {kind}: too few pixels were visited twice to measure the noise"
             raise BadInput(what, channel="intensity", hint=f"record longer, ask for fewer pixels or {hint}")
+
+
+def _constant_level(values: NDArray[Any], counts: Array) -> float | None:
+    """Mean of pixels' means that differ by rounding alone, both of shape (n,); None of others."""
+    mean = float(np.average(values, weights=counts))
+    return mean if np.allclose(values, mean, rtol=FLOAT32_RELATIVE_ERROR, atol=0.0) else None
 
 
 def _split_sums(means: Picture, held: Picture) -> list[SplitSums]:
@@ -258,9 +271,9 @@ def _describe_flat(means: Picture, noise: Sequence[SampleNoise | None]) -> list[
     names = detector_names(means.detectors, len(values))
     lines = []
     for name, detector, sample in zip(names, values, noise, strict=True):
-        mean = float(np.average(detector, weights=counts))
-        if np.allclose(detector, mean, rtol=FLOAT32_RELATIVE_ERROR, atol=0.0):
-            lines.append(f"{name}: every sample is {mean:g}: the picture shows nothing; check the detector")
+        level, mean = _constant_level(detector, counts), float(np.average(detector, weights=counts))
+        if level is not None:
+            lines.append(f"{name}: every sample is {level:g}: the picture shows nothing; check the detector")
             continue
         if sample is None or not (variance := float(sample.variance(np.asarray(mean)))) > 0:
             continue

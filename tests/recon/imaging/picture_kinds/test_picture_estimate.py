@@ -139,6 +139,25 @@ def test_several_detectors_are_estimated_each_by_itself() -> None:
     )
 
 
+@pytest.mark.parametrize("kind", ["kernel", "posterior"])
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_a_constant_detector_is_named_beside_the_picture_of_another_one(kind: str, level: float) -> None:
+    motion, recording = scan(discs(), 20.0, 0.003)
+    one = recording["intensity"].read()
+    both = Recording.from_arrays({"intensity": (np.column_stack([one, np.full(one.size, level)]), "1", RATE_HZ)})
+    estimated, alone = estimate(kind, motion, both), estimate(kind, motion, recording)
+    np.testing.assert_allclose(estimated.picture.image[..., 0], alone.picture.image)
+    np.testing.assert_allclose(estimated.picture.image[..., 1], level)
+    assert estimated.resolution_px == alone.resolution_px
+    assert estimated.limits == [
+        f"intensity, detector 1: every sample is {level:g}: the picture shows nothing; check the detector"
+    ]
+    channel, grid = both["intensity"], GRID
+    means, noise = grid_intensity(motion, channel, grid, []), measure_noise(motion, channel, grid)
+    following = estimate_picture(kind, means, noise, motion, channel, [], before=estimated)
+    np.testing.assert_allclose(following.picture.image[..., 1], level)
+
+
 def test_a_picture_of_samples_with_gaps_has_values() -> None:
     """A sample at the edge of a pixel may fall into its neighbour where a part of the scan is gridded."""
     motion, recording = scan(discs(), 20.0, 0.005)
