@@ -14,11 +14,13 @@ showed gains that rise by 120 % or fall by 70 %, where there was none."""
 
 
 def is_revisited(cell: NDArray[np.integer], time: Array) -> bool:
-    """Whether samples of one cell of the field were taken at times that are far apart.
+    """Whether samples of one cell of the field were taken at times that are far apart; False without any sample.
 
     Args:
         cell: number of the cell of each sample, shape (n,).
         time: of each sample, in any unit, shape (n,).
     """
+    if not cell.size:
+        return False
     visited = np.bincount(cell, time) / np.maximum(np.bincount(cell), 1)
     return bool(np.var(time - visited[cell]) >= MIN_TIME_SHARE * np.var(time))

@@ -1,5 +1,7 @@
 """A drift of the detector is estimated where the scan comes back, and not where every place is visited once."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -23,6 +25,12 @@ def spiral(radius: np.ndarray) -> np.ndarray:
 OPENING = spiral(TIME / TIME[-1])
 TWICE = spiral(np.abs(4.0 * TIME / TIME[-1] % 2.0 - 1.0))
 LISSAJOUS = pixels(np.sin(2 * np.pi * 5450.0 * TIME), np.sin(2 * np.pi * 6700.0 * TIME))
+
+
+def test_a_scan_outside_the_field_comes_back_nowhere() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not is_revisited(LISSAJOUS[:0], TIME[:0])
 
 
 @pytest.mark.parametrize(("pixel", "expected"), [(OPENING, False), (TWICE, True), (LISSAJOUS, True)])
