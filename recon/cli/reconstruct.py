@@ -97,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=parse_whole,
         default=0,
         metavar="PX",
-        help="fill holes up to PX pixels wide, marked in fill.tif (0: none)",
+        help="fill unvisited pixels with a visited one at most PX rows and columns away, marked in fill.tif (0: none)",
     )
     parser.add_argument(
         "--allow-outside", action="store_true", help="make the picture although most samples lie outside the field"

@@ -38,7 +38,8 @@ class Options:
         flips: axes whose sign is inverted.
         picture: how a pixel's value is found: "mean" of its samples, "kernel"-weighted mean with the samples around, or
             "posterior" mean under a smoothness prior.
-        fill_radius: holes up to this many pixels are filled and marked as filled; 0 fills none.
+        fill_radius: unvisited pixels at most so many rows and columns from a visited one are filled and marked as
+            filled, thus holes up to twice as wide wholly; 0 fills none.
         spot: standard deviation of the beam's spot [px] for the account of the blur. A recording does not contain it.
         allow_outside: make the picture although most samples lie outside the field of view.
         sense_only: keep the phase of the estimator, without the correction by the phase error that the picture shows.

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import binned_statistic_2d
 
+from recon.cli import main
 from recon.imaging.coverage import fill_against_time, time_for_fill
 from recon.imaging.gridding import (
     BLOCK_SAMPLES,
@@ -173,6 +174,21 @@ def test_fill_is_the_mean_of_the_visited_neighbours_weighted_by_coverage():
     assert_array_equal(mask, [[False, True, False, True, False]])
     assert_allclose(filled, [[1, (1 * 1 + 3 * 4) / 4, 4, 4, np.nan]])
     assert np.isnan(picture.image[0, 1])  # the picture itself is unchanged
+
+
+@pytest.mark.parametrize(("hole_px", "left_px"), [(4, 0), (7, 3)])
+def test_fill_reaches_its_radius_into_a_hole_from_both_sides(
+    hole_px: int, left_px: int, capsys: pytest.CaptureFixture
+) -> None:
+    counts = np.ones((9, hole_px + 6), np.uint32)
+    counts[:, 3:-3] = 0
+    picture = Picture(np.where(counts > 0, np.float32(2.0), np.nan), counts, Grid(hole_px + 6, 9, 1.0, 1.0))
+    filled, mask = fill_holes(picture, radius=2)
+    assert np.isnan(filled).sum() == 9 * left_px
+    assert mask.sum() == 9 * (hole_px - left_px)
+    with pytest.raises(SystemExit):
+        main(["reconstruct", "--help"])
+    assert "at most PX rows and columns away" in " ".join(capsys.readouterr().out.split())
 
 
 @no_deadline
