@@ -170,6 +170,11 @@ def _check_options(args: argparse.Namespace, options: Options) -> None:
         raise BadInput("sorts the samples by z, not by time", channel="--z-step", hint="give --frames without a number")
     if args.quiet_time is not None and not args.follow:
         raise BadInput("has no effect without --follow", channel="--quiet-time", hint="add --follow, or leave it out")
+    over_time = args.follow or options.frames or options.frame_time
+    if args.independent_frames and (args.picture != "posterior" or not over_time):
+        what = "has no effect: only posterior frames over time use earlier ones"
+        hint = "add --picture posterior and --frames N, --frame-time or --follow, or leave it out"
+        raise BadInput(what, channel="--independent-frames", hint=hint)
     if args.zarr:
         import_extra("zarr", "zarr")
     if args.fill and args.picture != "mean":

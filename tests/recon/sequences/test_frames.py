@@ -139,6 +139,28 @@ def test_options_of_frames_need_frames(tmp_path: Path, capsys: pytest.CaptureFix
         assert f"{option[0]}: needs frames" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        [],
+        ["--picture", "posterior"],
+        ["--frames", "3"],
+        ["--follow"],
+        ["--picture", "kernel", "--frame-time", "0.01"],
+        ["--picture", "posterior", "--frames"],
+    ],
+)
+def test_independent_frames_are_refused_where_frames_are_always_independent(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    recording = str(tmp_path / "none.h5")
+    command = ["reconstruct", recording, "-o", str(tmp_path / "out"), "--independent-frames"]
+    assert main([*command, *options]) == 2
+    assert "--independent-frames: has no effect" in capsys.readouterr().err
+    assert main([*command, "--picture", "posterior", "--frames", "3"]) == 2
+    assert "no such file" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_frames_by_number_and_by_time_at_once_are_refused(result: Reconstruction) -> None:
     with pytest.raises(BadInput, match="frame_time: is given beside a count"):
