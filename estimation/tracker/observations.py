@@ -174,7 +174,7 @@ def lay_out_blocks(
         first: time of the first sample [s] and length [samples] of the first block; by default the channel's start.
 
     Raises:
-        BadInput: the channel is too short, or a drive does not cover it.
+        BadInput: the channel is too short or sampled too slowly, or a drive does not cover it.
         DeviceInvalid: the device lacks a value.
     """
     channel, axes = sense.channel, tuple(device.axis(name) for name in sense.axes)
@@ -215,7 +215,7 @@ def lay_out_blocks(
         starts=starts,
         length=length,
         time=time,
-        lines=_usable_lines(axes, sense, w, channel.sample_rate),
+        lines=_usable_lines(axes, sense, w),
         psi=psi,
         w=w,
         force=force,
@@ -278,7 +278,7 @@ def demodulate_blocks(
         external_phase=np.zeros(w.shape),
         external_var=np.full(w.shape, np.inf),
         amplitude_table=np.stack([amplitude_table(axis, sense.readout) for axis in layout.axes]),
-        main_order=2 if is_capacitive(sense.readout) else 1,
+        main_order=_main_order(sense),
     )
     used = float((projections.counts - projections.clipped_counts).sum()) / (starts.size * length)
     clipped = _clipped_blocks(projections, starts, pieces, settling)
@@ -305,16 +305,34 @@ def _block_length(axes: Sequence[Axis], slowest: float, rate: float) -> int:
     return max(MIN_BLOCK_SAMPLES, round(max(MIN_BLOCK_CYCLES / slowest, width) * rate))
 
 
-def _usable_lines(axes: Sequence[Axis], sense: SenseChannel, w: Array, rate: float) -> Index:
-    """(axis, order) of the lines below MAX_LINE_RATE_RATIO; a comb that is symmetric has even orders only."""
-    found = []
+def _main_order(sense: SenseChannel) -> int:
+    """Order of the line that determines phase and amplitude: a capacitance has twice the motion's frequency."""
+    return 2 if is_capacitive(sense.readout) else 1
+
+
+def _usable_lines(axes: Sequence[Axis], sense: SenseChannel, w: Array) -> Index:
+    """(axis, order) of the lines below MAX_LINE_RATE_RATIO; a comb that is symmetric has even orders only.
+
+    Raises:
+        BadInput: the main line of an axis is above it.
+    """
+    found, channel, main = [], sense.channel, _main_order(sense)
     for i, axis in enumerate(axes):
         if is_capacitive(sense.readout):
             even = axis.require_capacitance().theta_th == 0.0
             orders = range(2 if even else 1, MAX_READOUT_HARMONIC + 1, 2 if even else 1)
         else:
             orders = range(1, MOTION_SENSOR_HARMONICS + 1)
-        found += [(i, n) for n in orders if n * w[:, i].max() < 2 * np.pi * MAX_LINE_RATE_RATIO * rate]
+        least_rates = {n: n * w[:, i].max() / (2 * np.pi * MAX_LINE_RATE_RATIO) for n in orders}
+        if least_rates[main] >= channel.sample_rate:
+            raise BadInput(
+                f"is sampled at {channel.sample_rate:g} Hz, too slowly for the line at "
+                f"{least_rates[main] * MAX_LINE_RATE_RATIO:.6g} Hz by which axis {sense.axes[i]} is tracked",
+                file=channel.file,
+                channel=channel.name,
+                hint=f"record at {ceil(least_rates[main])} Hz or more",
+            )
+        found += [(i, n) for n, least_rate in least_rates.items() if least_rate < channel.sample_rate]
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 

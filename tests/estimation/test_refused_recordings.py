@@ -14,7 +14,7 @@ from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
-from tests.support.simulated import imaging
+from tests.support.simulated import imaging, shared_electrode
 
 TIME = np.arange(5000) / 1e4
 DECAY = np.exp(-3.0 * TIME) * np.cos(2 * np.pi * 100.0 * TIME) + 0.01 * np.random.default_rng(1).normal(size=TIME.size)
@@ -111,3 +111,10 @@ def test_an_axis_with_a_drive_and_no_sensor_names_the_estimator_picture() -> Non
     channels = {"drive_x": (np.sin(2 * np.pi * 100.0 * TIME), "V", 1e4), "intensity": (DECAY, "V", 1e4)}
     with pytest.raises(BadInput, match="neither is sense_x; record it, or use --estimator picture"):
         estimate(Recording.from_arrays(channels, device(100.0, driven=True)), method="sensor")
+
+
+def test_a_sense_signal_that_is_too_slow_for_its_main_line_names_the_rate_that_serves() -> None:
+    whole, _ = shared_electrode()
+    channels = {n: (c.read()[::83], c.unit, c.sample_rate / 83) for n, c in whole.channels.items()}  # 60.24 kHz
+    with pytest.raises(BadInput, match=r"^sense: .* line at 27680 Hz by which axis x .*; record at 6151\d Hz or more$"):
+        estimate(Recording.from_arrays(channels, whole.device))
