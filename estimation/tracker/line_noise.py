@@ -80,12 +80,13 @@ def sample_noise_variance(
 
     A block has the typical variance unless it is disturbed. Lines whose phase slips or whose amplitude decays within a
     block leave residuals about a stationary fit. Blocks that seem disturbed are therefore fitted again with two more
-    lines beside each line, which follow such changes.
+    lines beside each line, which follow such changes. In a gap no block has more samples than its lines have
+    coefficients; the variances are 1 and NaN there.
     """
-    if not projections.counts.any():  # a gap that covers all blocks
-        return np.ones(starts.size), np.nan
     variance = residual_variance(projections)
     variance[projections.rails[:, 0] == projections.rails[:, 1]] = noise_sd**2  # a comparator has no residuals
+    if np.isnan(variance).all():
+        return np.ones(starts.size), np.nan
     typical = max(float(np.nanmedian(variance)), model_error)
     length = int(pieces[:, 1].max())
     sideband = channel.sample_rate / length  # [rad/s]: a slip of 1 rad over the block
@@ -217,10 +218,10 @@ def noise_spectrum(line_noise: Array, noise_var: float, length: int) -> NoiseSpe
 
     Args:
         line_noise: shape (1 + lines,) [V^2].
-        noise_var: of a sample [V^2].
+        noise_var: of a sample, NaN in a gap [V^2].
         length: of a block [samples].
     """
-    if not (np.isfinite(line_noise) & (line_noise > 0.0)).all():
+    if not ((np.isfinite(line_noise) & (line_noise > 0.0)).all() and noise_var > 0.0):
         return NoiseSpectrum(1.0, np.zeros(2 * line_noise.size - 1))
     white = float(line_noise.min())
     excess = np.repeat(line_noise - white, 2)[1:] * 2.0 / length  # a cosine has the square sum length / 2

@@ -128,7 +128,13 @@ def track(
             used, noise_var = observations.used_fraction, observations.noise_var
             results.append(SectionResult(stop - first, used, noise_var, states.mean_nis, states.log_likelihood))
         if all(np.isnan(result.noise_var) for result in results):
-            raise BadInput("holds no sample that can be used", file=sense.channel.file, channel=sense.channel.name)
+            least = 2 * len(layout.lines) + 2  # one more than the coefficients of the lines
+            raise BadInput(
+                f"holds too few samples that can be used: no block of {layout.length} has {least}, as its lines need",
+                file=sense.channel.file,
+                channel=sense.channel.name,
+                hint="check that it was recorded",
+            )
         clock = intensity_clock(recording, sense.channel)
         for a, name in enumerate(sense.axes):
             if not acquired[a]:

@@ -14,7 +14,7 @@ from scanner.device import Axis, Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
-from tests.support.simulated import imaging, shared_electrode
+from tests.support.simulated import imaging, shared_electrode, with_sense
 
 TIME = np.arange(5000) / 1e4
 DECAY = np.exp(-3.0 * TIME) * np.cos(2 * np.pi * 100.0 * TIME) + 0.01 * np.random.default_rng(1).normal(size=TIME.size)
@@ -118,3 +118,9 @@ def test_a_sense_signal_that_is_too_slow_for_its_main_line_names_the_rate_that_s
     channels = {n: (c.read()[::83], c.unit, c.sample_rate / 83) for n, c in whole.channels.items()}  # 60.24 kHz
     with pytest.raises(BadInput, match=r"^sense: .* line at 27680 Hz by which axis x .*; record at 6151\d Hz or more$"):
         estimate(Recording.from_arrays(channels, whole.device))
+
+
+def test_a_sense_signal_with_too_few_samples_in_every_block_is_refused() -> None:
+    rare = with_sense(shared_electrode()[0], lambda y: np.where(np.arange(y.size) % 1000 == 0, y, np.nan))
+    with pytest.raises(BadInput, match=r"^sense: holds too few samples that can be used: no block of .* as its lines"):
+        estimate(rare)
