@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 
 from recon.io.convert import convert
+from scanner.channel import USED_CHANNELS
 from scanner.errors import BadInput
 from scanner.hdf5 import undamaged
 from scanner.recording import Recording
@@ -94,8 +95,13 @@ def poll_recording(path: Path, mapping: Path | None, quiet_time: float) -> Itera
 
 
 def common_time_span(recording: Recording) -> tuple[float, float]:
-    """Return begin and end [s] of the time that all channels cover."""
-    channels = recording.channels.values()
+    """Return begin and end [s] of the time that all channels in use cover; all channels where none has a known name.
+
+    A room's temperature, of a few samples, does not end the scan.
+    """
+    known = {*USED_CHANNELS, *(channel.reference for channel in recording.channels.values())}
+    channels = [channel for name, channel in recording.channels.items() if name in known]
+    channels = channels or list(recording.channels.values())
     return max(channel.start for channel in channels), min(channel.end for channel in channels)
 
 

@@ -211,6 +211,18 @@ def test_frames_that_newer_ones_overtake_are_counted_and_stated(
     assert "4 of 5, because newer ones had arrived" in note
 
 
+def test_a_channel_that_nothing_uses_neither_ends_nor_delays_the_frames(scan: Path, tmp_path: Path) -> None:
+    channels = {n: (c.read(), c.unit, c.sample_rate, c.start) for n, c in Recording.open(scan).channels.items()}
+    channels["temperature"] = (np.full(100, 293.0), "K", 1e6, 0.001)  # of a scan of 20 ms from 0 s
+    Recording.from_arrays(channels, Recording.open(scan).device).write(tmp_path / "warm.h5")
+    options = Options(pixels=(50, 50))
+    live = follow_recording(
+        tmp_path / "warm.h5", tmp_path / "out", options, frame_time=0.01, quiet_time=0.1, quiet=True
+    )
+    assert live.frames + live.dropped == 2
+    assert live.shown[-1][0] == pytest.approx(0.02)
+
+
 def test_the_readout_error_is_measured_ever_more_rarely_and_never_stops() -> None:
     measured = [1]
     while measured[-1] < 256:
