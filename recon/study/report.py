@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from itertools import cycle, product
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,15 @@ from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.wording import counted
 
-MARKERS = "o+^xs"
-"""Markers of the phantoms, repeated if there are more."""
+MARKERS = "o^sDv"
+"""Markers of the phantoms, repeated if there are more. All of them can be filled in the ways of FILLS_AND_LINES."""
+
+ESTIMATOR_COLOURS = (*COLOURS, "#4aa3a2", "#7a7a7a", "#d08fb2")
+"""Colours of the estimators."""
+
+FILLS_AND_LINES = (("full", "-"), ("none", "--"), ("left", ":"), ("right", "-."))
+"""Fill of the markers and style of the lines of an estimator: the first while there are colours, then the next. Users
+may add estimators."""
 
 MIN_PHASE_ERROR_DEG = 1e-4
 """Phase errors below this value are drawn at it, because a logarithmic axis has no zero."""
@@ -90,17 +97,17 @@ def _blur_figure(study: Study, data: Columns) -> Figure:
         here = (data["pixels"] == pixels) & (data["p"] == study.p[0])  # neither blur nor picture depends on p
         law = np.geomspace(max(MIN_PHASE_ERROR_DEG, data["phase_rmse_deg"][here].min(initial=1.0)), 20.0, 50)
         above.plot(law, 0.5 * pixels * np.radians(law) / np.sqrt(2.0), color="#444", lw=0.8)
-        for name, colour in zip(study.estimators, _colours(), strict=False):
+        for name, of_estimator in _estimator_styles(study.estimators).items():
             for phantom, sign in zip(study.phantoms, cycle(MARKERS), strict=False):
                 x, y = (
                     here & (data["estimator"] == name) & (data["phantom"] == phantom) & (data["axis"] == axis)
                     for axis in AXES
                 )
                 label = name if phantom == study.phantoms[0] else None
-                style: dict[str, Any] = {"ms": 4, "alpha": 0.6, "color": colour}
+                style = of_estimator | {"marker": sign, "ls": "", "ms": 4, "alpha": 0.6}
                 error = np.maximum(data["phase_rmse_deg"], MIN_PHASE_ERROR_DEG)
-                above.loglog(error[x | y], data["blur_phase_px"][x | y], sign, label=label, **style)
-                below.loglog(np.hypot(error[x], error[y]) / np.sqrt(2.0), data["picture_error"][x], sign, **style)
+                above.loglog(error[x | y], data["blur_phase_px"][x | y], label=label, **style)
+                below.loglog(np.hypot(error[x], error[y]) / np.sqrt(2.0), data["picture_error"][x], **style)
         for panel in (above, below):
             panel.set_xlabel("phase error, rms [°]")
             for p in study.p:
@@ -185,7 +192,7 @@ def _error_figure(study: Study, data: Columns) -> Figure:
         panels.append(("snr_db", "SNR of the sense signal [dB]", 1.0))
     drawing, axes = new_figure(1, len(panels), (4.6 * len(panels), 3.2))
     for panel, (what, label, unit) in zip(axes[0], panels, strict=True):
-        for name, colour in zip(study.estimators, _colours(), strict=False):
+        for name, style in _estimator_styles(study.estimators).items():
             own = data["estimator"] == name
             at = np.unique(data[what][own])
             if not at.size:
@@ -194,8 +201,8 @@ def _error_figure(study: Study, data: Columns) -> Figure:
                 np.maximum(data["phase_rmse_deg"][own & (data[what] == value)], MIN_PHASE_ERROR_DEG) for value in at
             ]
             low, median, high = np.array([np.percentile(each, [10, 50, 90]) for each in error]).T
-            panel.fill_between(unit * at, low, high, color=colour, alpha=0.15, lw=0)
-            panel.plot(unit * at, median, "o-", ms=3, lw=1.2, color=colour, label=name)
+            panel.fill_between(unit * at, low, high, color=style["color"], alpha=0.15, lw=0)
+            panel.plot(unit * at, median, marker="o", ms=3, lw=1.2, label=name, **style)
         panel.set(yscale="log", xlabel=label, xticks=unit * np.unique(data[what]))
         use_plain_ticks(panel.yaxis)
     axes[0, 0].set_ylabel("phase error, rms [°]")
@@ -203,6 +210,10 @@ def _error_figure(study: Study, data: Columns) -> Figure:
     return Figure(figure_uri(drawing), "phase error of each estimator: median, 10th to 90th percentile")
 
 
-def _colours() -> list[str]:
-    """Enough colours for every estimator there is."""
-    return [*COLOURS, "#4aa3a2", "#7a7a7a", "#d08fb2"]
+def _estimator_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour, fill of the markers and style of the lines of each estimator, the same in all figures of a study."""
+    styles = cycle(product(FILLS_AND_LINES, ESTIMATOR_COLOURS))
+    return {
+        name: {"color": colour, "fillstyle": fill, "ls": line}
+        for name, ((fill, line), colour) in zip(names, styles, strict=False)
+    }

@@ -11,20 +11,23 @@ import tempfile
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from estimation.estimators import estimators
 from recon.cli import main
 from recon.evaluation import truth_from_simulation
 from recon.pipeline import reconstruct
 from recon.report.summary import summarise
 from recon.steps.reconstruction import Options
+from recon.study import report as study_report
 from recon.study.job import run_job, sense_rms, simulate_scenario
-from recon.study.plan import StudyDesign, cell_key, plan_jobs, read_study, remaining_jobs
-from recon.study.table import table_columns, table_rows
+from recon.study.plan import Study, StudyDesign, cell_key, plan_jobs, read_study, remaining_jobs
+from recon.study.table import AXIS_COLUMNS, table_columns, table_rows
 from scanner.device import Device
 from scanner.errors import BadInput
 from tests.support.study import CELLS, assert_study_is_complete, read_journal, small_study, wait_until
@@ -285,3 +288,23 @@ def test_an_interrupt_message_states_that_results_are_kept(tmp_path: Path) -> No
     assert process.returncode == 1
     assert "interrupted; finished jobs are kept" in message
     assert "Traceback" not in message
+
+
+def test_figures_show_every_estimator_in_a_style_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawings: list[Any] = []
+    monkeypatch.setattr(study_report, "figure_uri", lambda drawing: drawings.append(drawing) or "")
+    design = StudyDesign("d", "", (1, 1, 1), (1, 1, 1))
+    study = Study("s", (design,), ("checkerboard",), tuple(estimators()))
+    cell = {"phantom": "checkerboard", "design": "d", "drift": 0.0, "snr_db": None, "pixels": 400, "p": 1.0, "seed": 0}
+    of_cell = {"picture_error": 0.1, "fill": 1.0, "seconds": 1.0}
+    records = [
+        {"cell": cell | {"estimator": name}} | of_cell | {axis: dict.fromkeys(AXIS_COLUMNS, 0.1 * k) for axis in "xy"}
+        for k, name in enumerate(study.estimators, 1)
+    ]
+    rows = table_rows(records)
+    for figure in (study_report._error_figure, study_report._blur_figure):
+        figure(study, table_columns(rows))
+    for drawing in drawings:
+        lines = [line for line in drawing.axes[0].lines if line.get_label() in study.estimators]
+        assert [line.get_label() for line in lines] == list(study.estimators)
+        assert len({(line.get_color(), line.get_fillstyle()) for line in lines}) == len(lines)
