@@ -137,7 +137,7 @@ def read_scan(tracks: Mapping[str, AngleTrack], intensity: Channel) -> ScanSampl
         intensity: shape (n,) or (n, detectors).
 
     Raises:
-        BadInput: no sample is finite and has known angles.
+        BadInput: no sample is finite and has known angles, or the intensity is constant.
     """
     size = min(intensity.size, *(tracks[axis].size for axis in AXES))
     part = MAX_SAMPLES // 3
@@ -149,6 +149,9 @@ def read_scan(tracks: Mapping[str, AngleTrack], intensity: Channel) -> ScanSampl
     finite = np.isfinite(values) & np.isfinite(angles["x"]) & np.isfinite(angles["y"])
     if not finite.any():
         what, hint = "has no sample at which both angles are known", "check the channels' start times"
+        raise BadInput(what, file=intensity.file, channel=intensity.name, hint=hint)
+    if np.ptp(values[finite]) == 0.0:
+        what, hint = f"is constant, {values[finite][0]:.9g} {intensity.unit}", "check that it was connected"
         raise BadInput(what, file=intensity.file, channel=intensity.name, hint=hint)
     low, high = ({axis: float(end(angles[axis])) for axis in AXES} for end in (np.nanmin, np.nanmax))
     validation = (index * TIME_BLOCKS // size) % VALIDATION_EVERY == VALIDATION_EVERY // 2

@@ -10,15 +10,18 @@ import pytest
 
 import scanner.terms
 from estimation.complete_diagnosis import diagnose_with_optics
+from estimation.estimate import estimate
 from estimation.optics.candidates import candidate_effects
 from estimation.optics.correction import beam_motion, correct_intensity
 from estimation.optics.samples import read_scan
+from estimation.optics.selection import diagnose_optics
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.targets import make_target
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid
 from recon.report.diagnosis import diagnosis_report
 from scanner.angle_tracks import SampledAngle
+from scanner.channel import make_channel
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.optics import beam_position, intensity_delay, intensity_gain
@@ -167,6 +170,13 @@ def test_an_intensity_without_known_angles_is_refused() -> None:
     tracks = {axis: SampledAngle(np.full(5000, np.nan), 1e6) for axis in "xy"}
     with pytest.raises(BadInput, match="intensity: has no sample at which both angles are known; check the channels'"):
         read_scan(tracks, scan()["intensity"])
+
+
+def test_a_constant_intensity_is_refused() -> None:
+    intensity = scan()["intensity"]
+    dark = make_channel("intensity", np.full(intensity.size, 7.0), unit="V", sample_rate=intensity.sample_rate)
+    with pytest.raises(BadInput, match=r"^intensity: is constant, 7 V; check that it was connected$"):
+        diagnose_optics(estimate(scan()), dark, DEVICE)
 
 
 def test_effects_on_a_sample_without_features_are_reported_as_not_detectable() -> None:
