@@ -45,7 +45,7 @@ class FilmModel:
 
     Attributes:
         smoothing: standard deviation of the Gaussian for a frame's own lines that gives the least standard error [px].
-        own_sd: median standard error of the sampled frames, each by itself [px].
+        own_sd: median standard error of the sampled frames that determine their phase, each by itself [px].
         fill: fraction of the sweep's width that the columns cover; 0 if the shift is the same in all columns.
         fill_sd: its standard error; nan if the film does not determine it.
         typical: median shift of the frames [px].
@@ -117,21 +117,26 @@ def _starts(frame: Frame, before: float) -> list[float]:
 def fit_film(frames: Sequence[Frame]) -> FilmModel:
     """Fit what the frames share to a sample of them, each compared with its own lines.
 
+    Frames that determine no phase, such as those before the light was on, are left out.
+
     Raises:
         BadInput: no frame determines a line phase, or the lines of the second direction are not reversed.
     """
+    frames = [frame for frame in frames if _varies_along_lines(frame)]
+    if not frames:
+        raise _too_little_structure()
     _check_reversed(frames)
     start = _common_shift(frames)
     trials = {
         smoothing: [estimate_line_phase(frame, start, 0.0, [smoothing] * len(frame)) for frame in frames]
         for smoothing in SMOOTHING_SDS_PX
     }
-    sds = {smoothing: float(np.median([phase.sd for phase in found])) for smoothing, found in trials.items()}
-    smoothing = min(sds, key=lambda each: sds[each])
+    sds = {k: np.minimum([phase.sd for phase in found], MAX_SHIFT_SD_PX) for k, found in trials.items()}
+    determined = np.min(list(sds.values()), axis=0) < MAX_SHIFT_SD_PX
+    if not determined.any():
+        raise _too_little_structure()
+    smoothing = min(sds, key=lambda k: (np.median(sds[k][determined]), np.mean(sds[k])))
     shifts = [phase.shift if phase.sd < MAX_SHIFT_SD_PX else np.nan for phase in trials[smoothing]]
-    if not np.isfinite(shifts).any():
-        hint = "sum frames or channels, or take a film of a specimen with structure along the lines"
-        raise BadInput("the frames have too little structure or too much noise to determine a line phase", hint=hint)
     used = [(frame, shift) for frame, shift in zip(frames, shifts, strict=True) if np.isfinite(shift)]
     own: list[Sequence[Instrument]] = [[smoothing] * len(frame) for frame, _ in used]
     fill_squared, sd = _fit_fill(used, own, 0.0)
@@ -139,12 +144,22 @@ def fit_film(frames: Sequence[Frame]) -> FilmModel:
     fill, fill_sd = _significant_fill(fill_squared, sd)
     return FilmModel(
         smoothing=smoothing,
-        own_sd=sds[smoothing],
+        own_sd=float(np.median(sds[smoothing][determined])),
         fill=fill,
         fill_sd=fill_sd,
         typical=typical,
         lag=PooledEquations(frames[0][0].shape[1], fill**2).lag(),
     )
+
+
+def _varies_along_lines(frame: Frame) -> bool:
+    """Whether the values of a line differ in some line; blank frames have no shift."""
+    return bool(np.ptp(np.sum(frame, axis=0), axis=1).any())
+
+
+def _too_little_structure() -> BadInput:
+    hint = "sum frames or channels, or take a film of a specimen with structure along the lines"
+    return BadInput("the frames have too little structure or too much noise to determine a line phase", hint=hint)
 
 
 def with_reference(model: FilmModel, frames: Iterable[tuple[int, Frame]], sampled: Mapping[int, Frame]) -> FilmModel:

@@ -17,6 +17,7 @@ from recon.imaging.raster.film_phase import fit_film, frame_phase, own_phase, wi
 from recon.imaging.raster.line_shift import correct_frame, to_dtype
 from recon.imaging.raster.phase_smoothing import smooth_phases
 from recon.io.film import open_film
+from scanner.errors import BadInput
 
 FILL = 0.85
 SHIFTS = 2.0 + 0.05 * np.arange(12)
@@ -142,6 +143,16 @@ def test_a_constant_shift_has_the_same_lag_in_all_columns() -> None:
     model = fit_film(recorded)
     assert model.fill < 0.3
     assert abs(own_phase(recorded[0], model, 3.0).shift - 3.0) < 0.15
+
+
+@pytest.mark.parametrize("good", [1, 2])
+def test_blank_frames_leave_the_phase_of_the_others(good: int) -> None:
+    recorded = [[frame.astype(np.float32)] for frame in film(np.full(good, 3.0))]
+    alone, blank = fit_film(recorded), [np.full((128, 128), 7.0, np.float32)]
+    model = fit_film([*recorded, *[blank] * 3])
+    assert (model.typical, model.own_sd, model.smoothing) == (alone.typical, alone.own_sd, alone.smoothing)
+    with pytest.raises(BadInput, match="too little structure"):
+        fit_film([blank])
 
 
 def test_no_count_is_lost_between_the_borders() -> None:
