@@ -16,6 +16,11 @@ SHARP_FRACTION = 0.99
 """Fraction of the scan within the bound p/m from which a picture is called sharp: blur in the remaining hundredth of
 the samples is not visible."""
 
+MAX_MAGNIFICATION_ERROR = 0.1
+"""Largest deviation from 1 of the magnification that is fitted when a picture is compared with its scene. A device that
+is off by its tolerances magnifies by 6 % (docs/explanation/image_phase.md). Without a bound the fit stretches a scene
+that the picture does not show."""
+
 
 def phase_bound(p: float, m: float) -> float:
     """Return p/m: the phase error [rad] that displaces no sample by more than ``p`` pixels.
@@ -113,7 +118,8 @@ class SceneComparison:
 
     Attributes:
         rms: over visited pixels after a fit of gain and offset, in standard deviations of the scene.
-        magnification_x, magnification_y: a feature at s of the scene appears at magnification * s in the picture.
+        magnification_x, magnification_y: a feature at s of the scene appears at magnification * s in the picture;
+            within MAX_MAGNIFICATION_ERROR of 1.
     """
 
     rms: float
@@ -125,7 +131,8 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
     """Compare a picture with the scene, after a fit of gain, offset and a magnification of each axis.
 
     An amplitude error of 1 % displaces the edge of a 400 pixel picture by 2 pixels and blurs nothing. The magnification
-    is therefore fitted, within 5 % of 1, and reported separately.
+    is therefore fitted, within 10 % of 1, and reported separately. Visited pixels whose value is not finite are left
+    out.
 
     Args:
         picture: of one detector; several are averaged.
@@ -133,8 +140,8 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
         flip_x, flip_y: whether the picture is mirrored.
 
     Raises:
-        BadInput: an argument is of a wrong type or shape, no pixel was visited, or picture or scene have one value
-            only.
+        BadInput: an argument is of a wrong type or shape, no visited pixel is finite, or picture or scene have one
+            value only.
     """
     from scipy.ndimage import map_coordinates
 
@@ -143,9 +150,9 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
     image = np.asarray(picture.image if picture.image.ndim == 2 else picture.image.mean(-1), np.float64)
     image = image[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
     count = picture.coverage[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
-    rows, columns = np.nonzero(count)
+    rows, columns = np.nonzero((count > 0) & np.isfinite(image))
     if not rows.size:
-        raise BadInput("no pixel of the picture was visited")
+        raise BadInput("no pixel of the picture was visited and is finite")
     values, weight = image[rows, columns], np.ones(rows.size)
     for name, compared in (("picture", values), ("scene", scene)):
         if np.ptp(compared) == 0.0:
@@ -162,15 +169,16 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
 
     # Fine texture has many local minima. A grid of scales over coarse texture selects the right one.
     coarse, step = _resample_scene(scene, np.array(image.shape) / 8.0), max(1, values.size // 10_000)
-    trials = 1.0 + 0.01 * np.mgrid[-5:6, -5:6].reshape(2, -1).T
+    trials = 1.0 + MAX_MAGNIFICATION_ERROR * np.mgrid[-10:11, -10:11].reshape(2, -1).T / 10.0
     scale = trials[int(np.argmax([_correlation(sample_scene(t, coarse, step), values[::step]) for t in trials]))]
     for _ in range(8):
         model = sample_scene(scale)
         slopes = [(sample_scene(scale + d) - sample_scene(scale - d)) / 4e-3 for d in 2e-3 * np.eye(2)]
         gain = _fit_linear([model, weight], values)[0]
         fitted = _fit_linear([model, weight, gain * slopes[0], gain * slopes[1]], values)
-        scale = scale + np.clip(fitted[2:], -0.02, 0.02)
-        if np.abs(fitted[2:]).max() < 1e-6:
+        before, scale = scale, scale + np.clip(fitted[2:], -0.02, 0.02)
+        scale = np.clip(scale, 1.0 - MAX_MAGNIFICATION_ERROR, 1.0 + MAX_MAGNIFICATION_ERROR)
+        if np.abs(scale - before).max() < 1e-6:
             break
     model = sample_scene(scale)
     gain, offset = _fit_linear([model, weight], values)

@@ -76,7 +76,7 @@ def picture_of(image):
     return Picture(np.float32(image), np.uint32(np.isfinite(image)), Grid(image.shape[1], image.shape[0], 1.0, 1.0))
 
 
-@pytest.mark.parametrize(("mag_x", "mag_y"), [(1.0, 1.0), (1.01, 0.985), (0.96, 1.037)])
+@pytest.mark.parametrize(("mag_x", "mag_y"), [(1.0, 1.0), (1.01, 0.985), (0.96, 1.037), (1.092, 0.915)])
 @pytest.mark.parametrize("size", [(200, 220), (300, 340), (600, 680)])  # as fine as the picture, and finer
 def test_the_picture_error_excludes_magnification_and_gain(size, mag_x, mag_y):
     rng = np.random.default_rng(3)
@@ -111,6 +111,20 @@ def test_a_mapped_scan_agrees_with_its_scene_and_a_phase_error_does_not():
     assert (large.magnification_x, large.magnification_y) == pytest.approx((1.01, 1.01), abs=1e-3)
     assert large.rms == pytest.approx(true.rms, rel=0.1)
     assert late.rms > 2 * true.rms
+
+
+@pytest.mark.parametrize("magnification", [1.15, 1.3])
+def test_a_larger_magnification_is_an_error_of_the_picture(magnification):
+    error = compare_with_scene(picture_of(shown(scene(), mag_x=magnification)), scene())
+    assert error.magnification_x <= 1.1
+    assert error.rms > 0.5
+
+
+def test_visited_pixels_that_are_not_finite_are_left_out():
+    image = np.float32(shown(scene()))
+    image[40, 50] = np.nan
+    whole = Picture(image, np.ones(image.shape, np.uint32), Grid(220, 200, 1.0, 1.0))
+    assert compare_with_scene(whole, scene()) == compare_with_scene(picture_of(image), scene())
 
 
 def test_an_empty_picture_is_refused():
