@@ -134,6 +134,21 @@ def test_the_error_of_a_slow_gain_is_as_stated(noise_sd: float) -> None:
         assert 0.6 < np.std(error) / found.sd < 1.5
 
 
+@pytest.mark.parametrize("samples", [1000, 4000, 8000])
+def test_the_standard_deviation_contains_the_detail_of_the_scene_within_pixels(samples: int) -> None:
+    """A steady detector and pixels of 1/40 and 1/20 of the field: all of the drift is error."""
+    time = np.arange(samples) / 1e6
+    x, y = np.sin(2 * np.pi * 2510.0 * time + 0.3), np.sin(2 * np.pi * 1130.0 * time + 1.1)
+    pixel = (((y + 1) / 2 * 20).astype(int) * 40 + ((x + 1) / 2 * 40).astype(int)).astype(np.int32)
+    spot = 50.0 * np.exp(-((x - 0.3) ** 2 + (y + 0.4) ** 2) / 0.02)
+    clean = 100.0 + 60.0 * np.sin(9 * x + 2) * np.cos(6 * y + 1) + spot
+    for seed in range(3):
+        values = clean + 5.0 * np.random.default_rng(seed).standard_normal(samples)
+        found = estimate(pixel, values, 800, 1e6, "gain")
+        assert found is not None
+        assert np.std(found.values) < 2.5 * found.sd  # detail that neighbouring pixels share is not contained
+
+
 def test_a_steady_detector_stays_as_it_is() -> None:
     pixel, clean = crossing_scan(0.02)
     values = clean + NOISE_SD * np.random.default_rng(3).standard_normal(clean.size)
