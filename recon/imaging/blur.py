@@ -169,7 +169,7 @@ def compare_with_scene(picture: Picture, scene: Array, flip_x: bool = False, fli
 
     # Fine texture has many local minima. A grid of scales over coarse texture selects the right one.
     coarse, step = _resample_scene(scene, np.array(image.shape) / 8.0), max(1, values.size // 10_000)
-    trials = 1.0 + MAX_MAGNIFICATION_ERROR * np.mgrid[-10:11, -10:11].reshape(2, -1).T / 10.0
+    trials = 1.0 + MAX_MAGNIFICATION_ERROR * np.mgrid[-5:6, -5:6].reshape(2, -1).T / 5.0
     scale = trials[int(np.argmax([_correlation(sample_scene(t, coarse, step), values[::step]) for t in trials]))]
     for _ in range(8):
         model = sample_scene(scale)

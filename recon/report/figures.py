@@ -106,7 +106,7 @@ def save_picture(path: Path, picture: Picture, affected: NDArray[np.bool_] | Non
         path: the file.
         picture: to show.
         affected: pixels to highlight, shape (height, width).
-        fill_radius: holes up to this many pixels are filled; 0 fills none.
+        fill_radius: unvisited pixels within so many rows and columns of a visited one are filled; 0 fills none.
     """
     rgb = to_rgb(shown_image(picture, fill_radius))
     path.write_bytes(encode_png(rgb if affected is None else highlight_pixels(rgb, affected)))

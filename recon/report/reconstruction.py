@@ -53,7 +53,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fi
         subject += f" {stack[0].upper()}{stack[1:]}; the picture below is that of the whole scan."
     shown = shown_image(result.picture, fill_radius)
     image, limits = to_rgb(shown), contrast_limits(shown)
-    filling = f"holes up to {fill_radius} pixels wide filled from their neighbours" if fill_radius else "not filled"
+    filling = f"unvisited pixels within {fill_radius} px of a visited one filled" if fill_radius else "not filled"
     content = (
         f"picture, {filling}; blue: pixels never visited"
         if result.picture_kind == "mean"

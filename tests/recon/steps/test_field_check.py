@@ -120,7 +120,7 @@ def test_image_png_shows_unvisited_pixels_unless_filling_is_asked_for(fill: list
     page = (out / "report.html").read_text(encoding="utf-8")
     if fill:
         assert unvisited < 0.1
-        assert "holes up to 2 pixels wide filled" in page
+        assert "unvisited pixels within 2 px of a visited one filled" in page
     else:
         assert unvisited > 0.3
         assert "not filled; blue: pixels never visited" in page
