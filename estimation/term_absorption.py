@@ -86,12 +86,12 @@ def with_clocks(recording: Recording, terms: Terms) -> Recording:
                 continue
             names = ("sense", f"sense_{name}") if term.channel == "sense" else (f"{term.channel}_{name}",)
             for channel in (channels[key] for key in names if key in channels):
-                ends = np.array([channel.start, channel.end]) - recording.start
+                ends = np.array([channel.start, channel.end]) - recording.origin
                 start, end = (float(t) for t in term.term.clock(ends, term.values))
-                moved = replace(channel, start=recording.start + start, sample_rate=channel.size / (end - start))
+                moved = replace(channel, start=recording.origin + start, sample_rate=channel.size / (end - start))
                 channels[channel.name] = _cut(moved, recording.start, recording.end)
             for late in (edges[key] for key in names if key in edges):
-                times = recording.start + term.term.clock(late.times - recording.start, term.values)
+                times = recording.origin + term.term.clock(late.times - recording.origin, term.values)
                 edges[late.name] = replace(late, times=times)
     return replace(recording, channels=MappingProxyType(channels), edges=MappingProxyType(edges))
 
@@ -105,10 +105,10 @@ def _cut(channel: Channel, start: float, end: float) -> Channel:
 
 
 def with_drives(recording: Recording, device: Device, terms: Terms) -> Recording:
-    """The recording with the effective voltage of each drive in place of the recorded one."""
+    """The recording with the effective voltage of each drive, or bias without a drive, in place of the recorded one."""
     channels = dict(recording.channels)
     for name, active in terms.items():
-        drive = channels.get(f"drive_{name}")
+        drive = channels.get(f"drive_{name}", channels.get(f"bias_{name}"))
         if drive is not None and any(term.term.voltage for term in active):
             voltage = effective_drive(device.sensed_axis(name), active, drive_input(drive, recording, drive))
             channels[drive.name] = with_samples(drive, nodes_to_samples(voltage)[:-1])
@@ -216,7 +216,7 @@ def drive_input(drive: Channel | None, recording: Recording, clock: Channel) -> 
     step = 1.0 / clock.sample_rate
     half_steps = clock.start + 0.5 * step * np.arange(2 * clock.size + 1)
     voltage = np.zeros(half_steps.size) if drive is None else np.interp(half_steps, drive.time(), drive.read())
-    return DriveInput(to_nodes(voltage), step, clock.start - recording.start)
+    return DriveInput(to_nodes(voltage), step, clock.start - recording.origin)
 
 
 def trajectory(axis: Axis, terms: tuple[ActiveTerm, ...], drive: DriveInput, angle: Array) -> AxisTrajectory:

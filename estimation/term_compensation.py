@@ -100,7 +100,9 @@ def estimate_with_terms(
     if treats_clipping:
         remaining = without_visible_clipping(absorbed, bare, remaining)
     absorbed, terms = with_outputs(absorbed, bare, remaining, treats_clipping)
-    without_intensity = _without(absorbed, "intensity")  # angles at the sense signal's samples serve the iteration
+    without_intensity = absorbed.without_channel(
+        "intensity"
+    )  # angles at the sense signal's samples serve the iteration
     corrected = without_intensity
     motion, functions = run(without_intensity, bare), dict[str, DescribingFunction]()
 
@@ -134,10 +136,6 @@ def _acts(active: ActiveTerm) -> bool:
     """Whether a term still changes a signal or the motion."""
     term = active.term
     return any((term.torque, term.capacitance, term.pre_demodulation)) or bool(term.acts_on_channel)
-
-
-def _without(recording: Recording, name: str) -> Recording:
-    return replace(recording, channels={key: value for key, value in recording.channels.items() if key != name})
 
 
 def _with_signs(recording: Recording, bare: Device, terms: Terms, functions: Functions, motion: Motion) -> Motion:

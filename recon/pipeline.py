@@ -165,7 +165,7 @@ def estimate_motion(
     grid, _ = _picture_grid(device, motion, options)
     check_units(grid, motion)
     motion, notes = refine_motion(recording, device, motion, prepared.intensity, grid, options.flips)
-    motion, sign_notes = follow_signs(motion, device, prepared.intensity, recording.start)
+    motion, sign_notes = follow_signs(motion, device, prepared.intensity, recording.origin)
     grid, field_notes = _picture_grid(device, motion, options)
     notes = [*notes, *sign_notes, *motion.notes, *describe_unconfirmed_signs(recording, device, motion)]
     notes += describe_resonance_mismatch(device, motion)

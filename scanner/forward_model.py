@@ -289,7 +289,7 @@ def _same_channel(channel: str, motion: AxisTrajectory | None, size: int) -> Arr
     if motion is None or (channel == "sense" and motion.axis.readout is None):
         return np.zeros(size)
     if channel == "sense":
-        return _before_channel_terms(effective_readout(motion.axis.require_readout(), [motion]), [motion])
+        return _before_channel_terms(motion.axis.require_readout(), [motion])
     return motion.derivative(REFERENCE_ORDERS[channel])
 
 

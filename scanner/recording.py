@@ -67,6 +67,7 @@ class Recording:
     device_toml: str | None = None
     _file: Closeable | None = None
     edges: Mapping[str, Edges] = field(default_factory=dict)
+    _origin: float | None = None
 
     @classmethod
     def open(cls, path: str | Path, growing: bool = False) -> Recording:
@@ -241,6 +242,11 @@ class Recording:
         return min(starts or [float(edges.times[0]) for edges in self._edges_in_use()])
 
     @property
+    def origin(self) -> float:
+        """Time from which drifts and phases of a device's terms count [s]: the start of the complete recording."""
+        return self.start if self._origin is None else self._origin
+
+    @property
     def end(self) -> float:
         """Time one sample after the last sample of any channel in use [s]; of the last edge with edges only."""
         ends = [channel.end for channel in self._channels_in_use()]
@@ -266,6 +272,8 @@ class Recording:
     def slice(self, t0: float, t1: float) -> Recording:
         """Return the samples with ``t0 <= t < t1`` [s], on the same clock, without channels that have none.
 
+        The origin stays that of the whole, so that a drift of the device continues.
+
         Raises:
             BadInput: the interval holds no sample of any channel.
         """
@@ -275,7 +283,12 @@ class Recording:
             what = f"holds nothing from {t0:g} s to {t1:g} s"
             raise BadInput(what, file=self.path, hint=f"it runs from {self.start:g} s to {self.end:g} s")
         edges = {name: each.between(t0, t1) for name, each in self.edges.items()}
-        return replace(self, channels=MappingProxyType(nonempty), edges=MappingProxyType(edges))
+        return replace(self, channels=MappingProxyType(nonempty), edges=MappingProxyType(edges), _origin=self.origin)
+
+    def without_channel(self, name: str) -> Recording:
+        """Return the recording without a channel, with the same origin."""
+        rest = {key: channel for key, channel in self.channels.items() if key != name}
+        return replace(self, channels=MappingProxyType(rest), _origin=self.origin)
 
     def with_channel(self, channel: Channel) -> Recording:
         """Return the recording with a channel added, or replaced where there is one of its name."""

@@ -145,7 +145,7 @@ def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Ru
     if n < 8 * MIN_STEPS_PER_PERIOD:
         what = f"the channels share {end - start:.3g} s, fewer than 8 periods of the motion"
         raise BadInput(what, file=recording.path, hint="record longer, or check the channels' start times")
-    origin = recording.start
+    origin = recording.origin
     inputs = {
         name: DriveInput(
             _voltage(drives[name], _rest_voltage(device, name, drives[name]), grid_start, step, n),

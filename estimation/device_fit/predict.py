@@ -134,7 +134,7 @@ def _at_sample_times(
 
     output, channel = run.outputs[index], recording[run.outputs[index].name]
     inputs = run.inputs[output.axes[0]]
-    grid = recording.start + inputs.time
+    grid = recording.origin + inputs.time
     time = channel.time()
     values = np.full(time.size, np.nan)
     inside = (time >= grid[0] - 1e-9) & (time <= grid[-1] + 1e-9)

@@ -53,7 +53,7 @@ def correct_intensity(recording: Recording, device: Device, undo_lag: bool = Fal
         values = values[np.clip(index - start, 0, len(values) - 1)]
         for weights in filters:
             values = undo_low_pass(values, weights)
-        gain = intensity_gain(device, channel.time(first, stop) - recording.start)
+        gain = intensity_gain(device, channel.time(first, stop) - recording.origin)
         return np.asarray(values / (gain if values.ndim == 1 else gain[:, None]))
 
     removed = sum(1 / (2 * np.pi * corner) for corner in corners)

@@ -127,7 +127,7 @@ def prepare_segment(segment: Recording, device: Device, clock_jumps: Sequence[De
         defects=(*clock_jumps, *find_defects(lagging, device, segment["intensity"])),
         unknown_entries=tuple(_unknown_entries(recording, device)),
         clock_notes=tuple(_describe_intensity_clock(recording)),
-        origin=recording.start,
+        origin=recording.origin,
     )
 
 
@@ -149,7 +149,7 @@ def prepare_frame(recording: Recording, device: Device, start: float, stop: floa
         defects=tuple(find_defects(lagging, device, uncorrected.channels.get("intensity"))),
         unknown_entries=(),
         clock_notes=(),
-        origin=recording.start,
+        origin=recording.origin,
     )
 
 

@@ -12,7 +12,7 @@ from scanner.terms.term import Parameter, SignalContext, Term, driven_by_comb
 
 def voltage(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
     (half_square,) = p
-    return np.sqrt(np.maximum(voltage**2 + half_square, 0.0))
+    return np.copysign(np.sqrt(np.maximum(voltage**2 + half_square, 0.0)), voltage)
 
 
 TERM = Term(

@@ -19,7 +19,7 @@ def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
 TERM = Term(
     effect="feedthrough",
     stage="readout",
-    equation="y = y_nominal + g V + h V'/ω_d",
+    equation="y = y_nominal + g (V − V̄) + h V'/ω_d",
     parameters=(
         Parameter("g", "1", lambda s: 0.06 * s.sense_rms / s.voltage_rms),
         Parameter("h", "1", lambda s: 0.06 * s.sense_rms / s.voltage_rms),

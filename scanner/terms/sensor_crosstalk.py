@@ -20,7 +20,7 @@ def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
 TERM = Term(
     effect="sensor-crosstalk",
     stage="readout",
-    equation="y = y_nominal + c y_other",
+    equation="y = y_nominal + c (y_other − ȳ_other)",
     parameters=(Parameter("c", "1", lambda s: 0.03),),
     source="IEEE Std 1293 (2018): cross-axis sensitivity of a sensor of motion",
     confounders={

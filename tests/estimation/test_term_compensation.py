@@ -17,9 +17,9 @@ from phantoms.waveforms import Sine
 from recon.evaluation import evaluate_axis
 from scanner import devices
 from scanner.active_terms import ActiveTerm
-from scanner.device import Device
+from scanner.device import Axis, Device
 from scanner.recording import Recording
-from scanner.stages import Drive, Position
+from scanner.stages import Drive, Mechanics, Position
 from scanner.terms import catalogue
 
 DURATION_S = 0.006
@@ -154,3 +154,17 @@ def test_an_even_torque_determines_the_sign_of_the_motion(k2: float) -> None:
     assert np.degrees(found.phase_rmse) < 0.02
     mean = np.mean(motion.axes["x"].angle.read(0, motion.axes["x"].angle.size))
     assert mean == pytest.approx(np.mean(truth["angle_x"][0]), rel=0.1)
+
+
+def test_a_drift_counts_from_the_start_of_the_whole_recording() -> None:
+    """In its second half a gain that rises by 20 % is 15 % larger than at the beginning."""
+    rate, resonance = 1e5, 2 * np.pi * 1e3
+    time = np.arange(10_000) / rate
+    drift = {"gain-drift": {"g": 0.2, "T": 0.1}}
+    axis = Axis(Mechanics(1.0, 60.0, resonance**2), readout=Position(10.0, 1e-4), terms=drift, name="x")
+    angle = 0.1 * np.sin(resonance * time)
+    sensed = 10.0 * angle * (1.0 + 0.2 * time / 0.1)
+    device = Device("stage", {"x": axis})
+    half = Recording.from_arrays({"sense_x": (sensed, "V", rate, 0.0)}, device).slice(0.05, np.inf)
+    found = estimate(half, device, "sensor").axes["x"].angle.read(0, 5000)
+    np.testing.assert_allclose(found, angle[5000:], atol=1e-4)

@@ -7,6 +7,7 @@ from scanner.device import Axis
 from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.laws import capacitance
 from scanner.stages import Capacitance, Drive, Mechanics, Transimpedance
+from scanner.terms import SignalContext, catalogue
 
 BIAS_V = 5.0
 
@@ -26,3 +27,10 @@ def test_the_bias_of_the_current_is_the_stated_one_unless_it_was_recorded(is_bia
     found = sense_signal(axis.require_readout(), [motion])
     expected = -2e7 * BIAS_V * np.gradient(capacitance(motion.angle, 2e-12, 1e-11, 0.2, 0.0), 5e-6, edge_order=2)
     assert np.std(found - ratio * expected) < 0.01 * np.std(found)
+
+
+def test_a_carrier_adds_to_the_mean_square_of_a_bias_of_either_sign() -> None:
+    carrier = catalogue()["carrier-torque"].voltage
+    assert carrier is not None
+    context = SignalContext(np.zeros(3), 1.0, None, *(np.zeros(3) for _ in range(4)))
+    np.testing.assert_allclose(carrier(np.array([-20.0, 20.0]), (18.0,), context), [-np.sqrt(418.0), np.sqrt(418.0)])

@@ -325,3 +325,11 @@ def test_a_recording_whose_edge_lists_are_empty_lasts_as_long_as_its_channels() 
     assert (recording.start, recording.end) == (0.1, 0.2)
     later = recording.slice(0.5, 0.9)
     assert (later.start, later.end) == pytest.approx((0.5, 0.9))
+
+
+def test_a_part_of_a_recording_keeps_the_origin_of_the_whole() -> None:
+    recording = Recording.from_arrays({"sense": ramp(1e3, 0.5, 100), "intensity": ramp(1e3, 0.4, 100)})
+    assert recording.origin == recording.start == 0.4
+    assert recording.slice(0.45, 0.5).slice(0.46, 0.47).origin == 0.4
+    without = recording.without_channel("intensity")
+    assert (without.start, without.origin) == (0.5, 0.4)

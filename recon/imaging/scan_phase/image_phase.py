@@ -81,7 +81,7 @@ def refine_motion(
         return phases_from_picture(recording, device, motion, intensity, grid, flips)
     response_notes: list[str] = []
     if motion.estimator == "picture":
-        beam = beam_motion(motion, device, recording.start)
+        beam = beam_motion(motion, device, recording.origin)
         response = check_response(recording, device, motion, beam, intensity, flips)
         response_notes = response.notes
         if response.contradicted and device.scan is not None:
@@ -104,7 +104,7 @@ def refine_motion(
         # In the first round amplitudes are wrong too and change, so slices far apart in time share no picture.
         periods = PERIODS_PER_PICTURE if rounds else PERIODS_PER_SLICE
         windows = cut_slices(intensity, slow_period(motion) * periods)
-        errors = measure_motion_phase_errors(beam_motion(motion, device, recording.start), intensity, grid, windows)
+        errors = measure_motion_phase_errors(beam_motion(motion, device, recording.origin), intensity, grid, windows)
         found = {name: _measured_phase(errors, motion.axes[name], name, flips.get(name, False)) for name in refined}
         # The first round compares each slice with a picture of its own.
         phases = {name: keep_determined(phases[name], found[name]) for name in refined} if rounds > 1 else found
