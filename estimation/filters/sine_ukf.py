@@ -6,6 +6,8 @@ arcsin (eq 12 to 14), which is two-valued and singular at the turning points; he
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numba import njit
 
@@ -131,6 +133,6 @@ def estimate_sine_ukf(recording: Recording, device: Device) -> Motion:
         phase = track_sine_phase(angle - fitted[2], turn, amplitude, noise, wander)
         clock = intensity_clock(recording, channel)
         filtered = with_samples(channel, amplitude * np.sin(phase) + fitted[2])
-        axes[name] = axis_motion_from_angle(filtered, reference, noise, clock)
+        axes[name] = replace(axis_motion_from_angle(filtered, reference, noise, clock), angle_noise_sd=0.0)
         info[name] = {"amplitude": amplitude, "offset": float(fitted[2]), "phase_wander_a_sample": wander}
     return Motion(axes, "sine-ukf", info)

@@ -126,7 +126,7 @@ def _most_likely(
         if free < least - MIN_DEVIANCE_GAIN:
             walks = both
     count, chi2, _ = _likelihood(periods, measured, side, used, *walks, DIFFUSE)
-    return walks, chi2 / count
+    return walks, max(chi2 / count, MIN_VARIANCE)
 
 
 def _search(deviance: Callable[[float], float]) -> tuple[float, float]:

@@ -37,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
+    from scanner.errors import BadInput
+
+    if (args.workers or args.scheduler) and not args.each:
+        option = "--workers" if args.workers else "--scheduler"
+        raise BadInput("has no effect without --each", channel=option, hint="add --each, or leave it out")
     if args.each:
         from recon.cli.diagnose_each import diagnose_each
 

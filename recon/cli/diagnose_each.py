@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -57,12 +58,14 @@ def diagnose_each(
     work = partial(_diagnose_one, where, mapping and mapping.absolute())
     failures = run_fleet(fleet, work, "diagnose", scheduler, workers)
     rows: list[dict[str, Any]] = []
+    names = Counter(path.name for path in fleet.folders)
     for path, folder in fleet.folders.items():
+        name = path.name if names[path.name] == 1 else str(path)
         if path in failures:
-            rows.append({"recording": path.name, "failed": failures[path].reason})
+            rows.append({"recording": name, "failed": failures[path].reason})
         else:
             content = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
-            rows += table_rows(path.name, (folder / "device.toml").read_text(encoding="utf-8"), content)
+            rows += table_rows(name, (folder / "device.toml").read_text(encoding="utf-8"), content)
     summary: dict[str, Any] = finite(
         {
             "output": str(output),

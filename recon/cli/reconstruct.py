@@ -19,6 +19,13 @@ BY_POSITION = 0
 """Value of ``--frames`` and ``--stack`` without a number: ``position_z`` gives the slices or planes."""
 
 
+OPTIONAL_FILES = (
+    "affected.tif", "data_share.tif", "fill.tif", "filled.tif", "frames.gif", "frames.mp4", "frames.ome.tif",
+    "frames.ome.zarr", "frames_filled.ome.tif", "frames_sd.ome.tif", "sample_motion.csv",
+)  # fmt: skip
+"""Files of the output that some options or recordings give only."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
@@ -249,7 +256,10 @@ def reconstruct_file(
     from recon.steps.z_slices import find_z_slices
 
     growing = live is not None
-    with open_any(path, mapping, growing) as recording, replacing_folder(output, options.device, path) as folder:
+    with (
+        open_any(path, mapping, growing) as recording,
+        replacing_folder(output, options.device, path, optional=OPTIONAL_FILES) as folder,
+    ):
         if options.wants_stack:  # what prevents a stack is found before the motion is estimated
             reason = "--frames without a number and --z-step cut the scan by it"
             find_z_slices(recording.require("position_z", reason), recording.require("intensity"), options.z_step)

@@ -44,7 +44,7 @@ def check_folder(folder: Path) -> None:
 
 
 @contextmanager
-def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
+def replacing_folder(folder: Path, *inputs: object, optional: Sequence[str] = ()) -> Iterator[Path]:
     """A temporary folder to write into; its files replace those of ``folder`` when the block ends without an error.
 
     If the block fails, ``folder`` is unchanged. Old files are deleted before the first new file is moved, so that a
@@ -52,6 +52,8 @@ def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
 
     Args:
         inputs: files that the command reads, which no new file may replace; what is no path is ignored.
+        optional: names of files that the command writes with some options only. Those of an earlier run are deleted:
+            beside the new files they would pass for theirs.
 
     Raises:
         BadInput: as :func:`check_folder`, or a new file has the place of an input.
@@ -61,8 +63,9 @@ def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
     try:
         temporary.mkdir(mode=0o700)
         yield temporary
-        for path in temporary.iterdir():
-            check_no_input(folder / path.name, *(Path(each) for each in inputs if isinstance(each, str | Path)))
+        replaced = {*optional, *(path.name for path in temporary.iterdir())}
+        for name in replaced:
+            check_no_input(folder / name, *(Path(each) for each in inputs if isinstance(each, str | Path)))
         IS_REPLACING.set()
         HAS_REPLACED.set()
         if not folder.exists():
@@ -70,11 +73,11 @@ def replacing_folder(folder: Path, *inputs: object) -> Iterator[Path]:
             temporary.replace(folder)
         else:
             written = sorted(temporary.iterdir())
-            for path in written:
-                if (folder / path.name).is_dir():
-                    shutil.rmtree(folder / path.name)
+            for name in replaced:
+                if (folder / name).is_dir():
+                    shutil.rmtree(folder / name)
                 else:
-                    (folder / path.name).unlink(missing_ok=True)
+                    (folder / name).unlink(missing_ok=True)
             for path in written:
                 path.replace(folder / path.name)
     except OSError as error:

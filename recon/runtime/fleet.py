@@ -16,10 +16,11 @@ from glob import escape
 from pathlib import Path
 from typing import Any
 
+from estimation import estimators
 from recon.io.output import check_folder, write_json
 from recon.io.readers import register, registered
 from recon.runtime.executors import open_executor, picklable_task
-from scanner import devices
+from scanner import devices, terms
 from scanner.device import Device
 from scanner.errors import BadInput, line_of
 from scanner.files import read_toml, replacing
@@ -76,7 +77,7 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
 
 
 def state_inputs(device: Device | str | Path | None, mapping: Path | None) -> str:
-    """Return a text that states the contents of device and mapping, for the options of :func:`plan_fleet`.
+    """Return a text that states the contents of device, mapping and registered files, for :func:`plan_fleet`.
 
     A path alone would not: results of a file that was edited since would be taken as results of the file as it is.
 
@@ -90,8 +91,14 @@ def state_inputs(device: Device | str | Path | None, mapping: Path | None) -> st
     content = {
         "device": None if device is None else devices.find(device).to_toml(),
         "mapping": None if mapping is None else read_toml(mapping),
+        "registered": {str(path): path.read_text(encoding="utf-8") for path in registered_files()} or None,
     }
     return " ".join(f"{name}={_digest(each)}" for name, each in content.items())
+
+
+def registered_files() -> tuple[Path, ...]:
+    """Return the users' files of terms, estimators and readers that are registered."""
+    return (*terms.registered(), *estimators.registered(), *registered())
 
 
 def _digest(content: object) -> str | None:

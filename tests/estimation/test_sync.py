@@ -303,3 +303,12 @@ def test_an_unknown_torque_widens_the_interval() -> None:
         motion, _, _ = axis_motion_from_edges(recording, device, edges, (attrs["sample_rate"], 0.0, angle.size))
         sds.append(float(np.degrees(np.median(motion.phase_sd))))
     assert sds[1] == pytest.approx(np.hypot(sds[0], 0.5 * 0.054), rel=0.1)
+
+
+@pytest.mark.parametrize("frequency", [1024.0, 512.0])
+def test_edges_without_any_rounding_give_the_phase(frequency: float) -> None:
+    edges = make_edges("sync_x", np.arange(1000) / (2.0 * frequency), {"unit": "s", "event": "both-edges"})
+    found = phase_from_edges(edges)
+    assert np.isfinite(found.phase).all()
+    slope = np.diff(found.phase) / np.diff(found.time)
+    np.testing.assert_allclose(np.abs(slope), 2 * np.pi * frequency, rtol=1e-6)

@@ -79,6 +79,7 @@ def test_estimator_is_available_by_name():
     error = motion.axes["x"].angle.read() - 0.087 * np.sin(TURN + 0.7) - 0.002
     assert np.std(error) < 1e-3
     assert motion.info["x"]["offset"] == pytest.approx(0.002, abs=2e-4)
+    assert motion.axes["x"].angle_noise_sd == 0.0  # filtered, so that noise moves no single sample
 
 
 def test_a_capacitive_readout_is_refused():

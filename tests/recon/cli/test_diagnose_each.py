@@ -70,3 +70,17 @@ def test_completed_recordings_are_kept(folder: Path) -> None:
     assert summary["kept"] == summary["recordings"] == 2
     assert summary["exit"] == 0
     assert (folder / "out" / "a" / "diagnosis.json").stat().st_mtime_ns == before
+
+
+def test_recordings_of_one_name_in_two_folders_are_two(tmp_path: Path) -> None:
+    paths = [tmp_path / place / "r.h5" for place in ("p", "q")]
+    for path in paths:
+        path.parent.mkdir()
+        path.write_text("no recording", encoding="utf-8")
+    summary = diagnose_each(paths, tmp_path / "out", None, None, workers=1)
+    assert [row["recording"] for row in summary["table"]] == [str(path) for path in paths]
+
+
+def test_workers_without_each_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["diagnose", str(tmp_path / "a.h5"), "-o", str(tmp_path / "out"), "--workers", "2"]) == 2
+    assert "--workers: has no effect without --each" in capsys.readouterr().err

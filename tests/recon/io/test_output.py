@@ -187,3 +187,13 @@ def test_a_disk_that_fills_during_a_write_is_named(tmp_path: Path, monkeypatch: 
     with pytest.raises(OSError, match="No space left on device") as caught, replacing_folder(tmp_path / "out"):
         raise OSError("160000 requested and 102312 written")
     assert line_of(caught.value, "output") == f"{tmp_path / 'out'}: No space left on device"
+
+
+def test_files_of_other_options_do_not_stay_beside_new_ones(tmp_path: Path) -> None:
+    for name in ("image.tif", "filled.tif", "notes.txt"):
+        (tmp_path / name).write_text("old", encoding="utf-8")
+    (tmp_path / "frames.ome.zarr").mkdir()
+    with replacing_folder(tmp_path, optional=["filled.tif", "frames.ome.zarr"]) as folder:
+        (folder / "image.tif").write_text("new", encoding="utf-8")
+    left = {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()}
+    assert left == {"image.tif": "new", "notes.txt": "old"}

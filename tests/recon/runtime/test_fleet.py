@@ -7,6 +7,7 @@ import pytest
 
 from recon.cli.diagnose_each import diagnose_each
 from recon.cli.reconstruct_many import reconstruct_files
+from recon.runtime import fleet
 from recon.runtime.fleet import plan_fleet, state_inputs
 from recon.steps.reconstruction import Options
 from scanner import devices
@@ -65,3 +66,14 @@ def test_old_results_are_not_done_after_an_overwrite_that_was_killed(tmp_path: P
     assert plan_fleet(recordings[:1], tmp_path / "out", options, "summary.json", False).done == frozenset()
     assert sorted(path.name for path in (tmp_path / "out" / "a").iterdir()) == ["image.tif"]
     assert (tmp_path / "out" / "b" / "summary.json").read_text(encoding="utf-8") == "old"
+
+
+def test_registered_files_are_part_of_what_results_were_made_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, stated = tmp_path / "terms.py", [state_inputs(None, None)]
+    monkeypatch.setattr(fleet, "registered_files", lambda: (path,))
+    for text in ("first", "second"):
+        path.write_text(text, encoding="utf-8")
+        stated.append(state_inputs(None, None))
+    assert len(set(stated)) == 3
