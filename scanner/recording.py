@@ -243,7 +243,8 @@ class Recording:
 
     @property
     def origin(self) -> float:
-        """Time from which drifts and phases of a device's terms count [s]: the start of the complete recording."""
+        """Time from which drifts and phases of a device's terms count [s]: the start, or that of the whole of
+        a part."""
         return self.start if self._origin is None else self._origin
 
     @property
@@ -272,7 +273,7 @@ class Recording:
     def slice(self, t0: float, t1: float) -> Recording:
         """Return the samples with ``t0 <= t < t1`` [s], on the same clock, without channels that have none.
 
-        The origin stays that of the whole, so that a drift of the device continues.
+        It is a recording by itself: drifts of a device begin at its start.
 
         Raises:
             BadInput: the interval holds no sample of any channel.
@@ -283,7 +284,11 @@ class Recording:
             what = f"holds nothing from {t0:g} s to {t1:g} s"
             raise BadInput(what, file=self.path, hint=f"it runs from {self.start:g} s to {self.end:g} s")
         edges = {name: each.between(t0, t1) for name, each in self.edges.items()}
-        return replace(self, channels=MappingProxyType(nonempty), edges=MappingProxyType(edges), _origin=self.origin)
+        return replace(self, channels=MappingProxyType(nonempty), edges=MappingProxyType(edges), _origin=None)
+
+    def part(self, t0: float, t1: float) -> Recording:
+        """Return :meth:`slice` with the origin of the whole, so that a drift of the device continues in it."""
+        return replace(self.slice(t0, t1), _origin=self.origin)
 
     def without_channel(self, name: str) -> Recording:
         """Return the recording without a channel, with the same origin."""

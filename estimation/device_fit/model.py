@@ -143,12 +143,13 @@ class Model:
         return Model(self.runs, self.device, candidates, self.mains)
 
     def scales(self, axis: str) -> NaturalScales:
-        """Natural scales of an axis, from the recording with the strongest drive, then with the largest motion.
+        """Natural scales of an axis, from the recording with the strongest drive, then with the smallest motion.
 
-        A ringdown among driven recordings has no drive, with whose scales no term of the drive would apply.
+        A ringdown among driven recordings has no drive, with whose scales no term of the drive would apply. The priors
+        of nonlinear laws are widest by the smallest motion.
         """
         of_runs = (run.scales[axis] for run in self.runs if axis in run.scales)
-        return max(of_runs, key=lambda scales: (scales.voltage_rms, scales.amplitude))
+        return max(of_runs, key=lambda scales: (scales.voltage_rms, -scales.amplitude))
 
     def values(self, candidate: Candidate, x: Array) -> tuple[float, ...]:
         """Physical values of the parameters of a candidate."""

@@ -210,7 +210,7 @@ def keep_part(sensed: Motion, estimated: EstimatedMotion, duration: float) -> Fr
     """Return a part of a frame with the samples in memory in which the phase error of the readout can be measured."""
     prepared = estimated.prepared
     start = prepared.intensity.start
-    cut = prepared.recording.slice(start, start + MAX_REGISTERED_PERIODS * slow_period(sensed))
+    cut = prepared.recording.part(start, start + MAX_REGISTERED_PERIODS * slow_period(sensed))
     channels = {
         name: replace(channel, raw=channel.stored(), first=0, stop=channel.size)
         for name, channel in cut.channels.items()

@@ -66,7 +66,7 @@ def _sense_beginning(recording: Recording, device: Device) -> tuple[Recording, M
     """The first ``TRIED_S`` of a recording, and the motion from its sensors; of all of it where that is too short."""
     if recording.duration > TRIED_S:
         with suppress(BadInput):
-            beginning = recording.slice(recording.start, recording.start + TRIED_S)
+            beginning = recording.part(recording.start, recording.start + TRIED_S)
             sensed = estimate(beginning, device, "sensor")
             if TRIED_S * min(float(np.median(axis.frequency)) for axis in sensed.axes.values()) >= MIN_TRIED_PERIODS:
                 return beginning, sensed

@@ -99,7 +99,7 @@ def prepare(recording: Recording, device: DeviceSource | None = None) -> Prepare
     device = select_device(recording, device)
     clock_jumps = detect_clock_jumps(recording)
     if clock_jumps:
-        recording = recording.slice(*longest_segment(recording, clock_jumps))
+        recording = recording.part(*longest_segment(recording, clock_jumps))
     for axis in AXES:
         device.axis(axis)
     check_drives(recording, device)
@@ -137,9 +137,9 @@ def prepare_frame(recording: Recording, device: Device, start: float, stop: floa
     Raises:
         BadInput: the part holds no intensity.
     """
-    frame, lagging = (correct_intensity(recording, device, undo_lag=each).slice(start, stop) for each in (True, False))
+    frame, lagging = (correct_intensity(recording, device, undo_lag=each).part(start, stop) for each in (True, False))
     frame.require("intensity", "a picture needs it")
-    uncorrected = recording.slice(start, stop)
+    uncorrected = recording.part(start, stop)
     return PreparedRecording(
         recording=frame,
         lagging=lagging.require("intensity", "a picture needs it"),

@@ -165,6 +165,6 @@ def test_a_drift_counts_from_the_start_of_the_whole_recording() -> None:
     angle = 0.1 * np.sin(resonance * time)
     sensed = 10.0 * angle * (1.0 + 0.2 * time / 0.1)
     device = Device("stage", {"x": axis})
-    half = Recording.from_arrays({"sense_x": (sensed, "V", rate, 0.0)}, device).slice(0.05, np.inf)
+    half = Recording.from_arrays({"sense_x": (sensed, "V", rate, 0.0)}, device).part(0.05, np.inf)
     found = estimate(half, device, "sensor").axes["x"].angle.read(0, 5000)
     np.testing.assert_allclose(found, angle[5000:], atol=1e-4)

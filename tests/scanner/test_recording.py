@@ -330,6 +330,7 @@ def test_a_recording_whose_edge_lists_are_empty_lasts_as_long_as_its_channels() 
 def test_a_part_of_a_recording_keeps_the_origin_of_the_whole() -> None:
     recording = Recording.from_arrays({"sense": ramp(1e3, 0.5, 100), "intensity": ramp(1e3, 0.4, 100)})
     assert recording.origin == recording.start == 0.4
-    assert recording.slice(0.45, 0.5).slice(0.46, 0.47).origin == 0.4
+    assert recording.part(0.45, 0.5).part(0.46, 0.47).origin == 0.4
+    assert recording.part(0.45, 0.5).slice(0.46, 0.47).origin == pytest.approx(0.46)  # a recording by itself
     without = recording.without_channel("intensity")
     assert (without.start, without.origin) == (0.5, 0.4)
