@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lissajous.functions import DeviceSource, load_device
-from scanner.arguments import check_numbers
-from scanner.errors import BadInput
+from scanner.arguments import check_pairs
 from scanner.wording import counted
 
 if TYPE_CHECKING:
@@ -63,17 +63,17 @@ def design(
         margin: relative change of either stiffness that field and motion have to survive.
 
     Raises:
-        BadInput: an argument is no number, the drives do not sustain the field, or no pair of frequencies repeats at
-            the frame rate.
+        BadInput: an argument is no number or no pair of numbers, the drives do not sustain the field, or no pair of
+            frequencies repeats at the frame rate.
     """
     from recon.imaging.picture import grid_of_scan
     from recon.scan_design import ScanRequirements, wanted_field
     from recon.scan_design import design as design_scan
 
-    if not isinstance(volts, Sequence) or len(volts) != 2:
-        raise BadInput(f"is {volts!r}", channel="volts", hint="give amplitude and offset, as (30.0, 30.0)")
-    for number in volts:
-        check_numbers(volts=number)
+    check_pairs(Integral, "give width and height, as (400, 400)", pixels=pixels)
+    check_pairs(Real, "give amplitude and offset [V], as (30.0, 30.0)", volts=volts)
+    if half_angles is not None:
+        check_pairs(Real, "give half the field in x and y [rad], as (0.1, 0.1)", half_angles=half_angles)
     loaded = load_device(device)
     grid = grid_of_scan(*pixels, wanted_field(loaded, half_angles))
     requirements = ScanRequirements(grid, frame_rate, fill, sample_rate, margin)

@@ -160,6 +160,8 @@ def make_target(name: str | Path, size: Size = DEFAULT_SIZE) -> Array:
     Raises:
         BadInput: neither a known name nor a file, or a file without a usable picture.
     """
+    if not isinstance(name, (str, Path)):
+        raise BadInput(f"is {name!r}", channel="target", hint="give the name of a target or an image file, as text")
     if name in TARGETS:
         return TARGETS[str(name)](size)
     if name in TISSUES:

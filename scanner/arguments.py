@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 
 import numpy as np
@@ -39,6 +39,23 @@ def check_numbers(**numbers: object) -> None:
 def check_whole_numbers(**numbers: object) -> None:
     """Check that every argument is a whole number; as :func:`check_numbers`. 3.0 is none."""
     _check_types(Integral, "give a whole number", numbers)
+
+
+def check_pairs(kind: type, hint: str, **pairs: object) -> None:
+    """Check that every argument is a sequence of two numbers of a kind.
+
+    Args:
+        kind: ``numbers.Real`` or ``numbers.Integral``.
+        hint: what to give, with an example.
+        pairs: by the name of their argument.
+
+    Raises:
+        BadInput: one is none; the error names the argument.
+    """
+    for name, pair in pairs.items():
+        numbers = list(pair) if isinstance(pair, Iterable) else []
+        if len(numbers) != 2 or not all(isinstance(n, kind) and not isinstance(n, bool) for n in numbers):
+            raise BadInput(f"is {pair!r}", channel=name, hint=hint)
 
 
 def check_type(kind: type, hint: str, **values: object) -> None:

@@ -241,7 +241,11 @@ def test_a_bound_needs_positive_numbers_of_pixels() -> None:
         (lambda: lissajous.Device.from_toml(3), "text: is a int, no str; give the text"),
         (lambda: lissajous.phase_bound("a", 100.0), "p: is 'a'; give a number"),
         (lambda: lissajous.design(frame_rate="a"), "frame_rate: is 'a'; give a number"),
-        (lambda: lissajous.design(volts="ab"), "volts: is 'a'; give a number"),
+        (lambda: lissajous.design(volts="ab"), "volts: is 'ab'; give amplitude and offset"),
+        (lambda: lissajous.design(pixels=400), r"pixels: is 400; give width and height, as \(400, 400\)"),
+        (lambda: lissajous.design(pixels=(400.0, 400)), r"pixels: is \(400.0, 400\); give width and height"),
+        (lambda: lissajous.design(half_angles=0.1), "half_angles: is 0.1; give half the field in x and y"),
+        (lambda: lissajous.simulate(target=["a"]), r"target: is \['a'\]; give the name of a target"),
         (lambda: lissajous.design(volts=(1.0,)), "volts: is .*; give amplitude and offset"),
     ],
 )
