@@ -73,13 +73,16 @@ def intensity_delay(device: Device, step: float) -> float:
         step: sampling interval of the channel [s].
 
     Raises:
-        BadInput: the delay is longer than ``MAX_DELAY_SAMPLES``.
+        BadInput: the delay is longer than ``MAX_DELAY_SAMPLES``, or no light reaches the channel.
     """
     terms, samples = terms_on_channel(device, "intensity"), MIN_RAMP_SAMPLES
     while True:
         time = step * np.arange(samples, dtype=np.float64)
         ramp, gain = apply_terms(terms, time, time), apply_terms(terms, np.ones(samples), time)
         middle = samples // 2  # after the transient of the start, and before the samples that a shift runs out of
+        if not gain[middle] > 0.0:
+            what = f"holds no light {time[middle]:.3g} s after the start by the terms of {device.name}"
+            raise BadInput(what, channel="intensity", hint="check tau of its terms, in seconds")
         delay = float(time[middle] - ramp[middle] / gain[middle])
         if MIN_RAMP_DELAYS * abs(delay) <= samples * step:
             return delay

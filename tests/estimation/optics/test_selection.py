@@ -244,6 +244,12 @@ def test_a_delay_of_any_length_is_corrected(tau: float) -> None:
     assert intensity_delay(device, 2e-7) == pytest.approx(tau, rel=1e-6)
 
 
+def test_light_that_decays_at_once_is_refused() -> None:
+    device = Device.from_toml("[x]\n[y]\n[x.terms.bleaching]\ntau = 1e-12\n")
+    with pytest.raises(BadInput, match=r"intensity: holds no light .* check tau"):
+        intensity_delay(device, 2e-7)
+
+
 def test_a_delay_of_seconds_is_refused() -> None:
     device = Device.from_toml("[x]\n[y]\n[x.terms.intensity-delay]\ntau = 1.0\n")
     with pytest.raises(BadInput, match=r"intensity: comes 0.\d+ s or more after the light .* check tau"):
