@@ -15,7 +15,7 @@ from estimation.held_samples import held_runs_while_driven, without_samples
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
 from scanner.device import Device
-from scanner.errors import BadInput
+from scanner.errors import BadInput, DeviceInvalid
 from scanner.recording import Recording
 from scanner.terms.measured_law import EFFECT as MEASURED_LAW
 from scanner.terms.measured_law import beyond
@@ -61,19 +61,47 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
         The prediction of each channel by its name.
 
     Raises:
-        BadInput: the recording has no sense or angle channel, a channel is missing or invalid, or its motion persists
-            without a recorded drive.
+        BadInput: the recording has no sense or angle channel, a channel is missing or invalid, its motion persists
+            without a recorded drive, or the predicted motion diverges.
     """
     run = prepare_run(recording, device)
     if axes_without_drive(recording, device) and (steady := steady_without_drive(recording, device)) is not None:
         hint = "record the voltage that drives it; without one a free decay is predicted"
         raise BadInput(f"has no drive to predict from: {steady}", file=recording.path, hint=hint)
-    model, x = fit_start_only([run], device)
+    signals = _signals(run, device)
+    for output, signal in zip(run.outputs, signals, strict=True):
+        if not np.isfinite(signal).all():
+            raise _divergence(run, device, output.axes)
     held = held_runs_while_driven(recording, device)
     return {
         output.name: _at_sample_times(run, index, signal, recording, held.get(output.name, []))
-        for index, (output, signal) in enumerate(zip(run.outputs, model.full_signals(x), strict=True))
+        for index, (output, signal) in enumerate(zip(run.outputs, signals, strict=True))
     }
+
+
+def _signals(run: Run, device: Device) -> list[Array]:
+    """Every channel of a run on the integration grid. That of a motion that diverges is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        model, x = fit_start_only([run], device)
+        return model.full_signals(x)
+
+
+def _divergence(run: Run, device: Device, axes: Sequence[str]) -> DeviceInvalid:
+    """The error of a motion of ``axes`` that diverges. It names a term without which no predicted motion diverges."""
+    terms = [(name, effect) for name in run.inputs for effect in device.axes[name].terms]
+    for name, effect in terms:
+        axis = device.axes[name]
+        rest = {each: values for each, values in axis.terms.items() if each != effect}
+        without = replace(device, axes={**device.axes, name: replace(axis, terms=rest)})
+        if all(np.isfinite(signal).all() for signal in _signals(run, without)):
+            hint = (
+                "without this term it does not: its size, or a frequency of it far above that of the motion, is wrong"
+            )
+            where = f"{name}.terms.{effect}"
+            return DeviceInvalid("lets the predicted motion diverge", file=device.source, channel=where, hint=hint)
+    what = "lets the predicted motion diverge"
+    hint = "check its mechanics, its drive and its terms; all values are in SI units"
+    return DeviceInvalid(what, file=device.source, channel=" and ".join(axes), hint=hint)
 
 
 def drifts(device: Device) -> dict[str, list[str]]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from estimation.device_fit.predict import predict
 from scanner.active_terms import stated_terms
 from scanner.device import Axis, Device
+from scanner.errors import DeviceInvalid
 from scanner.forward_model import DriveInput, simulate_axis
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
@@ -55,3 +59,16 @@ def test_the_start_of_an_overdamped_axis_is_that_of_the_first_samples() -> None:
     predicted = predict(Recording.from_arrays(channels, Device("tank", {"x": true})), Device("tank", {"x": tank}))
     values = predicted["sense_x"].values
     assert abs(values[0] - level[0]) < 0.2 * np.ptp(level)
+
+
+@pytest.mark.parametrize(
+    ("terms", "key"),
+    [
+        ({"sensor-cubic": {"c3": 0.1}, "second-mode": {"c": 0.01, "f2": 1e6, "Q2": 40.0}}, r"x\.terms\.second-mode"),
+        ({"second-mode": {"c": 0.01, "f2": 1e6, "Q2": 40.0}, "viscoelastic": {"k_v": 0.1, "tau_v": 1e-8}}, "x"),
+    ],
+)
+def test_a_prediction_that_diverges_names_the_term(terms: dict[str, dict[str, float]], key: str) -> None:
+    device = Device("stage", {"x": replace(STAGE, terms=terms)})
+    with pytest.raises(DeviceInvalid, match=f"^{key}: lets the predicted motion diverge; "):
+        predict(stage_recording(), device)
