@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
 from scanner.device import Axis
+from scanner.device_toml import INDEX, checked_number
 from scanner.errors import BadInput, DeviceInvalid
+from scanner.integrator.abi import MAX_TERMS_PER_STAGE
 from scanner.terms import STAGES, Term, catalogue
 from scanner.terms.driven_modes import EFFECT as DRIVEN_MODES
 from scanner.terms.driven_modes import driven_modes
@@ -37,37 +39,64 @@ def stated_terms(axis: Axis) -> tuple[ActiveTerm, ...]:
     """Return the terms that a device file states for an axis under ``[x.terms.<effect>]``.
 
     Raises:
-        BadInput: the catalogue has no such effect, or the file lacks one of its parameters.
+        BadInput: the catalogue has no such effect, or a value of it is missing or cannot be used.
+        DeviceInvalid: more terms of one stage than the integrator takes.
     """
-    known = catalogue()
-    return tuple(
-        active for effect, values in axis.terms.items() for active in _stated_term(axis, effect, dict(values), known)
+    known, others = catalogue(), axis.extra.get("terms", {})
+    stated = tuple(
+        active
+        for effect, values in axis.terms.items()
+        for active in _stated_term(axis, effect, {**others.get(effect, {}), **values}, known)
     )
+    _check_number_of_terms(axis, "torque", [each.term for each in stated if each.term.torque])
+    _check_number_of_terms(axis, "capacitance", [each.term for each in stated if each.term.capacitance])
+    return stated
+
+
+def _check_number_of_terms(axis: Axis, quantity: str, terms: Sequence[Term]) -> None:
+    """Check that the integrator takes as many terms that change a quantity. Raises DeviceInvalid."""
+    if len(terms) > MAX_TERMS_PER_STAGE:
+        what = f"states {len(terms)} effects on the {quantity}, and at most {MAX_TERMS_PER_STAGE} can act on one axis"
+        hint = f"keep the largest of {', '.join(term.effect for term in terms)}"
+        raise DeviceInvalid(what, file=axis.source, channel=f"{axis.name}.terms", hint=hint)
 
 
 def _stated_term(axis: Axis, effect: str, values: dict[str, Any], known: dict[str, Term]) -> list[ActiveTerm]:
     """The term that a table states; once for each channel where it acts on several."""
     key = f"{axis.name}.terms.{effect}"
-    if effect in (MEASURED_LAW, DRIVEN_MODES):
-        try:
-            if effect == DRIVEN_MODES:
-                return [ActiveTerm(*law) for law in driven_modes(values, axis)]
-            law, packed = measured_law(values)
-        except DeviceInvalid as error:
-            raise DeviceInvalid(error.what, file=axis.source, channel=key, hint=error.hint) from None
-        return [ActiveTerm(law, packed, law.channels[0])]
-    if effect not in known:
+    if effect not in (MEASURED_LAW, DRIVEN_MODES, *known):
         near = get_close_matches(effect, known) or known
         hint = f"known effects: {', '.join(near)}; a term file of your own is given with --terms"
         raise BadInput("is not an effect of the catalogue", file=axis.source, channel=key, hint=hint)
-    term = known[effect]
+    try:
+        if effect == DRIVEN_MODES:
+            return [ActiveTerm(*law) for law in driven_modes(values, axis)]
+        if effect == MEASURED_LAW:
+            law, packed = measured_law(values)
+            return [ActiveTerm(law, packed, law.channels[0])]
+        return [_catalogue_term(known[effect], values)]
+    except DeviceInvalid as error:
+        key = ".".join(part for part in (key, error.channel) if part)
+        raise DeviceInvalid(error.what, file=axis.source, channel=key, hint=error.hint) from None
+
+
+def _catalogue_term(term: Term, values: Mapping[str, Any]) -> ActiveTerm:
+    """The term of the catalogue with the values of a table.
+
+    Raises:
+        DeviceInvalid: a value is missing or does not satisfy the condition of its parameter.
+    """
     if missing := [p.name for p in term.parameters if p.name not in values]:
-        hint = f"{effect} needs {', '.join(p.name for p in term.parameters)}"
-        raise BadInput(f"lacks {missing[0]}", file=axis.source, channel=key, hint=hint)
-    variant = int(values.get("variant", 0))
-    if not 0 <= variant < len(term.variants):
-        raise BadInput(f"variant {variant} is unknown", file=axis.source, channel=key, hint="count from 0")
-    return [ActiveTerm(term, tuple(values[p.name] for p in term.parameters), term.variants[variant])]
+        hint = f"{term.effect} needs {', '.join(p.name for p in term.parameters)}"
+        raise DeviceInvalid(f"lacks {missing[0]}", hint=hint)
+    channels = ", ".join(f"{index}: {name}" for index, name in enumerate(term.variants))
+    variant = int(checked_number(values.get("variant", 0), INDEX["must"], "variant", f"known are {channels}"))
+    if variant >= len(term.variants):
+        raise DeviceInvalid(f"is {variant}, which is unknown", channel="variant", hint=f"known are {channels}")
+    channel = term.variants[variant]
+    hint = f"remove the term if it has no effect; its law is {term.equation}"
+    checked = tuple(checked_number(values[p.name], p.condition(channel), p.name, hint) for p in term.parameters)
+    return ActiveTerm(term, checked, channel)
 
 
 def in_stage_order(terms: Iterable[ActiveTerm]) -> list[ActiveTerm]:

@@ -9,6 +9,7 @@ from math import isfinite
 from typing import Any, TypeVar
 
 from scanner.errors import DeviceInvalid
+from scanner.wording import counted
 
 # Conditions on the number in a field: stored as the field's metadata, checked when the dataclass is made.
 FINITE = {"must": "be a finite number"}
@@ -16,6 +17,7 @@ POSITIVE = {"must": "be a number greater than 0"}
 NOT_NEGATIVE = {"must": "be a number, 0 or greater"}
 NONZERO = {"must": "be a number other than 0"}
 WHOLE = {"must": "be a whole number greater than 0"}
+INDEX = {"must": "be a whole number, 0 or greater"}
 CAN_BE_OFF = {"optional": True}
 
 _CONDITIONS: dict[str, Callable[[Any], bool]] = {
@@ -24,6 +26,7 @@ _CONDITIONS: dict[str, Callable[[Any], bool]] = {
     NOT_NEGATIVE["must"]: lambda number: number >= 0,
     NONZERO["must"]: lambda number: number != 0,
     WHOLE["must"]: lambda number: isinstance(number, int) and number > 0,
+    INDEX["must"]: lambda number: number >= 0 and float(number).is_integer(),  # tables of terms hold floats
 }
 
 T = TypeVar("T")
@@ -49,6 +52,25 @@ def checked_number(value: object, must: str, key: str, hint: str = "") -> float 
     raise DeviceInvalid(f"is {value!r} and must {must}", channel=key)
 
 
+def checked_numbers(value: object, must: str, key: str, size: int | None = None) -> tuple[float | int, ...]:
+    """Return ``value`` as a tuple of numbers that satisfy ``must``.
+
+    Args:
+        value: of the device file.
+        must: condition on every number.
+        key: of the value.
+        size: how many numbers are needed; any where None.
+
+    Raises:
+        DeviceInvalid: it is no list, has another length, or a number does not satisfy the condition.
+    """
+    if not isinstance(value, (list, tuple)):
+        raise DeviceInvalid(f"is {value!r} and must be a list of numbers", channel=key)
+    if size is not None and len(value) != size:
+        raise DeviceInvalid(f"has {counted(len(value), 'number')} and must have {size}", channel=key)
+    return tuple(checked_number(number, must, key) for number in value)
+
+
 def check_values(record: object) -> None:
     """Check every number of a dataclass against its field's metadata and store it as float (or int)."""
     for item in fields(record):  # type: ignore[arg-type]
@@ -56,9 +78,7 @@ def check_values(record: object) -> None:
         if must is None or (value is None and item.metadata.get("optional")):
             continue
         if item.type in ("tuple[float, ...]", "tuple[int, ...]"):
-            if not isinstance(value, (list, tuple)):
-                raise DeviceInvalid(f"is {value!r} and must be a list of numbers", channel=item.name)
-            checked: object = tuple(checked_number(number, must, item.name) for number in value)
+            checked: object = checked_numbers(value, must, item.name)
         else:
             checked = checked_number(value, must, item.name, item.metadata.get("hint", ""))
         object.__setattr__(record, item.name, checked)

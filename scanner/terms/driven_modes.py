@@ -24,12 +24,16 @@ from numba.extending import register_jitable
 
 from scanner.arrays import Array
 from scanner.device import Axis
+from scanner.device_toml import FINITE, POSITIVE, checked_number, checked_numbers
 from scanner.errors import DeviceInvalid
 from scanner.stages import MotionSensor
 from scanner.terms.term import Parameter, SignalContext, Term
 
 EFFECT = "driven-modes"
-LISTS = ("frequency", "quality", "gain", "gain_rate")
+LISTS = {"frequency": POSITIVE, "quality": POSITIVE, "gain": FINITE}
+"""Lists that every table has, with the condition on their numbers."""
+
+GAIN_RATE = "gain_rate"
 EQUATION = "y = y_nominal + Σ q_i + direct V,  q_i'' + (ω_i/Q_i) q_i' + ω_i² q_i = a_i V + h_i V'/ω_i"
 SOURCE = "Ewins, Modal Testing, Research Studies Press (2000), section 4.3: residues and residual terms"
 
@@ -156,21 +160,20 @@ def driven_modes(table: Mapping[str, Any], axis: Axis) -> list[tuple[Term, tuple
     """Return the term, its packed values and its channel, for every channel that contains the modes of a table.
 
     Raises:
-        DeviceInvalid: a list is missing or of another length, a frequency or quality is not positive, or the readout
-            is not a sensor of motion.
+        DeviceInvalid: a list is missing or of another length, a value is no finite number, a frequency or quality is
+            not positive, or the readout is not a sensor of motion.
     """
-    if missing := [key for key in LISTS[:3] if key not in table]:
-        raise DeviceInvalid(f"lacks {missing[0]}", channel=EFFECT, hint=f"it needs {', '.join(LISTS[:3])}")
-    columns = [np.atleast_1d(np.asarray(table.get(key, np.zeros(len(table["gain"]))), float)) for key in LISTS]
-    if len({column.size for column in columns}) > 1:
-        hint = "state one frequency, quality and gain a mode"
-        raise DeviceInvalid("has lists of different lengths", channel=EFFECT, hint=hint)
-    if not np.all(np.concatenate(columns[:2]) > 0.0):
-        raise DeviceInvalid("has a mode without frequency or quality", channel=EFFECT, hint="state them above 0")
+    if missing := [key for key in LISTS if key not in table]:
+        raise DeviceInvalid(f"lacks {missing[0]}", hint=f"it needs {', '.join(LISTS)}")
+    columns = [checked_numbers(table[key], must["must"], key) for key, must in LISTS.items()]
+    columns.append(checked_numbers(table.get(GAIN_RATE, (0.0,) * len(columns[0])), FINITE["must"], GAIN_RATE))
+    if len({len(column) for column in columns}) > 1:
+        raise DeviceInvalid("has lists of different lengths", hint="state one frequency, quality and gain a mode")
+    direct = checked_number(table.get("direct", 0.0), FINITE["must"], "direct")
     if axis.readout is not None and not isinstance(axis.readout, MotionSensor):
         hint = "use a readout of kind position, velocity or acceleration, or the term second-mode"
-        raise DeviceInvalid("acts on sensors of motion only", channel=EFFECT, hint=hint)
-    values = (float(columns[0].size), float(table.get("direct", 0.0)), *map(float, np.stack(columns, axis=1).ravel()))
+        raise DeviceInvalid("acts on sensors of motion only", hint=hint)
+    values = (float(len(columns[0])), direct, *np.transpose(columns).ravel().tolist())
     names = tuple(Parameter(f"p{i}", "SI", lambda scales: 0.0) for i in range(len(values)))
     channels = [channel for channel in CHANNELS if channel != "sense" or axis.readout is not None]
     return [

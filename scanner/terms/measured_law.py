@@ -33,6 +33,7 @@ import numpy as np
 from numba import njit
 
 from scanner.arrays import Array
+from scanner.device_toml import FINITE, INDEX, checked_numbers
 from scanner.errors import DeviceInvalid
 from scanner.integrator.abi import TORQUE_LAW
 from scanner.terms.term import Parameter, SignalContext, Term
@@ -126,41 +127,52 @@ def measured_law(table: Mapping[str, Any]) -> tuple[Term, tuple[float, ...]]:
     """Return the term that a table of a device file states, and its packed values.
 
     Raises:
-        DeviceInvalid: a stage that has no measured law, a key missing, lists of different lengths, or a table that is
-            not ascending, has fewer than two knots, or is of two variables.
+        DeviceInvalid: a stage that has no measured law, a key missing, a value that is no list of finite numbers, lists
+            of different lengths, an upper end below the lower one, or a table that is not ascending, has fewer than
+            two knots, or is of two variables.
     """
     stage = table.get("stage")
-    if stage not in VARIABLES:
-        hint = f"stages with a measured law: {', '.join(VARIABLES)}"
-        raise DeviceInvalid(f"stage {stage!r} is unknown", channel=EFFECT, hint=hint)
+    if not isinstance(stage, str) or stage not in VARIABLES:
+        raise DeviceInvalid(f"stage {stage!r} is unknown", hint=f"stages with a measured law: {', '.join(VARIABLES)}")
     needed = ("centre", "lower", "upper", "powers", "coefficients")
     if missing := [key for key in needed if key not in table]:
-        raise DeviceInvalid(f"lacks {missing[0]}", channel=EFFECT, hint=f"it needs {', '.join(needed)}")
-    count, width = len(table["coefficients"]), len(VARIABLES[stage])
-    ends = [list(map(float, table[key])) for key in ("centre", "lower", "upper")]
-    powers: list[list[int]] = [list(map(int, each)) for each in table["powers"]]
-    if len(powers) != count or {len(each) for each in powers} | {len(each) for each in ends} != {width}:
-        hint = (
-            f"one power of {' and '.join(VARIABLES[stage])} a coefficient, one centre, lower and upper end a variable"
-        )
-        raise DeviceInvalid("has lists of the wrong length", channel=EFFECT, hint=hint)
-    centre, lower, upper = ([*each, 0.0][:2] for each in ends)
-    packed = [float(count), *centre, *lower, *upper]
-    for each, coefficient in zip(powers, table["coefficients"], strict=True):
-        packed += [*map(float, [*each, 0][:2]), float(coefficient)]
-    packed += _packed_table(table, width)
+        raise DeviceInvalid(f"lacks {missing[0]}", hint=f"it needs {', '.join(needed)}")
+    width = len(VARIABLES[stage])
+    packed = _packed_range(table, width) + _packed_polynomial(table, VARIABLES[stage])
+    packed = [float(len(table["coefficients"])), *packed, *_packed_table(table, width)]
     names = [Parameter(f"p{i}", "SI", lambda scales: 0.0) for i in range(len(packed))]
     return Term(EFFECT, stage, "law as measured, no name", tuple(names), "a diagnosis", **_LAWS[stage]), tuple(packed)
 
 
+def _packed_range(table: Mapping[str, Any], width: int) -> list[float]:
+    """Centre, lower and upper end, each of two variables."""
+    keys = ("centre", "lower", "upper")
+    centre, lower, upper = (checked_numbers(table[key], FINITE["must"], key, width) for key in keys)
+    if any(low > high for low, high in zip(lower, upper, strict=True)):
+        what = f"is {list(upper)} and must not be below lower, {list(lower)}"
+        raise DeviceInvalid(what, channel="upper", hint="state the range in which the law was measured")
+    return [number for each in (centre, lower, upper) for number in [*each, 0.0][:2]]
+
+
+def _packed_polynomial(table: Mapping[str, Any], variables: Sequence[str]) -> list[float]:
+    """For each coefficient the powers of two variables and its value."""
+    coefficients, powers = checked_numbers(table["coefficients"], FINITE["must"], "coefficients"), table["powers"]
+    if not isinstance(powers, (list, tuple)) or len(powers) != len(coefficients):
+        what = f"is {powers!r} and must be a list with one list of powers a coefficient"
+        raise DeviceInvalid(what, channel="powers", hint=f"each holds the power of {' and of '.join(variables)}")
+    each_power = [checked_numbers(each, INDEX["must"], "powers", len(variables)) for each in powers]
+    rows = zip(each_power, coefficients, strict=True)
+    return [number for power, coefficient in rows for number in (*[*power, 0.0][:2], coefficient)]
+
+
 def _packed_table(table: Mapping[str, Any], width: int) -> list[float]:
     """The knots of a law and its values at them; empty where it has no table."""
-    knots, values = (list(map(float, table.get(key, ()))) for key in ("knots", "knot_values"))
+    knots, values = (checked_numbers(table.get(key, ()), FINITE["must"], key) for key in ("knots", "knot_values"))
     if not knots and not values:
         return []
     if width > 1 or len(knots) != len(values) or len(knots) < 2 or not np.all(np.diff(knots) > 0.0):
         hint = "a law of one variable has two or more ascending knots, and one of knot_values for each"
-        raise DeviceInvalid("has a table that cannot be used", channel=EFFECT, hint=hint)
+        raise DeviceInvalid("has a table that cannot be used", hint=hint)
     return [*knots, *values]
 
 

@@ -30,14 +30,27 @@ def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
     return np.sign(signal) * _clipped(np.abs(signal), limit, noise)
 
 
+ONE_RAIL = ("sense:upper", "sense:lower")
+"""Channels on which one rail alone clips, at a level of any sign: min(y, L) and max(y, -L)."""
+
 TERM = Term(
     effect="saturation",
     stage="readout",
     equation="y = clip(y_nominal, −L, L); variant 1: min(y_nominal, L), variant 2: max(y_nominal, −L)",
-    parameters=(Parameter("limit", "V", lambda s: s.sense_peak, kind="log", spread=0.2, starts=(0.0, -0.4, -1.2)),),
+    parameters=(
+        Parameter(
+            "limit",
+            "V",
+            lambda s: s.sense_peak,
+            kind="log",
+            spread=0.2,
+            starts=(0.0, -0.4, -1.2),
+            any_sign_on=ONE_RAIL,
+        ),
+    ),
     source="converter data sheets: input range",
     confounders={"sensor-cubic": "a cubic sensor makes no flat top in the histogram: look at the largest samples"},
     output=output,
-    stated_channels=("sense:upper", "sense:lower"),  # min(y, L) and max(y, -L): one rail alone, at a level of any sign
+    stated_channels=ONE_RAIL,
     after_noise=True,
 )

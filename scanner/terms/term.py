@@ -28,6 +28,7 @@ import numpy as np
 
 from scanner.arrays import Array
 from scanner.device import Axis
+from scanner.device_toml import FINITE, NONZERO, POSITIVE
 from scanner.interpolation import shift_samples
 from scanner.lowpass import apply_lowpass
 from scanner.stages import Readout
@@ -110,6 +111,8 @@ class Parameter:
         sign: +1 or -1 where physics allows only x of that sign, 0 where both.
         starts: values of x to start a search from, for a ``log`` parameter.
         minimum: lower bound of a ``log`` parameter, which is added to the above, in its unit.
+        must: condition on the value in a device file, one of ``scanner.device_toml``; that of the kind where None.
+        any_sign_on: channels on which the value may be any finite number.
     """
 
     name: str
@@ -120,6 +123,20 @@ class Parameter:
     sign: int = 0
     starts: tuple[float, ...] = (0.0,)
     minimum: float = 0.0
+    must: str | None = None
+    any_sign_on: tuple[str, ...] = ()
+
+    def condition(self, channel: str) -> str:
+        """Return the condition that a stated value has to satisfy for a term that acts on ``channel``.
+
+        A size or a spectral line may be any finite number. The other kinds divide or are exponentials, so 0 has no
+        meaning, and a negative value only for an ``inverse`` parameter of both signs.
+        """
+        if channel in self.any_sign_on or (self.must is None and self.kind in ("linear", "line")):
+            return FINITE["must"]
+        if self.must is None and self.kind == "inverse" and self.sign != 1:
+            return NONZERO["must"]
+        return self.must or POSITIVE["must"]
 
     def possible(self, x: float) -> float:
         """Return ``x``, or its nearest value that physics allows, at which an inverse parameter is finite."""

@@ -94,7 +94,11 @@ def test_estimators_take_the_modes_off_the_sense_signal() -> None:
     [
         ({"gain": None}, "lacks gain"),
         ({"quality": [40.0]}, "different lengths"),
-        ({"frequency": [805.0, 0.0]}, "without frequency"),
+        ({"frequency": 805.0, "quality": 40.0, "gain": 1.0}, "frequency: is 805.0 and must be a list of numbers"),
+        ({"frequency": ["a", 805.0]}, "frequency: is 'a' and must be a number"),
+        ({"gain": [float("nan"), 1.0]}, "gain: is nan and must be a finite number"),
+        ({"direct": "a"}, "direct: is 'a' and must be a finite number"),
+        ({"frequency": [805.0, 0.0]}, "frequency: is 0.0 and must be a number greater than 0"),
     ],
 )
 def test_modes_that_cannot_be_used_are_refused(changed: dict[str, Any], what: str) -> None:
