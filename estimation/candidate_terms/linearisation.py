@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -26,7 +25,6 @@ from estimation.device_fit.model import uncertain
 from estimation.device_fit.parameters import Candidate
 from estimation.least_squares import regress
 from scanner.arrays import Array
-from scanner.integrator.abi import MAX_TERMS_PER_STAGE
 
 FIT_ITERATIONS = 20
 """Largest number of iterations of a fit from an estimate in the linear model, which may lie in a narrow valley."""
@@ -65,13 +63,12 @@ def linear_model_of_corrections(likelihood: Likelihood, fit: Fit) -> LinearModel
 def _blocks_beside(likelihood: Likelihood, fit: Fit, candidates: Sequence[Candidate]) -> list[_Block]:
     """Candidates that a fit does not contain, as far as the integrator takes them."""
     present = {candidate.key for candidate in fit.model.candidates}
-    stages = Counter((candidate.axis, candidate.term.stage) for candidate in fit.model.candidates)
     others = [
         candidate
         for candidate in candidates
         if candidate.key not in present
         and is_linear(candidate)
-        and stages[candidate.axis, candidate.term.stage] < MAX_TERMS_PER_STAGE
+        and fit.model.has_room_for(candidate.axis, candidate.term)
     ]
     return [
         (test.candidate, test.columns, test, 2.0 * float(np.log(len(tests))))

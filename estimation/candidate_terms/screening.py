@@ -48,14 +48,17 @@ class ScoreTest:
 
 
 def all_candidates(model: Model, terms: Iterable[Term]) -> list[Candidate]:
-    """Every term on every axis and channel where it applies; terms of a shared readout are on the first axis only."""
+    """Every term on every axis and channel where it applies and the integrator takes it beside those of the model.
+
+    Terms of a shared readout are on the first axis only.
+    """
     device, candidates = model.device, list[Candidate]()
     for axis in model.axes:
         scales = model.scales(axis)
         kinds = {output.kind for run in model.runs for output in run.outputs if axis in output.axes}
         on_later_axis = device.readout is not None and axis != model.axes[0]
         for term in terms:
-            if term.applies(device.axis(axis), scales):
+            if term.applies(device.axis(axis), scales) and model.has_room_for(axis, term):
                 candidates += [
                     Candidate(term, axis, channel)
                     for channel in term.channels

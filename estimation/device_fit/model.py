@@ -22,8 +22,9 @@ from scanner.arrays import Array
 from scanner.coupled_motion import simulate_coupled
 from scanner.device import Axis, Device
 from scanner.forward_model import AxisTrajectory, DriveInput, reference_signal, sense_signal, simulate_axis
+from scanner.integrator.abi import MAX_TERMS_PER_STAGE
 from scanner.stages import Amdm
-from scanner.terms import NaturalScales
+from scanner.terms import NaturalScales, Term
 
 START_STATE_SD = 3.0
 """Prior standard deviation of the initial angle and rate in amplitudes of the motion: so wide that the data determine
@@ -137,6 +138,15 @@ class Model:
     def indices(self, kind: str, owner: str | None = None) -> list[int]:
         """Indices in x of all parameters of a kind, of one owner or of all."""
         return [i for i, f in enumerate(self.parameters) if f.kind == kind and owner in (None, f.owner)]
+
+    def has_room_for(self, axis: str, term: Term) -> bool:
+        """Whether the integrator takes one more term on an axis beside the stated ones and the candidates."""
+        terms = [active.term for active in self.given[axis]]
+        terms += [candidate.term for candidate in self.candidates if candidate.axis == axis]
+        torques, capacitances = sum(bool(each.torque) for each in terms), sum(bool(each.capacitance) for each in terms)
+        return (not term.torque or torques < MAX_TERMS_PER_STAGE) and (
+            not term.capacitance or capacitances < MAX_TERMS_PER_STAGE
+        )
 
     def with_candidates(self, candidates: Sequence[Candidate]) -> Model:
         """The model of the same recordings, device and mains with other added terms."""

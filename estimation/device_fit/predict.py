@@ -68,15 +68,25 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
     if axes_without_drive(recording, device) and (steady := steady_without_drive(recording, device)) is not None:
         hint = "record the voltage that drives it; without one a free decay is predicted"
         raise BadInput(f"has no drive to predict from: {steady}", file=recording.path, hint=hint)
-    signals = _signals(run, device)
-    for output, signal in zip(run.outputs, signals, strict=True):
-        if not np.isfinite(signal).all():
-            raise _divergence(run, device, output.axes)
+    signals = finite_signals(run, device)
     held = held_runs_while_driven(recording, device)
     return {
         output.name: _at_sample_times(run, index, signal, recording, held.get(output.name, []))
         for index, (output, signal) in enumerate(zip(run.outputs, signals, strict=True))
     }
+
+
+def finite_signals(run: Run, device: Device) -> list[Array]:
+    """Every channel of a run on the integration grid, as ``device`` predicts it.
+
+    Raises:
+        DeviceInvalid: a motion diverges; the error names the term without which it does not, if there is one.
+    """
+    signals = _signals(run, device)
+    for output, signal in zip(run.outputs, signals, strict=True):
+        if not np.isfinite(signal).all():
+            raise _divergence(run, device, output.axes)
+    return signals
 
 
 def _signals(run: Run, device: Device) -> list[Array]:

@@ -13,6 +13,7 @@ from estimation.device_fit.fit import Fit, nominal_values_are_improbable
 from estimation.device_fit.further_modes import describe_modes, with_driven_modes
 from estimation.device_fit.hum import describe_strong_hum
 from estimation.device_fit.open_loop import is_worse, open_loop
+from estimation.device_fit.predict import finite_signals
 from estimation.diagnosis.corrected_parameters import correct_parameters
 from estimation.diagnosis.finding import METRIC, Finding, beside_imperfections, find_effect
 from estimation.diagnosis.held_drive import with_held_drives
@@ -117,11 +118,15 @@ def diagnose(
         excluded: effects that are no candidates.
 
     Raises:
-        BadInput: no device, a recording that cannot be compared with it, or one in another unit or with another sign.
+        BadInput: no device, a recording that cannot be compared with it, one in another unit or with another sign, or a
+            stated term with which the motion diverges.
     """
     nominal = require_device(recordings[0], device)
     runs = [prepare_run(recording, nominal) for recording in recordings]
     check_units_and_signs(recordings, runs, nominal)
+    if any(axis.terms for axis in nominal.axes.values()):
+        for run in runs:
+            finite_signals(run, nominal)
     diagnosis = _diagnose_with_modes(runs, nominal, progress, excluded)
     return replace(diagnosis, findings=with_held_drives(diagnosis.findings, recordings, nominal))
 

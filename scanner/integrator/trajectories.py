@@ -11,6 +11,7 @@ from numba import njit, types
 
 from scanner.arrays import Array
 from scanner.device import Axis
+from scanner.errors import BadInput
 from scanner.integrator.abi import CAPACITANCE_LAW, LANES, MAX_TERMS_PER_STAGE, NOMINAL_TYPE, nominal_values
 from scanner.integrator.function_addresses import FunctionAddress, address_of
 from scanner.integrator.runge_kutta import in_all_lanes, no_law, run_kernel
@@ -102,7 +103,8 @@ def integrate(
         (angle [rad], rate [rad/s]), each of shape (n + 1,), the start included.
 
     Raises:
-        ValueError: more terms than ``MAX_TERMS_PER_STAGE``, or drives of other lengths.
+        BadInput: more terms than ``MAX_TERMS_PER_STAGE``.
+        ValueError: drives of other lengths.
         DeviceInvalid: the device states no mechanics of the axis.
     """
     return integrate_batch([TrajectorySpec(axis, start, torques, capacitances)], [voltage], step, t0, other_angle)[0]
@@ -170,7 +172,10 @@ def _float64(values: Array) -> Array:
 
 def _lane_laws(laws: list[Callable[..., Any]]) -> tuple[FunctionAddress, ...]:
     if len(laws) > MAX_TERMS_PER_STAGE:
-        raise ValueError(f"{len(laws)} terms of one stage, the integrator takes at most {MAX_TERMS_PER_STAGE}")
+        what = (
+            f"{len(laws)} effects act on the torque or the capacitance of one axis, at most {MAX_TERMS_PER_STAGE} can"
+        )
+        raise BadInput(what, hint="state fewer terms in the device")
     return tuple(map(in_all_lanes, laws)) + (address_of(no_law),) * (MAX_TERMS_PER_STAGE - len(laws))
 
 

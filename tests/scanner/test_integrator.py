@@ -72,7 +72,7 @@ def test_too_many_motions_or_terms_are_refused() -> None:
         integrate_batch([TrajectorySpec(AXIS, (0.1, 0.0))] * (LANES + 1), [voltage] * (LANES + 1), 1e-6)
     cubic = catalogue()["cubic-stiffness"].torque
     assert cubic
-    with pytest.raises(ValueError, match="5 terms of one stage"):
+    with pytest.raises(ValueError, match="5 effects act on the torque"):
         integrate(AXIS, (0.1, 0.0), voltage, 1e-6, 0.0, [TorqueTerm(cubic, (0.0,))] * 5)
 
 

@@ -7,13 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimation.candidate_terms.screening import all_candidates
+from estimation.device_fit.data import prepare_run
+from estimation.device_fit.model import Model
 from estimation.device_fit.predict import predict
+from estimation.diagnosis.diagnose import diagnose
 from scanner.active_terms import stated_terms
 from scanner.device import Axis, Device
 from scanner.errors import DeviceInvalid
 from scanner.forward_model import DriveInput, simulate_axis
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
+from scanner.terms import catalogue
 
 SAMPLE_RATE_HZ = 2000.0
 CREEP = 0.003  # [V]
@@ -72,3 +77,18 @@ def test_a_prediction_that_diverges_names_the_term(terms: dict[str, dict[str, fl
     device = Device("stage", {"x": replace(STAGE, terms=terms)})
     with pytest.raises(DeviceInvalid, match=f"^{key}: lets the predicted motion diverge; "):
         predict(stage_recording(), device)
+    with pytest.raises(DeviceInvalid, match=f"^{key}: lets the predicted motion diverge; "):
+        diagnose([stage_recording()], device)
+
+
+def test_terms_that_the_integrator_does_not_take_are_no_candidates() -> None:
+    stated = {
+        "cubic-stiffness": {"k3": 1.0},
+        "quintic-stiffness": {"k5": 1.0},
+        "quadratic-stiffness": {"k2": 1.0},
+        "viscoelastic": {"k_v": 0.1, "tau_v": 1e-3},
+    }
+    recording, device = stage_recording(), Device("stage", {"x": replace(STAGE, terms=stated)})
+    model = Model([prepare_run(recording, device)], device)
+    terms = [catalogue()[effect] for effect in ("quadratic-drag", "sensor-cubic")]
+    assert [candidate.term.effect for candidate in all_candidates(model, terms)] == ["sensor-cubic"]
