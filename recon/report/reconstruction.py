@@ -110,9 +110,13 @@ def scale_bar(grid: Grid, part: float = 1.0) -> tuple[str, float]:
 
 
 def round_scale_bar(width: float, unit: str) -> tuple[str, float]:
-    """Label and length of a scale bar, as a fraction, for a picture of ``width`` in ``unit``."""
+    """Label and length of a scale bar, as a fraction, for a picture of ``width`` in ``unit``.
+
+    A quarter of the width that rounding moved below a round length counts as that length.
+    """
     power = 10.0 ** math.floor(math.log10(width / 4.0))
-    length = max(step * power for step in (1.0, 2.0, 5.0) if step * power <= width / 4.0)
+    largest = width / 4.0 * (1.0 + 1e-9)
+    length = max(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power <= largest)
     return f"{length:g} {unit}", length / width
 
 

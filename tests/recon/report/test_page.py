@@ -19,7 +19,7 @@ from recon.quality.defects import Defect, unrecoverable_intervals
 from recon.report.figures import MAX_CURVE_SEGMENTS, highlight_pixels, min_max_envelope
 from recon.report.page import Section, render
 from recon.report.phase_slider import MISSING_CODE, phase_slider_data
-from recon.report.reconstruction import phase_slider_section, reconstruction_report
+from recon.report.reconstruction import phase_slider_section, reconstruction_report, round_scale_bar
 from recon.report.summary import summarise
 from recon.steps.reconstruction import Options, Reconstruction
 from scanner.sample_ranges import to_sample_ranges
@@ -266,3 +266,14 @@ def test_a_long_curve_is_reduced_to_few_points_and_keeps_its_outliers() -> None:
     assert np.array_equal(
         min_max_envelope(time[:MAX_CURVE_SEGMENTS], values[:MAX_CURVE_SEGMENTS])[1], values[:MAX_CURVE_SEGMENTS]
     )
+
+
+@pytest.mark.parametrize("power", [0.01, 0.1, 1.0, 10.0, 1000.0])
+@pytest.mark.parametrize("roundings", [-2, -1, 0, 1])
+def test_a_quarter_of_the_picture_may_be_a_rounding_beside_a_round_length(power: float, roundings: int) -> None:
+    width = 4.0 * power
+    for _ in range(abs(roundings)):
+        width = np.nextafter(width, np.sign(roundings) * np.inf)
+    label, part = round_scale_bar(float(width), "mm")
+    assert label == f"{power:g} mm"
+    assert part == pytest.approx(0.25)
