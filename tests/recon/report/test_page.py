@@ -17,7 +17,7 @@ from recon.imaging.picture import Grid
 from recon.pipeline import reconstruct
 from recon.quality.defects import Defect, unrecoverable_intervals
 from recon.report.figures import MAX_CURVE_SEGMENTS, highlight_pixels, min_max_envelope
-from recon.report.page import Section, render
+from recon.report.page import Figure, Section, render
 from recon.report.phase_slider import MISSING_CODE, phase_slider_data
 from recon.report.reconstruction import phase_slider_section, reconstruction_report, round_scale_bar
 from recon.report.summary import summarise
@@ -277,3 +277,14 @@ def test_a_quarter_of_the_picture_may_be_a_rounding_beside_a_round_length(power:
     label, part = round_scale_bar(float(width), "mm")
     assert label == f"{power:g} mm"
     assert part == pytest.approx(0.25)
+
+
+def test_the_length_of_a_scale_bar_is_a_fraction_of_the_picture() -> None:
+    """A width in percent is that of the box around it, which has to be as wide as the picture beside a legend too."""
+    figure = Figure("data:,", "picture", scale_bar=("5 µm", 0.2), grey_scale=("0", "1"))
+    page = render("title", "", [Section("Picture", figures=[figure], pixelated=True)])
+    assert '<span class="length"><i style="width: 20.0%"></i>5 µm</span>' in page
+    widths = dict(re.findall(r"^(\.scale|\.row\.pictures img, canvas) {[^}]*max-width: (\w+);", page, re.MULTILINE))
+    assert len(widths) == 2
+    assert len(set(widths.values())) == 1
+    assert "flex: 0 0 100%;" in re.search(r"^\.scale \.length {(.*?)}", page, re.MULTILINE)[1]
