@@ -187,17 +187,27 @@ def blur_parts(result: Reconstruction, own: AxisMotion, axis: str, error: AxisEv
     grid = result.picture.grid
     half = grid.half_angle_x if axis == "x" else grid.half_angle_y
     amplitude = np.zeros(1) if error is None else error.amplitude - np.mean(error.amplitude)
-    spot = result.truth.spot_sd * result.pixels("x") if result.spot is None and result.truth else result.spot or 0.0
     return blur.blur_by_cause(
         typical_amplitude(own.amplitude),
         half,
         result.pixels(axis),
         displacing_phase(own, error),
         amplitude,
-        spot,
+        spot_px(result, axis),
         float(sample_displacement_px(result)[AXES.index(axis)]),
         own.angle_noise_sd / grid.pixel_angle[AXES.index(axis)],
     )
+
+
+def spot_px(result: Reconstruction, axis: str) -> float:
+    """Standard deviation of the spot along an axis, as given or that of the simulation [px]; 0 where unknown.
+
+    A simulation states the spot as a fraction of the field's width. The spot is as high as it is wide.
+    """
+    if result.spot is not None or result.truth is None:
+        return result.spot or 0.0
+    grid = result.picture.grid
+    return result.truth.spot_sd * 2.0 * grid.half_angle_x / grid.pixel_angle[AXES.index(axis)]
 
 
 def angle_noise_phase(result: Reconstruction, axis: str) -> float:

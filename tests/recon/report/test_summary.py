@@ -1,13 +1,24 @@
 """The figures of the summary that combine several measurements."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from recon.evaluation import Truth
+from recon.imaging.picture import Grid
 from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
 from recon.report.conclusions import describe_slices
-from recon.report.summary import picture_phase_error
+from recon.report.summary import picture_phase_error, spot_px
+from recon.steps.reconstruction import Reconstruction
+from tests.support.two_axis_scan import FIELD, RATE_HZ, READOUTS, light, reconstruct, sensors
 
 SLICES = 16
+
+
+@pytest.fixture(scope="module")
+def result() -> Reconstruction:
+    return reconstruct({**sensors(0), "intensity": (light(0), "V", RATE_HZ)}, READOUTS + FIELD)
 
 
 def slices(value: np.ndarray, sd: np.ndarray) -> list[PhaseError]:
@@ -40,3 +51,12 @@ def test_slices_that_differ_beyond_their_errors_are_named_beside_the_mean() -> N
     agree = picture_phase_error(slices(np.array([0.050, 0.053, 0.047]), np.full(3, 2e-3)), "x")
     assert agree["scatter"] == 0.0
     assert describe_slices(agree) == ""
+
+
+def test_the_spot_of_a_simulation_is_round_on_the_sample(result: Reconstruction) -> None:
+    picture = replace(result.picture, grid=Grid(200, 300, 0.1, 0.05))  # pixels are three times as wide as high
+    simulated = replace(result, picture=picture, truth=Truth({}, None, 0.01))
+    assert spot_px(simulated, "x") == pytest.approx(2.0)
+    assert spot_px(simulated, "y") == pytest.approx(6.0)
+    assert spot_px(replace(simulated, spot=0.7), "y") == 0.7
+    assert spot_px(result, "y") == 0.0
