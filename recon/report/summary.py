@@ -11,11 +11,11 @@ import numpy as np
 from estimation.least_squares import between_variance
 from recon.evaluation import AxisEvaluation
 from recon.imaging import blur
-from recon.imaging.coverage import fill_against_time
 from recon.imaging.picture import fill_factor
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.imaging.scan_phase.phase_error import PhaseError
 from recon.imaging.scan_phase.readout_phase import UNDESCRIBED_DELAY_SD_S, common_delay
+from recon.report.fill_summary import seconds_to_fill
 from recon.report.z_summary import position_summary, stack_summary
 from recon.steps.reconstruction import Reconstruction
 from recon.steps.z_slices import ZSlices
@@ -23,12 +23,6 @@ from scanner.arrays import Array
 from scanner.device import AXES
 from scanner.errors import BadInput
 from scanner.motion import AxisMotion, in_proportion_to_amplitude, rms_phase, typical_amplitude
-
-FILL_FRACTIONS = (0.25, 0.5, 0.75, 0.9, 0.99)
-"""Fractions of visited pixels for which the time is stated."""
-
-MAX_FILL_SAMPLES = 1 << 22
-"""Samples from the start of the scan in which these times are searched: 0.8 s at 5 MS/s, longer than any frame."""
 
 MIN_SD_RAD = 1e-9
 """Least standard error of a phase: without noise it can be 0."""
@@ -315,18 +309,6 @@ def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str
         "limits": result.limits,
         "notes": result.notes,
         "info": dict(result.motion.info),
-    }
-
-
-def seconds_to_fill(result: Reconstruction) -> dict[str, float | None]:
-    """Frame time after which each of ``FILL_FRACTIONS`` was reached [s]; None where the scan was too short for it."""
-    x, y = (result.motion.axes[axis].angle for axis in AXES)
-    time, fill = fill_against_time(
-        x.read(0, MAX_FILL_SAMPLES), y.read(0, MAX_FILL_SAMPLES), x.sample_rate, result.picture.grid
-    )
-    at = np.searchsorted(fill, FILL_FRACTIONS)
-    return {
-        f"{wanted:g}": float(time[k]) if k < time.size else None for wanted, k in zip(FILL_FRACTIONS, at, strict=True)
     }
 
 

@@ -8,10 +8,12 @@ import pytest
 from recon.evaluation import Truth
 from recon.imaging.picture import Grid
 from recon.imaging.scan_phase.phase_error import PhaseError, PhaseEstimate
+from recon.quality.defects import Defect
 from recon.report.conclusions import describe_slices
+from recon.report.fill_summary import seconds_to_fill
 from recon.report.summary import picture_phase_error, spot_px
 from recon.steps.reconstruction import Reconstruction
-from tests.support.two_axis_scan import FIELD, RATE_HZ, READOUTS, light, reconstruct, sensors
+from tests.support.two_axis_scan import FIELD, RATE_HZ, READOUTS, SAMPLES, light, reconstruct, sensors
 
 SLICES = 16
 
@@ -60,3 +62,17 @@ def test_the_spot_of_a_simulation_is_round_on_the_sample(result: Reconstruction)
     assert spot_px(simulated, "y") == pytest.approx(6.0)
     assert spot_px(replace(simulated, spot=0.7), "y") == 0.7
     assert spot_px(result, "y") == 0.0
+
+
+def test_samples_that_are_not_mapped_fill_no_pixel(result: Reconstruction) -> None:
+    """The first half of the scan has no intensity in one of two detectors, or no phase."""
+    half_s, values = 0.5 * SAMPLES / RATE_HZ, np.ones((SAMPLES, 2))
+    assert seconds_to_fill(result)["0.5"] < half_s
+    values[: SAMPLES // 2, 1] = np.nan
+    dark = replace(result, intensity=replace(result.intensity, raw=values, first=0, stop=SAMPLES))
+    assert seconds_to_fill(dark)["0.5"] > half_s
+    x = result.motion.axes["x"]
+    unknown = replace(x, phase_sd=np.where(x.time < half_s, np.inf, x.phase_sd))
+    motion = replace(result.motion, axes={**result.motion.axes, "x": unknown})
+    lost = replace(result, motion=motion, defects=[Defect("sense_x", "gap", 0.0, half_s)])
+    assert seconds_to_fill(lost)["0.5"] > half_s
