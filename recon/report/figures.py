@@ -147,12 +147,12 @@ def use_plain_ticks(axis: Axis) -> None:
 def min_max_envelope(time: Array, values: Array) -> tuple[Array, Array]:
     """A curve; a long one as minimum and maximum of each of ``MAX_CURVE_SEGMENTS`` segments.
 
-    This bounds the size of the page and keeps every outlier.
+    This bounds the size of the page and keeps every outlier. A segment is NaN where all of its values are.
     """
     if time.size <= MAX_CURVE_SEGMENTS:
         return time, values
     edges = np.linspace(0, time.size, MAX_CURVE_SEGMENTS, endpoint=False).astype(np.int64)
-    ends = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
+    ends = np.fmin.reduceat(values, edges), np.fmax.reduceat(values, edges)
     return np.repeat(time[edges], 2), np.stack(ends, axis=1).ravel()
 
 

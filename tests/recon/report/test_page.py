@@ -268,6 +268,14 @@ def test_a_long_curve_is_reduced_to_few_points_and_keeps_its_outliers() -> None:
     )
 
 
+def test_unknown_values_of_a_long_curve_hide_no_others() -> None:
+    time, values = np.arange(6000.0), np.arange(6000.0)
+    values[::3] = np.nan
+    values[3000:3300] = np.nan
+    x, y = min_max_envelope(time, values)
+    assert np.array_equal(np.isnan(y), (x >= 3000) & (x < 3300))
+
+
 @pytest.mark.parametrize("power", [0.01, 0.1, 1.0, 10.0, 1000.0])
 @pytest.mark.parametrize("roundings", [-2, -1, 0, 1])
 def test_a_quarter_of_the_picture_may_be_a_rounding_beside_a_round_length(power: float, roundings: int) -> None:
