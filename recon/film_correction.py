@@ -52,7 +52,8 @@ class CorrectedFilm:
         model: what the frames share.
         shift, sd: of each frame after smoothing over time [px], shape (frames,).
         measured, measured_sd: of each frame before smoothing [px]; (nan, inf) where it determines none.
-        before, after: picture of one frame as recorded and corrected, summed over channels, shape (rows, columns).
+        before, after: picture of one frame as recorded and corrected, summed over channels, shape (rows, columns); of
+            the sampled frames the one that determines its phase best, as others may be blank.
         rows_rms: root mean square of the lines less the mean of their neighbours in the sampled frames: as recorded,
             corrected, and corrected by the same shift in all columns.
         counts: totals of the film, of the corrected film, and of what lay beyond the border.
@@ -192,8 +193,8 @@ def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = Fa
         total=film.frames, desc="correct", unit="frame", file=sys.stderr, leave=False, disable=quiet or None
     ) as bar:
         write_film(output, film, _corrected_planes(film, shift, model.fill**2, means, account, bar))
-    middle = len(sampled) // 2
-    before: Array = np.asarray(np.sum(samples[middle], axis=0, dtype=np.float64))
+    shown = int(np.argmin(measured_sd[sampled]))
+    before: Array = np.asarray(np.sum(samples[shown], axis=0, dtype=np.float64))
     return CorrectedFilm(
         film=film,
         model=model,
@@ -202,7 +203,7 @@ def correct_film(film: Film, output: Path, means: bool = False, quiet: bool = Fa
         measured=measured,
         measured_sd=measured_sd,
         before=before,
-        after=correct_frame(before, shift[sampled[middle]], model.fill**2, means)[0],
+        after=correct_frame(before, shift[sampled[shown]], model.fill**2, means)[0],
         rows_rms=_rows_rms(samples, shift[sampled], model.fill**2, means),
         counts=(account.recorded, account.corrected, account.beyond),
         clipped=account.clipped,

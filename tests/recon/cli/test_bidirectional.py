@@ -155,6 +155,15 @@ def test_blank_frames_leave_the_phase_of_the_others(good: int) -> None:
         fit_film([blank])
 
 
+def test_the_frame_that_the_report_shows_is_not_blank(tmp_path: Path) -> None:
+    frames = film(np.full(3, 2.0))
+    frames[1] = 7
+    tifffile.imwrite(tmp_path / "film.tif", frames, photometric="minisblack")
+    result = correct_film(open_film(tmp_path / "film.tif"), tmp_path / "corrected.tif", quiet=True)
+    assert any(np.array_equal(result.before, frame) for frame in frames[[0, 2]])
+    assert np.ptp(result.after) > 0.0
+
+
 def test_no_count_is_lost_between_the_borders() -> None:
     frame = np.zeros((20, 64))
     frame[:, 20:44] = np.random.default_rng(0).poisson(3.0, (20, 24))
