@@ -82,6 +82,7 @@ class PointCloud:
             "without_return": self.without_return,
             "unlocated": self.unlocated,
             "extent_m": {name: [self.position[:, k].min(), self.position[:, k].max()] for k, name in enumerate("xyz")},
+            "largest_distance_m": np.linalg.norm(self.position, axis=1).max(),
             "sd_m": {name: np.sqrt(np.mean(np.square(sd[:, k]))) for k, name in enumerate("xyz")},
             "range_sd_m": self.geometry.range_sd or None,
             "geometry": self.geometry.kind,

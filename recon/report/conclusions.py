@@ -320,8 +320,7 @@ def conclude_bidirectional(summary: Mapping[str, Any]) -> str:
 
 def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
     """What displaces the points, how many there are, how far they reach and how uncertain they are."""
-    reach = max(abs(edge) for edge in summary["extent_m"]["z"])
-    sd = max(summary["sd_m"].values())
+    sd, reach = max(summary["sd_m"].values()), summary["largest_distance_m"]
     of_angles = "" if summary["range_sd_m"] else "; by the angles alone, without the range finder's noise"
     points, shots = counted(summary["points"], "point"), counted(summary["shots"], "shot")
     limits = "".join(f"{sentence(limit)} " for limit in summary["limits"])

@@ -14,7 +14,8 @@ import pytest
 from phantoms.lidar import add_ranges, measure_wall
 from recon.cli import main
 from recon.io.point_files import write_points
-from recon.point_cloud import make_point_cloud
+from recon.point_cloud import PointCloud, make_point_cloud
+from recon.report.conclusions import conclude_point_cloud
 from recon.report.point_cloud import draw_view
 from recon.steps.reconstruction import Options
 from scanner import devices
@@ -168,6 +169,13 @@ def test_geometry_is_read_and_written_with_the_device() -> None:
     for wrong in ('kind = "prism"', 'order = "xz"', "incidence = 45", "range_sd = -1"):
         with pytest.raises(BadInput, match="geometry"):
             Device.from_toml(f"[x.mechanics]\nJ = 1\nb = 1\nk = 1\n[geometry]\n{wrong}")
+
+
+def test_the_conclusion_states_the_distance_of_the_farthest_point() -> None:
+    """It lies at the edge of a wall 4 m away, not in its middle."""
+    position, rows = np.array([[0.0, 0.0, 4.0], [3.0, 0.0, 4.0], [0.0, -1.0, 4.0]]), np.ones(3)
+    cloud = PointCloud(rows, position, rows, 1e-6 * np.ones((3, 6)), 3, 0, 0, Geometry(), "tracker", [], [])
+    assert "up to 5 m away" in conclude_point_cloud(cloud.summary(), "points.pcd")
 
 
 def test_a_colour_bar_of_equal_distances_does_not_show_the_rounding_of_the_arithmetic() -> None:
