@@ -22,7 +22,7 @@ from recon.report.figures import (
     new_figure,
     to_rgb,
 )
-from recon.report.numbers import format_uncertain, format_value
+from recon.report.numbers import format_ends, format_uncertain, format_value
 from recon.report.page import Figure, Section, Table, render
 from recon.report.reconstruction import round_scale_bar
 from scanner.arrays import Array
@@ -77,7 +77,7 @@ def bidirectional_report(result: CorrectedFilm, summary: Mapping[str, Any]) -> s
         ),
     ]
     limits = contrast_limits(result.before)
-    bar, grey = _scale_bar(result.film), (f"{limits[0]:.3g}", f"{limits[1]:.3g}")
+    bar, grey = _scale_bar(result.film), format_ends(*limits)
     pictures = [
         Figure(_picture(picture, limits), caption, scale_bar=bar, grey_scale=grey)
         for picture, caption in ((result.before, "As recorded: the middle of one frame."), (result.after, "Corrected."))

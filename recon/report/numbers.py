@@ -55,12 +55,18 @@ def format_interval(value: float, low: float, high: float, unit: str = "") -> st
 
 
 def format_range(low: float, high: float) -> str:
-    """Both ends of an interval, with two significant digits of its width."""
+    """Both ends of an interval as one text, see :func:`format_ends`."""
+    return " to ".join(format_ends(low, high))
+
+
+def format_ends(low: float, high: float, unit: str = "") -> tuple[str, str]:
+    """Both ends of an interval with their unit, with two significant digits of its width."""
     width, largest = high - low, max(abs(low), abs(high))
-    if not (math.isfinite(width) and width > 0.0):
-        return f"{format_value(low)} to {format_value(high)}"
-    digits = math.floor(math.log10(largest)) - math.floor(math.log10(width)) + 2
-    return " to ".join(format_value(end, min(digits, sys.float_info.dig)) for end in (low, high))
+    digits = 4
+    if math.isfinite(width) and width > 0.0:
+        needed = math.floor(math.log10(largest)) - math.floor(math.log10(width)) + 2
+        digits = min(needed, sys.float_info.dig)
+    return _with_unit(format_value(low, digits), unit), _with_unit(format_value(high, digits), unit)
 
 
 def readable_unit(value: float, unit: str) -> tuple[float, str]:

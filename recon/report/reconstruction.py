@@ -26,7 +26,7 @@ from recon.report.figures import (
     shown_image,
     to_rgb,
 )
-from recon.report.numbers import format_uncertain
+from recon.report.numbers import format_ends, format_uncertain
 from recon.report.page import Figure, Section, Table, render
 from recon.report.phase_slider import phase_slider_data
 from recon.report.picture_conclusion import conclude_reconstruction
@@ -65,7 +65,7 @@ def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fi
             data_uri(encode_png(image)),
             content,
             scale_bar=bar,
-            grey_scale=(f"{limits[0]:.3g} {unit}", f"{limits[1]:.3g} {unit}"),
+            grey_scale=format_ends(*limits, unit),
         ),
         *uncertainty_figures(result, bar),
         coverage_figure(result.picture.coverage, bar),

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -223,6 +224,15 @@ def test_pictures_of_the_report_have_a_length_and_a_grey_scale(unit: dict, lengt
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert page.count(f"{length}</span>") == 2
     assert page.count('class="grey"') == 2
+
+
+def test_black_and_white_of_a_film_on_a_large_offset_have_different_labels(tmp_path: Path) -> None:
+    path = tmp_path / "film.tif"
+    tifffile.imwrite(path, film(SHIFTS[:3]).astype(np.uint16) + 30_000, photometric="minisblack")
+    assert main(["bidirectional", str(path), "-o", str(tmp_path / "out"), "--values", "means"]) == 0
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    black, white = re.search(r'<span class="grey">(\d+)<i></i>(\d+)</span>', page).groups()
+    assert 30_000 <= int(black) < int(white) < 31_000
 
 
 def test_compressed_films_and_odd_lines_are_read(tmp_path: Path) -> None:

@@ -287,6 +287,13 @@ def test_a_quarter_of_the_picture_may_be_a_rounding_beside_a_round_length(power:
     assert part == pytest.approx(0.25)
 
 
+def test_black_and_white_of_a_picture_on_a_large_offset_have_different_labels(result: Reconstruction) -> None:
+    bright = replace(result, picture=replace(result.picture, image=30_000.0 + 0.1 * result.picture.image))
+    page = reconstruction_report(bright, summarise(result))
+    black, white = re.search(r'<span class="grey">([\d.]+) V<i></i>([\d.]+) V</span>', page).groups()
+    assert 30_000.0 <= float(black) < float(white) < 30_001.0
+
+
 def test_the_length_of_a_scale_bar_is_a_fraction_of_the_picture() -> None:
     """A width in percent is that of the box around it, which has to be as wide as the picture beside a legend too."""
     figure = Figure("data:,", "picture", scale_bar=("5 µm", 0.2), grey_scale=("0", "1"))
