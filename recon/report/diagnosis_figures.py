@@ -66,7 +66,10 @@ def measured_curve_figure(curve: Any) -> Figure:
 
 
 def waveform_figure(shown: Waveform, name: str, unit: str) -> Figure:
-    """Measured and simulated waveform, before and after, and the differences below."""
+    """Measured and simulated waveform, before and after, and the differences below.
+
+    The name contains that of the recording, in which ``$`` begins no formula.
+    """
     drawing, axes = new_figure(2, 1, (6.0, 4.2))
     top, bottom = axes[:, 0]
     time = 1e3 * shown.time
@@ -74,7 +77,7 @@ def waveform_figure(shown: Waveform, name: str, unit: str) -> Figure:
     for values, (colour, label) in zip((shown.before, shown.after), PAIR, strict=True):
         top.plot(time, values, color=colour, lw=1.2, label=label)
         bottom.plot(time, shown.measured - values, color=colour, lw=1.0, label=label)
-    top.set(ylabel=f"{name} ({unit})")
+    top.set_ylabel(f"{name} ({unit})", parse_math=False)
     top.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8)
     bottom.axhline(0.0, color="#888", lw=0.6)
     bottom.set(xlabel="time (ms)", ylabel=f"measured − simulated ({unit})")

@@ -81,7 +81,8 @@ def _sizes(group: Sequence[Row], label: str) -> str:
         if low is not None and high is not None:
             panel.plot([low, high], [k, k], color=COLOURS[0], lw=1.5)
         panel.plot(row["value"], k, "o", ms=3, color=COLOURS[0])
-    panel.set_yticks(range(len(drawn)), [Path(row["recording"]).stem for row in drawn], fontsize=7)
+    names = [Path(row["recording"]).stem for row in drawn]
+    panel.set_yticks(range(len(drawn)), names, fontsize=7, parse_math=False)
     panel.invert_yaxis()
     panel.set_xlabel(label)
     return figure_uri(drawing)

@@ -1,13 +1,16 @@
 """``lissajous diagnose --each``: table and page of many recordings; what is done is kept, what is bad is listed."""
 
+import base64
 import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from recon.cli import main
 from recon.cli.diagnose_each import COLUMNS, diagnose_each
+from recon.report.fleet import fleet_report
 from recon.runtime.fleet import plan_fleet, state_inputs
 
 FINDING = {
@@ -84,3 +87,13 @@ def test_recordings_of_one_name_in_two_folders_are_two(tmp_path: Path) -> None:
 def test_workers_without_each_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["diagnose", str(tmp_path / "a.h5"), "-o", str(tmp_path / "out"), "--workers", "2"]) == 2
     assert "--workers: has no effect without --each" in capsys.readouterr().err
+
+
+def test_names_of_recordings_are_drawn_as_they_are() -> None:
+    size = {"parameter": "k3", "value": 2.0, "ci95_low": 1.0, "ci95_high": 3.0, "unit": "N m/rad^3"}
+    row = {**FINDING, **size}
+    rows = [{**row, "recording": name, "device": "d", "verdict": "mismatch"} for name in ("a$_$b.h5", "5$ ^2$.h5")]
+    page = fleet_report({"table": rows, "failed": 0, "recordings": 2, "seconds": 1.0})
+    (figure,) = re.findall('data:image/svg\\+xml;base64,([^"]+)', page)
+    labels = re.findall("<!-- (.*?) -->", base64.b64decode(figure).decode())
+    assert {"a$_$b", "5$ ^2$"} <= set(labels)

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 import recon.report.phase_slider
+from estimation.device_fit.posterior import Waveform
 from recon.imaging.gridding import accumulate_samples
 from recon.imaging.picture import Grid
 from recon.pipeline import reconstruct
 from recon.quality.defects import Defect, unrecoverable_intervals
+from recon.report.diagnosis_figures import waveform_figure
 from recon.report.figures import MAX_CURVE_SEGMENTS, highlight_pixels, min_max_envelope
 from recon.report.page import Figure, Section, render
 from recon.report.phase_slider import MISSING_CODE, phase_slider_data
@@ -220,6 +222,12 @@ def test_text_from_a_recording_is_escaped() -> None:
     assert "<b>" not in page
     assert "<i>" not in page
     assert "<img" not in page
+
+
+def test_a_dollar_sign_in_the_name_of_a_recording_begins_no_formula() -> None:
+    values = np.zeros(3)
+    figure = waveform_figure(Waveform(values, values, values, values), "a$_$b, sense_x", "V")
+    assert "<!-- a$_$b, sense_x (V) -->" in base64.b64decode(figure.uri.partition(",")[2]).decode()
 
 
 def test_defects_are_marked_and_their_samples_are_omitted(result: Reconstruction) -> None:
