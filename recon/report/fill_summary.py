@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.imaging.coverage import fill_against_time
 from recon.quality.defects import unrecoverable_intervals
@@ -23,19 +20,19 @@ MAX_FILL_SAMPLES = 1 << 22
 def seconds_to_fill(result: Reconstruction) -> dict[str, float | None]:
     """Frame time after which each of ``FILL_FRACTIONS`` was reached [s]; None where the scan was too short for it.
 
-    Samples without an intensity and those at an unknown angle visit no pixel.
+    Samples in gaps of the intensity and those at an unknown angle visit no pixel.
     """
     x, y = (result.beam.axes[axis].angle.read(0, MAX_FILL_SAMPLES) for axis in AXES)
-    x = np.where(_has_intensity(result.intensity.stored(0, MAX_FILL_SAMPLES)), x, np.nan)
-    for first, stop in to_sample_ranges(unrecoverable_intervals(result.motion, result.defects), result.intensity):
+    gaps = [
+        (defect.start, defect.stop)
+        for defect in result.defects
+        if defect.channel == result.intensity.name and defect.kind == "gap" and defect.fraction == 1.0
+    ]
+    unknown = unrecoverable_intervals(result.motion, result.defects)
+    for first, stop in to_sample_ranges([*gaps, *unknown], result.intensity):
         x[first:stop] = np.nan
     time, fill = fill_against_time(x, y, result.intensity.sample_rate, result.picture.grid)
     at = np.searchsorted(fill, FILL_FRACTIONS)
     return {
         f"{wanted:g}": float(time[k]) if k < time.size else None for wanted, k in zip(FILL_FRACTIONS, at, strict=True)
     }
-
-
-def _has_intensity(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether each sample, shape (n,) or (n, detectors), is finite in every detector; shape (n,)."""
-    return np.isfinite(values).reshape(len(values), -1).all(axis=1)

@@ -65,11 +65,10 @@ def test_the_spot_of_a_simulation_is_round_on_the_sample(result: Reconstruction)
 
 
 def test_samples_that_are_not_mapped_fill_no_pixel(result: Reconstruction) -> None:
-    """The first half of the scan has no intensity in one of two detectors, or no phase."""
-    half_s, values = 0.5 * SAMPLES / RATE_HZ, np.ones((SAMPLES, 2))
+    """The first half of the scan has no intensity, or no phase."""
+    half_s = 0.5 * SAMPLES / RATE_HZ
     assert seconds_to_fill(result)["0.5"] < half_s
-    values[: SAMPLES // 2, 1] = np.nan
-    dark = replace(result, intensity=replace(result.intensity, raw=values, first=0, stop=SAMPLES))
+    dark = replace(result, defects=[Defect("intensity", "gap", 0.0, half_s)])
     assert seconds_to_fill(dark)["0.5"] > half_s
     x = result.motion.axes["x"]
     unknown = replace(x, phase_sd=np.where(x.time < half_s, np.inf, x.phase_sd))
