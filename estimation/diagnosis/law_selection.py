@@ -183,7 +183,7 @@ def _iterate_selection(
             fits |= {effects: fit for effects, fit in more.items() if centre.is_followed_by(fit)}
         if not fits:
             return centre if present else None, compared
-        compared.append(fits)
+        compared.append({present: centre.fit, **fits} if present else fits)
         effects = min(fits, key=lambda names: fits[names].neg2_log_evidence)
         best = fits[effects]
         if effects == present or (effects < present and _is_needed(centre, best)):
@@ -192,7 +192,10 @@ def _iterate_selection(
             continue
         returned, is_worse = effects in centres, best.neg2_log_evidence > centre.fit.neg2_log_evidence
         if present and is_worse and (returned or len(effects) > len(present)):
-            return centre, compared
+            if not centre.leaves_noise:
+                return centre, compared
+            returned, start = True, centre.fit
+            continue
         fitted[effects] = start = best
     return None, compared
 

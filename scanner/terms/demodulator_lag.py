@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import pi
 
 from scanner.stages import Amdm
-from scanner.terms.term import Parameter, Term
+from scanner.terms.term import NATURAL_PHASE_LAG, Parameter, Term
 
 
 def corners(p: Sequence[float]) -> tuple[float, ...]:
@@ -18,7 +18,9 @@ TERM = Term(
     effect="demodulator-lag",
     stage="readout",
     equation="y = a_cir C/(1 + i f/f_c)² + b_cir",
-    parameters=(Parameter("f_c", "Hz", lambda s: 15.0 * s.rate / (2.0 * pi), kind="inverse", sign=1),),
+    parameters=(  # each of the two sections has half of the phase
+        Parameter("f_c", "Hz", lambda s: s.rate / (2.0 * pi * 0.5 * NATURAL_PHASE_LAG), kind="inverse", sign=1),
+    ),
     source="chen2020, section II-C and appendix: two sections near 41 kHz, which the paper treats as a constant phase",
     confounders={
         "channel-delay": "a delay leaves the size of the harmonics unchanged: sweep the drive's frequency",

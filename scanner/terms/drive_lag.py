@@ -9,7 +9,7 @@ import numpy as np
 from scanner.arrays import Array
 from scanner.integrator.nodes import from_nodes, to_nodes
 from scanner.lowpass import apply_lowpass
-from scanner.terms.term import Parameter, SignalContext, Term
+from scanner.terms.term import NATURAL_PHASE_LAG, Parameter, SignalContext, Term
 
 
 def voltage(voltage: Array, p: Sequence[float], context: SignalContext) -> Array:
@@ -21,7 +21,9 @@ TERM = Term(
     effect="drive-lag",
     stage="drive",
     equation="V' = 2π f_c (V_set − V)",
-    parameters=(Parameter("f_c", "Hz", lambda s: 5.0 * s.drive_rate / (2.0 * np.pi), kind="inverse", sign=1),),
+    parameters=(
+        Parameter("f_c", "Hz", lambda s: s.drive_rate / (2.0 * np.pi * NATURAL_PHASE_LAG), kind="inverse", sign=1),
+    ),
     source="Horowitz & Hill, The Art of Electronics, section 1.7",
     confounders={
         "readout-lag": "for a linear axis the two commute: record the angle, or use a larger drive",

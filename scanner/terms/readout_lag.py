@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scanner.terms.term import Parameter, Term
+from scanner.terms.term import NATURAL_PHASE_LAG, Parameter, Term
 
 
 def corners(p: Sequence[float]) -> tuple[float, ...]:
@@ -18,7 +18,7 @@ TERM = Term(
     effect="readout-lag",
     stage="readout",
     equation="y' = 2π f_c (y_nominal − y)",
-    parameters=(Parameter("f_c", "Hz", lambda s: 15.0 * s.rate / (2.0 * np.pi), kind="inverse", sign=1),),
+    parameters=(Parameter("f_c", "Hz", lambda s: s.rate / (2.0 * np.pi * NATURAL_PHASE_LAG), kind="inverse", sign=1),),
     source="Horowitz & Hill, The Art of Electronics, section 1.7",
     confounders={
         "channel-delay": "a delay is the same for all harmonics, without loss: use a larger drive, or two frequencies",

@@ -48,6 +48,10 @@ MAX_LOG_RATIO = 60.0
 exponents, which a fit may try, would overflow."""
 
 
+NATURAL_PHASE_LAG = 0.1
+"""Natural size of a delay: the phase by which it turns the signal at its own frequency [rad]. It is the same for delays
+and for every low-pass, which a signal of one frequency does not distinguish: the prior must not prefer one of them."""
+
 MIN_MODE_QUALITY = 0.5
 """Quality factor of critical damping. Below it a mode does not oscillate: it is a relaxation, which has names of its
 own."""
