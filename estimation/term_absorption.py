@@ -154,7 +154,7 @@ def with_outputs(
             for name in axes
         }
         filtered = any(term.term.corners and term.channel == kind for name in axes for term in terms[name])
-        if filtered or not any(laws.values()):  # a low-pass and a nonlinear law cannot be exchanged
+        if filtered or not any(laws.values()):  # the iteration compensates laws behind a low-pass
             continue
         unknown = {
             name: trajectory(

@@ -99,9 +99,18 @@ def _catalogue_term(term: Term, values: Mapping[str, Any]) -> ActiveTerm:
     return ActiveTerm(term, checked, channel)
 
 
-def in_stage_order(terms: Iterable[ActiveTerm]) -> list[ActiveTerm]:
-    """Return terms in the order of their stages, which is the order in which a signal passes them."""
-    return sorted(terms, key=lambda active: STAGES.index(active.term.stage))
+def place_in_signal_path(active: ActiveTerm) -> tuple[int, bool]:
+    """Return the sorting key of a term by the order in which a signal passes laws: by stage, low-pass sections first.
+
+    The sections of a readout belong to its own electronics, as those that ``lpf_hz`` states; other laws of a channel
+    act on their output. Terms with equal keys act in the order in which the device states them.
+    """
+    return STAGES.index(active.term.stage), active.term.corners is None
+
+
+def in_signal_order(terms: Iterable[ActiveTerm]) -> list[ActiveTerm]:
+    """Return terms in the order in which a signal passes them, see :func:`place_in_signal_path`."""
+    return sorted(terms, key=place_in_signal_path)
 
 
 def with_constants(axis: Axis, terms: Iterable[ActiveTerm]) -> Axis:

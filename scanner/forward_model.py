@@ -11,14 +11,14 @@ from functools import cached_property
 
 import numpy as np
 
-from scanner.active_terms import ActiveTerm, in_stage_order, with_constants
+from scanner.active_terms import ActiveTerm, in_signal_order, place_in_signal_path, with_constants
 from scanner.arrays import Array
 from scanner.device import Axis
 from scanner.integrator.nodes import nodes_to_samples
 from scanner.laws import amdm_voltage, capacitance, capacitance_slope, motion_voltage, transimpedance_voltage
 from scanner.lowpass import apply_lowpass
 from scanner.stages import Amdm, MotionSensor, Readout
-from scanner.terms import STAGES, SignalContext
+from scanner.terms import SignalContext
 
 _EMPTY = np.empty(0)
 
@@ -169,7 +169,7 @@ def effective_drive(axis: Axis, terms: Sequence[ActiveTerm], drive: DriveInput) 
     """Return the voltage on the actuator, after the drive terms, at the nodes of every step, shape (n, 3) [V]."""
     context = SignalContext(drive.time, drive.step, axis.readout, _EMPTY, drive.samples, _EMPTY, _EMPTY)
     voltage = drive.voltage
-    for active in in_stage_order(terms):
+    for active in in_signal_order(terms):
         if active.term.voltage is not None:
             voltage = active.term.voltage(voltage, active.values, context)
     return voltage
@@ -254,7 +254,7 @@ def apply_channel_terms(
     readout: Readout | None,
     background: Array | float = 0.0,
 ) -> Array:
-    """Return ``signal`` after the terms that act on ``channel``, in the order of their stages.
+    """Return ``signal`` after the terms that act on ``channel``, in signal order.
 
     Args:
         channel: ``"sense"`` or one of ``REFERENCE_ORDERS``.
@@ -270,7 +270,7 @@ def apply_channel_terms(
         for active in motion.active_terms
         if active.channel.partition(":")[0] == channel
     ]
-    pairs.sort(key=lambda pair: STAGES.index(pair[0].term.stage))
+    pairs.sort(key=lambda pair: place_in_signal_path(pair[0]))
     for after_noise in (False, True):
         for active, motion in pairs:
             if active.term.after_noise is after_noise:

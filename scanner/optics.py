@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from scanner.active_terms import ActiveTerm, in_stage_order, stated_terms
+from scanner.active_terms import ActiveTerm, in_signal_order, stated_terms
 from scanner.arrays import Array
 from scanner.device import Device
 from scanner.errors import BadInput
@@ -23,14 +23,14 @@ MAX_DELAY_SAMPLES = 1 << 20
 
 
 def terms_on_channel(device: Device, channel: str, axis: str | None = None) -> list[ActiveTerm]:
-    """Return the terms that the device states for a channel, of one axis or of all, in the order of their stages.
+    """Return the terms that the device states for a channel, of one axis or of all, in signal order.
 
     Raises:
         DeviceInvalid: the device has no such axis.
         BadInput: as :func:`scanner.active_terms.stated_terms`.
     """
     axes = device.axes.values() if axis is None else (device.axis(axis),)
-    return in_stage_order(term for one in axes for term in stated_terms(one) if term.channel == channel)
+    return in_signal_order(term for one in axes for term in stated_terms(one) if term.channel == channel)
 
 
 def apply_terms(terms: Iterable[ActiveTerm], signal: Array, time: Array) -> Array:

@@ -9,10 +9,10 @@ them:
 ``torque``            compiled with ``scanner.integrator.abi.TORQUE_LAW``: torque and hidden states
 ``capacitance``       compiled with ``scanner.integrator.abi.CAPACITANCE_LAW``: additional capacitance and its slope
 ``pre_demodulation``  ``(capacitance, p, context) -> capacitance``: before the sections of an AMDM readout
+``corners``           ``(p) -> corners``: first-order low-pass sections of the channel [Hz]
 ``output``            ``(signal, p, context) -> signal``: one of the term's ``channels``; the channel ``"place"`` is the
                       position of the beam on the sample, as the mirror angle that would put it there [rad]
 ``clock``             ``(time, p) -> time``: the time at which each sample of that channel was really taken [s]
-``corners``           ``(p) -> corners``: first-order low-pass sections that the channel passes last [Hz]
 ====================  =========================================================================================
 
 ``p`` holds the values of the parameters in their order. Compiled laws receive it as an array, others as a sequence.
@@ -199,7 +199,7 @@ class Term:
         parameters: in the order in which the laws take them.
         source: where the law was published.
         confounders: effect -> the measurement that distinguishes the two.
-        constants, voltage, torque, capacitance, pre_demodulation, output, clock, corners: the law, see the module.
+        constants, voltage, torque, capacitance, pre_demodulation, corners, output, clock: the law, see the module.
         hidden_state_scales: natural sizes of the hidden states, at most two. Their effect on the mirror is proportional
             to the first parameter, which is the size of the effect.
         initial_seeds: for an effect that grows from its hidden states: values of x of the hidden states to start a
@@ -256,12 +256,12 @@ class Term:
 
     def apply(self, signal: Array, p: Sequence[float], context: SignalContext) -> Array:
         """Return a signal (n,) of the channel that the effect acts on, after the effect."""
+        for corner in self.corners(p) if self.corners is not None else ():
+            signal = apply_lowpass(signal, corner, context.step)
         if self.output is not None:
             signal = self.output(signal, p, context)
         if self.clock is not None:
             signal = shift_samples(signal, (self.clock(context.time, p) - context.time) / context.step)
-        for corner in self.corners(p) if self.corners is not None else ():
-            signal = apply_lowpass(signal, corner, context.step)
         return signal
 
     def values(self, x: Sequence[float], scales: NaturalScales) -> tuple[float, ...]:

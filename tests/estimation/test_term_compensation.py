@@ -120,6 +120,18 @@ def test_the_nonlinearity_and_lag_of_a_position_sensor_are_inverted() -> None:
     assert rms[1] < 1e-3 < 5 * rms[1] < rms[0]  # inverting a lag amplifies noise
 
 
+@pytest.mark.parametrize("order", [1, -1], ids=["sensor first", "lag first"])
+def test_the_order_in_the_device_file_does_not_place_a_lag(order: int) -> None:
+    """The angle had an error of 6.2e-4 rad where the file stated the lag last: the simulation applied it there."""
+    device = devices.load("imaging")
+    terms = dict([("sensor-cubic", {"c3": -0.05}), ("readout-lag", {"f_c": 1e5})][::order])
+    device = replace(device, axes=dict(device.axes) | {"x": replace(device.axis("x"), terms=terms)})
+    recording, truth = simulate(device, Plan(DRIVES, DURATION_S), seed=1)
+    axis = estimate(recording, device, "tracker").axes["x"]
+    is_turned = evaluate_axis(axis, truth["angle_x"][0], 5e6, 0.0).mirrored
+    assert evaluate_axis(axis.negated() if is_turned else axis, truth["angle_x"][0], 5e6, 0.0).angle_rmse < 4e-4
+
+
 def test_torque_harmonics_equal_the_describing_function() -> None:
     axis = devices.load("chen2020-driven").axis("x")
     cubic = torque_harmonics(ActiveTerm(catalogue()["cubic-stiffness"], (2.0,)), axis, 0.1, 1e5, 0.0)
