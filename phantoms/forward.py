@@ -30,7 +30,8 @@ from scanner.forward_model import AxisTrajectory, DriveInput, reference_signal, 
 from scanner.integrator.nodes import to_nodes
 from scanner.optics import apply_intensity_terms, beam_position
 from scanner.recording import Recording
-from scanner.stages import Amdm, MotionSensor, Readout, without_noise
+from scanner.settling import settling_time
+from scanner.stages import MotionSensor, Readout, without_noise
 
 CHUNK_S = 0.01
 """Length integrated at a time [s]: 2 MB an axis at 10 MHz, so memory does not grow with the recording."""
@@ -46,8 +47,8 @@ angle near it; the scanners of the papers have amplitudes of 0.1 to 0.2 rad."""
 MAX_SAMPLES = 1e8
 """Most samples that are simulated: with 150 bytes each, as measured, they take 15 GB of memory."""
 
-SETTLE_TIME_CONSTANTS = 20.0
-"""Time constants after which the transient of a low-pass section is negligible: exp(-20) = 2e-9."""
+MIN_LEAD_STEPS = 2
+"""Steps before a piece that the derivatives of a motion need."""
 
 
 @dataclass(frozen=True)
@@ -153,12 +154,26 @@ def settled_state(axis: Axis, plan: Plan) -> InitialState:
     Raises:
         BadInput: the drive does not sustain a motion.
     """
+    return _last_state(_settling_motion(axis, plan, 0.0))
+
+
+def _settling_motion(axis: Axis, plan: Plan, duration: float) -> AxisTrajectory:
+    """The end of the settling of an axis, of ``duration`` [s] or longer, up to t = 0. Raises as :func:`settled_state`.
+
+    Earlier pieces are dropped, as the settling may be long.
+    """
     samples = max(1, round(plan.settle * plan.sample_rate))
-    edges = _piece_edges(samples, plan.sample_rate, -samples / plan.sample_rate)
+    last = min(samples, ceil(max(duration, CHUNK_S) * plan.sample_rate))
+    edges = _piece_edges(samples - last, plan.sample_rate, -samples / plan.sample_rate) if samples > last else []
+    edges = [*(edges or [-samples / plan.sample_rate]), 0.0]
     pieces = simulate_motion({axis.name: axis}, plan, {axis.name: InitialState(START_ANGLE_RAD, 0.0)}, edges)
-    (paths,) = deque(pieces, maxlen=1)  # earlier pieces are dropped, as the settling may be long
+    (paths,) = deque(pieces, maxlen=1)
     path = paths[axis.name]
     _require_motion(axis.name, path.angle, plan)
+    return path
+
+
+def _last_state(path: AxisTrajectory) -> InitialState:
     return InitialState(float(path.angle[-1]), float(path.rate[-1]))
 
 
@@ -207,18 +222,20 @@ def sense_channels(device: Device) -> dict[str, tuple[Readout, tuple[str, ...]]]
 
 
 def _motion_pieces(
-    device: Device, plan: Plan, start: Mapping[str, InitialState] | None
+    device: Device, plan: Plan, start: Mapping[str, InitialState] | None, lead: float
 ) -> Iterator[dict[str, AxisTrajectory]]:
-    """The motion of all axes over the recording, piece by piece.
+    """The motion of all axes before the recording, of ``lead`` [s] or longer, and over it, piece by piece.
 
     A term may depend on the whole of a signal (its mean, its history). With terms there is therefore one piece, which
-    includes the settling.
+    includes the settling. Nothing precedes a stated ``start``: there the first item is empty.
     """
     axes = {name: device.sensed_axis(name) for name in device.axes}
     if not any(axis.terms for axis in axes.values()):
+        before = {} if start else {name: _settling_motion(axis, plan, lead) for name, axis in axes.items()}
+        yield before
         edges = _piece_edges(round(plan.duration * plan.sample_rate), plan.sample_rate)
         yield from simulate_motion(
-            axes, plan, start or {name: settled_state(axis, plan) for name, axis in axes.items()}, edges
+            axes, plan, start or {name: _last_state(path) for name, path in before.items()}, edges
         )
         return
     settling = 0 if start else round(plan.settle * plan.sample_rate)
@@ -228,6 +245,7 @@ def _motion_pieces(
     if first:
         for name, path in paths.items():
             _require_motion(name, path.angle[max(0, first - round(CHUNK_S / path.drive.step)) : first], plan)
+    yield {name: path.to_step(first) for name, path in paths.items()} if first else {}
     yield {name: path.from_step(first) for name, path in paths.items()}
 
 
@@ -279,12 +297,20 @@ def _check_steps(device: Device, plan: Plan) -> None:
             raise BadInput(what, hint=f"simulate with {ceil(least)} or more")
 
 
-def _settling_steps(readout: Readout, step: float) -> int:
-    """Steps after which the transients of a readout's sections are negligible; 2 for the derivatives of a motion."""
-    if isinstance(readout, MotionSensor):
-        return 2
-    slowest = min(readout.lpf_hz, default=np.inf) if isinstance(readout, Amdm) else np.inf
-    return int(np.ceil(SETTLE_TIME_CONSTANTS / (2 * np.pi * slowest * step)))
+def _lead(device: Device, plan: Plan) -> float:
+    """Time before a piece on which the channels in it depend [s]."""
+    kinds = [("sense", axes) for _, axes in sense_channels(device).values()]
+    kinds += [(kind, (name,)) for kind in plan.references for name in device.axes]
+    settling = [settling_time(kind, [device.sensed_axis(name) for name in axes])[0] for kind, axes in kinds]
+    return max([MIN_LEAD_STEPS / (plan.sample_rate * plan.substeps), *settling])
+
+
+def _last_part(paths: Mapping[str, AxisTrajectory], duration: float) -> dict[str, AxisTrajectory]:
+    """The end of a motion, of ``duration`` [s] or shorter."""
+    return {
+        name: path.from_step(max(0, len(path.drive.voltage) - ceil(duration / path.drive.step)))
+        for name, path in paths.items()
+    }
 
 
 def simulate(
@@ -302,7 +328,8 @@ def simulate(
         plan: drives, duration and rates.
         scene: without one there is no intensity channel.
         seed: of all noise.
-        start: state of each axis at the first sample; by default that of a settled drive.
+        start: state of each axis at the first sample, before which its signals are constant; by default that of a
+            settled drive.
         nominal: the device that the recording states, where its calibration differs from the truth.
 
     Raises:
@@ -315,22 +342,23 @@ def simulate(
     check_plan(device, plan, start is None)
     rng = np.random.default_rng(seed)
     parts: dict[str, list[Array]] = {}
-    lead: dict[str, AxisTrajectory] = {}
-    for paths in _motion_pieces(device, plan, start):
+    lead = _lead(device, plan)
+    pieces = _motion_pieces(device, plan, start, lead)
+    before = _last_part(next(pieces), lead)
+    for piece in pieces:
+        paths = {name: before[name].joined_with(path) if name in before else path for name, path in piece.items()}
+        samples = slice(-1 - len(next(iter(piece.values())).drive.voltage), -1, plan.substeps)
         for name, path in paths.items():
-            parts.setdefault(f"truth_{name}", []).append(path.angle[: -1 : plan.substeps])
+            parts.setdefault(f"truth_{name}", []).append(path.angle[samples])
             for kind in plan.references:
-                parts.setdefault(f"{kind}_{name}", []).append(reference_signal(path, kind)[: -1 : plan.substeps])
+                parts.setdefault(f"{kind}_{name}", []).append(reference_signal(path, kind)[samples])
         for channel, (readout, axes) in sense_channels(device).items():
-            motions = [lead[name].joined_with(paths[name]) if name in lead else paths[name] for name in axes]
-            new = len(paths[axes[0]].drive.voltage)
-            noise, samples = np.zeros(motions[0].angle.size), slice(-1 - new, -1, plan.substeps)
+            motions = [paths[name] for name in axes]
+            noise = np.zeros(motions[0].angle.size)
             noise[samples] = rng.normal(0.0, readout.noise_sd, noise[samples].size)
             noisy = sense_signal(without_noise(readout), motions, noise)[samples]
             parts.setdefault(channel, []).append(quantise(noisy, readout.bits, plan.sense_range))
-            for name, path in zip(axes, motions, strict=True):
-                steps = len(path.drive.voltage)
-                lead[name] = path.from_step(max(0, steps - _settling_steps(readout, path.drive.step)))
+        before = _last_part(paths, lead)
     whole = {name: np.concatenate(values) for name, values in parts.items()}
     truth = {f"angle_{name}": whole.pop(f"truth_{name}") for name in device.axes}
     channels: dict[str, tuple[NDArray[Any], str]] = {

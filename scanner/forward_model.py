@@ -93,6 +93,17 @@ class AxisTrajectory:
             other=None if self.other is None else self.other.from_step(first),
         )
 
+    def to_step(self, stop: int) -> AxisTrajectory:
+        """Return the trajectory up to the end of step ``stop`` - 1."""
+        return replace(
+            self,
+            drive=replace(self.drive, voltage=self.drive.voltage[:stop]),
+            angle=self.angle[: stop + 1],
+            rate=self.rate[: stop + 1],
+            voltage=self.voltage[: stop + 1],
+            other=None if self.other is None else self.other.to_step(stop),
+        )
+
     def joined_with(self, later: AxisTrajectory) -> AxisTrajectory:
         """Return this trajectory and ``later``, which starts where this one ends, as one."""
         return replace(

@@ -101,6 +101,22 @@ def test_a_simulation_in_pieces_is_that_of_the_whole(rate: float, duration: floa
     assert recording["drive_x"].size == time.size
 
 
+@pytest.mark.parametrize(
+    "terms", [{}, {"readout-lag": {"f_c": 2e4}}, {"channel-delay": {"delay": 2e-5}}], ids=["sections", "lag", "delay"]
+)
+def test_a_settled_signal_does_not_depend_on_where_the_recording_begins(terms: dict) -> None:
+    """Low-pass sections and delays started anew: the first 20 us were up to half of the signal off."""
+    device = devices.load("imaging")
+    quiet = replace(device, readout=replace(device.readout, noise_var=0.0, bits=None))
+    quiet = replace(quiet, axes=dict(quiet.axes) | {"x": replace(quiet.axis("x"), terms=terms)})
+    signals = []
+    for lead in (0.0, 3e-4):
+        drives = {name: lambda t, drive=drive, lead=lead: drive(t - lead) for name, drive in DRIVES.items()}
+        plan = Plan(drives, 2e-4 + lead, settle=0.01 - lead)
+        signals.append(simulate(quiet, plan)[0]["sense"].read()[-1000:])
+    assert np.abs(signals[0] - signals[1]).max() < 1e-6 * np.ptp(signals[1])
+
+
 def test_resonance_follows_the_drift_of_the_stiffness() -> None:
     device = devices.load("chen2020-driven")
     axis = device.axis("x")
