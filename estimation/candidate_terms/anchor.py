@@ -63,6 +63,7 @@ def _residual_ratios(likelihood: Likelihood, fit: Fit, stop: float, fitted: bool
         for output, whitener, signal in zip(run.outputs, whiteners, signals, strict=True):
             data, noise = output.data[: signal.size], whitener.noise_variance
             used = ~held_out_samples(output.data.size)[: signal.size] if fitted else np.ones(signal.size, bool)
+            used[: output.guard[0]] = False
             for i, part in enumerate(np.array_split(np.arange(signal.size), parts)):
                 rows = part[used[part]]
                 if rows.size == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, floor
 
@@ -20,6 +20,7 @@ from scanner.integrator.nodes import to_nodes
 from scanner.interpolation import interpolate_cubic
 from scanner.lowpass import lowpass_response
 from scanner.recording import Recording
+from scanner.settling import settling_time
 from scanner.signal_check import check_signal
 from scanner.stages import Amdm, MotionSensor, Readout, Transimpedance
 from scanner.terms import NaturalScales
@@ -44,6 +45,11 @@ determine the initial state: without them it would follow an error of the model,
 FILTER_EDGE_SAMPLES = 16
 """Samples at either end of a decimated channel that are not compared: the decimation filter extends over 16 decimated
 samples on either side, and there beyond the recording."""
+
+
+MAX_UNSETTLED_SHARE = 0.25
+"""Largest share of a channel that is left out at either end for the transient of a readout. Of a shorter recording
+nothing has settled, and what is left must determine the motion."""
 
 
 @dataclass(frozen=True)
@@ -267,14 +273,23 @@ def _output(channel: Channel, axes: tuple[str, ...], device: Device, step: float
     drive = max((lines[name].max() for name in axes if lines[name].size), default=0.0)
     band = min(0.35 / interval, max(BAND_HARMONICS * fastest, 1.5 * drive))
     edge = FILTER_EDGE_SAMPLES if decimation > 1 else 2
-    guard = (0 if forgotten else max(edge, ceil(1.0 / (fastest * interval))), edge)
     kind = channel.name.partition("_")[0]
+    unsettled = unsettled_samples(kind, [device.sensed_axis(name) for name in axes], data.size, interval)
+    start_guard = 0 if forgotten else max(edge, ceil(1.0 / (fastest * interval)))
+    guard = (max(start_guard, unsettled[0]), max(edge, unsettled[1]))
     readout = readout_of(device, axes[0])
     noise = readout.noise_sd if kind == "sense" and readout is not None else None
     bins = fast_transform_length(int(band * data.size * interval)) + 1
     return Output(
         channel.name, kind, axes, data, full, channel.sample_rate, interval, offset, interval / step, guard, bins, noise
     )
+
+
+def unsettled_samples(kind: str, axes: Sequence[Axis], size: int, step: float) -> tuple[int, int]:
+    """Samples at the start and at the end of a channel that depend on the signal before and after the recording."""
+    most = int(MAX_UNSETTLED_SHARE * size)
+    start, end = (min(most, ceil(time / step - 1e-6)) for time in settling_time(kind, axes, size * step))
+    return start, end
 
 
 def _scales(device: Device, name: str, inputs: DriveInput, outputs: tuple[Output, ...], lines: Array, two_axes: bool,

@@ -17,6 +17,9 @@ FIRST_WINDOW_PERIODS = 5
 """Periods of the motion in the first window: so few that an error of the nominal frequency within its tolerance changes
 the phase by less than half a cycle."""
 
+MIN_WINDOW_PERIODS = 4
+"""Periods of the motion in the first window that are compared, where the readout settles for longer than one."""
+
 WINDOW_GROWTH = 3.0
 """Ratio of the lengths of successive windows. A frequency that was fitted over one window predicts the phase over three
 times its length with an error far below half a cycle."""
@@ -46,7 +49,8 @@ def window_schedule(model: Model) -> list[float]:
     if all(scales.rate < 0.5 * np.sqrt(scales.k / scales.J) for run in model.runs for scales in run.scales.values()):
         return [1.0]
     periods = min(run.duration * scales.rate / (2 * np.pi) for run in model.runs for scales in run.scales.values())
-    stops = [FIRST_WINDOW_PERIODS / periods]
+    left_out = max(output.guard[0] / output.data.size for run in model.runs for output in run.outputs)
+    stops = [max(FIRST_WINDOW_PERIODS / periods, left_out + MIN_WINDOW_PERIODS / periods)]
     while stops[-1] * WINDOW_GROWTH < 0.7:
         stops.append(stops[-1] * WINDOW_GROWTH)
     return [*stops, 1.0] if stops[0] < 0.7 else [1.0]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.device_fit.data import Run, prepare_run
+from estimation.device_fit.data import Run, prepare_run, unsettled_samples
 from estimation.device_fit.model import Model
 from estimation.device_fit.open_loop import fit_start_only
 from estimation.device_fit.undriven import axes_without_drive, steady_without_drive
@@ -26,7 +26,8 @@ class Predicted:
     """Prediction of one channel at its recorded sample times.
 
     Attributes:
-        values: predicted, shape (n,), NaN where the drive was not recorded.
+        values: predicted, shape (n,), NaN where the drive was not recorded, and where a lag or a delay of the readout
+            refers to what preceded the recording or follows it.
         measured: recorded, shape (n,), NaN where the signal stands at one value while the axis is driven.
         unit: of both.
         sample_rate, start: of both [Hz], [s].
@@ -71,7 +72,7 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
     signals = finite_signals(run, device)
     held = held_runs_while_driven(recording, device)
     return {
-        output.name: _at_sample_times(run, index, signal, recording, held.get(output.name, []))
+        output.name: _at_sample_times(run, index, signal, recording, device, held.get(output.name, []))
         for index, (output, signal) in enumerate(zip(run.outputs, signals, strict=True))
     }
 
@@ -161,7 +162,7 @@ def _without_readout_laws(device: Device) -> Device:
 
 
 def _at_sample_times(
-    run: Run, index: int, signal: Array, recording: Recording, held: Sequence[tuple[int, int]]
+    run: Run, index: int, signal: Array, recording: Recording, device: Device, held: Sequence[tuple[int, int]]
 ) -> Predicted:
     """A signal on the integration grid, at every sample of its channel, by a cubic spline.
 
@@ -177,6 +178,10 @@ def _at_sample_times(
     values = np.full(time.size, np.nan)
     inside = (time >= grid[0] - 1e-9) & (time <= grid[-1] + 1e-9)
     values[inside] = CubicSpline(grid, signal)(time[inside])
+    axes = [device.sensed_axis(name) for name in output.axes]
+    first, last = unsettled_samples(output.kind, axes, channel.size, 1.0 / channel.sample_rate)
+    values[np.flatnonzero(inside)[:first]] = np.nan
+    values[np.flatnonzero(inside)[np.count_nonzero(inside) - last :]] = np.nan
     measured = without_samples(channel, held).read()
     left_out = sum(stop - first for first, stop in held)
     return Predicted(values, measured, channel.unit, channel.sample_rate, channel.start, output.noise_sd, left_out)

@@ -48,7 +48,7 @@ def decaying_fit(late_phase: float) -> tuple[Likelihood, Fit]:
     data = np.exp(-time / 10.0) * np.cos(phase)
     signal = np.exp(-time / 10.0) * np.cos(phase + late_phase * (time > 35.0))
     scales = SimpleNamespace(rate=2 * np.pi, k=1.0, J=1.0 / (2 * np.pi) ** 2)
-    run = SimpleNamespace(outputs=[SimpleNamespace(data=data)], duration=40.0, scales={"x": scales})
+    run = SimpleNamespace(outputs=[SimpleNamespace(data=data, guard=(0, 0))], duration=40.0, scales={"x": scales})
     model = SimpleNamespace(runs=[run], outputs=lambda x, stop: [[signal]])
     likelihood = SimpleNamespace(whiteners=[[SimpleNamespace(noise_variance=1e-8)]])
     return likelihood, SimpleNamespace(model=model, x=np.zeros(0))  # type: ignore[return-value]
