@@ -123,11 +123,12 @@ class Run:
         return sum(len(drive.voltage) for drive in self.inputs.values())
 
 
-def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Run:
+def prepare_run(recording: Recording, device: Device, oversample: int = 1, to_last_sample: bool = False) -> Run:
     """Prepare a recording for the fit.
 
     Args:
         oversample: factor by which the integration grid is finer than needed, to check the integration error.
+        to_last_sample: whether the last step may end after the last sample, so that the steps contain all samples.
 
     Raises:
         BadInput: no channel can be simulated by the device, or a channel is missing or invalid.
@@ -151,10 +152,10 @@ def prepare_run(recording: Recording, device: Device, oversample: int = 1) -> Ru
     if n < 8 * MIN_STEPS_PER_PERIOD:
         what = f"the channels share {end - start:.3g} s, fewer than 8 periods of the motion"
         raise BadInput(what, file=recording.path, hint="record longer, or check the channels' start times")
-    origin = recording.origin
+    origin, steps = recording.origin, ceil((end - grid_start) / step - 1e-6) if to_last_sample else n
     inputs = {
         name: DriveInput(
-            _voltage(drives[name], _rest_voltage(device, name, drives[name]), grid_start, step, n),
+            _voltage(drives[name], _rest_voltage(device, name, drives[name]), grid_start, step, steps),
             step,
             grid_start - origin,
             is_bias=f"bias_{name}" in recording and f"drive_{name}" not in recording,

@@ -65,7 +65,7 @@ def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
         BadInput: the recording has no sense or angle channel, a channel is missing or invalid, its motion persists
             without a recorded drive, or the predicted motion diverges.
     """
-    run = prepare_run(recording, device)
+    run = prepare_run(recording, device, to_last_sample=True)
     if axes_without_drive(recording, device) and (steady := steady_without_drive(recording, device)) is not None:
         hint = "record the voltage that drives it; without one a free decay is predicted"
         raise BadInput(f"has no drive to predict from: {steady}", file=recording.path, hint=hint)
