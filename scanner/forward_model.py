@@ -237,12 +237,20 @@ def _before_channel_terms(readout: Readout, motions: Sequence[AxisTrajectory]) -
                     _capacitance_slope(motion),
                     motion.rate,
                     readout.R_s,
-                    motion.voltage if motion.drive.is_bias else readout.V_bias,
+                    _recorded_bias(motion) if motion.drive.is_bias else readout.V_bias,
                 )
                 for motion in motions
             ]
             signal = sum(currents[1:], start=currents[0])
     return signal
+
+
+def _recorded_bias(motion: AxisTrajectory) -> Array:
+    """The recorded bias of the current of a comb after the drive terms, without carriers, shape (n + 1,) [V]."""
+    passed = [active for active in motion.active_terms if not active.term.torque_only]
+    if len(passed) == len(motion.active_terms):
+        return motion.voltage
+    return nodes_to_samples(effective_drive(motion.axis, passed, motion.drive))
 
 
 def effective_readout(readout: Readout, motions: Sequence[AxisTrajectory]) -> Readout:

@@ -26,4 +26,5 @@ TERM = Term(
     },
     applies=lambda axis, scales: driven_by_comb(axis) and scales.voltage_mean**2 + scales.voltage_rms**2 > 0,
     voltage=voltage,
+    torque_only=True,
 )

@@ -211,6 +211,8 @@ class Term:
             themselves; no fit searches them.
         after_noise: whether ``output`` acts on the sum of signal and noise, as the converter does.
         per_axis: on an electrode that all combs share, whether each axis may have the effect separately.
+        torque_only: whether ``voltage`` adds a carrier. The torque contains its mean square; in the current of a comb
+            it lies beyond the band of the readout.
         drifts: whether the effect changes with the time since the start of a recording, and so starts again with each.
         coupled: whether ``torque`` or ``output`` depends on the motion of the other axis.
     """
@@ -236,6 +238,7 @@ class Term:
     stated_channels: tuple[str, ...] = ()
     after_noise: bool = False
     per_axis: bool = False
+    torque_only: bool = False
     drifts: bool = False
     coupled: bool = False
 
