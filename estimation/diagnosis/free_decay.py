@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-
-import numpy as np
 
 from estimation.device_fit.data import Run, readout_of
-from estimation.device_fit.model import Model
 from estimation.device_fit.parameters import Candidate
+from estimation.device_fit.undriven import is_moved_by_drive
 from scanner.device import Device
 from scanner.stages import MotionSensor
 
@@ -18,10 +15,6 @@ AMPLITUDE_DAMPING = ("cubic-damping", "quadratic-drag", "coulomb-friction")
 
 AMPLITUDE_STIFFNESS = ("cubic-stiffness", "quintic-stiffness", "gravity-stiffness")
 """Effects by which the frequency of a decay depends on amplitude."""
-
-MIN_DRIVEN_SHARE = 0.01
-"""Share of a channel, both as standard deviations, from which the motion that a drive causes counts. A driven axis
-owes it most of its signal, and to the noise of a converter without a drive far less."""
 
 CHANGES_IN_TIME = ("gain-drift", "damping-drift")
 """Effects by which a decay changes with time. Either may fit where the rate depends on amplitude, and conversely."""
@@ -54,26 +47,6 @@ def confounders_in_one_decay(effect: str, gain_is_known: bool = False) -> tuple[
     return tuple(each for each in confounders if not (gain_is_known and each == "gain-drift"))
 
 
-def _is_driven(run: Run, device: Device, axis: str) -> bool:
-    """Whether the variation of an axis's drive moves the nominal device visibly; the noise of a recorded drive does
-    not."""
-    drive = run.inputs[axis]
-    if np.ptp(drive.voltage) == 0.0:
-        return False
-    constant = replace(drive, voltage=np.full_like(drive.voltage, drive.voltage.mean()))
-    driven, free = (
-        Model([replace(run, inputs={**run.inputs, axis: inputs})], device, mains=()) for inputs in (drive, constant)
-    )
-    signals = zip(
-        run.outputs, *(model.outputs(np.zeros(len(model.parameters)))[0] for model in (driven, free)), strict=True
-    )
-    return any(
-        np.std(with_drive - without) > MIN_DRIVEN_SHARE * np.std(output.data)
-        for output, with_drive, without in signals
-        if axis in output.axes
-    )
-
-
 def decay_confounders(runs: Sequence[Run], device: Device, candidate: Candidate) -> tuple[str, ...]:
     """Confounders of a candidate, where one ringdown of its axis is all that was recorded.
 
@@ -81,7 +54,7 @@ def decay_confounders(runs: Sequence[Run], device: Device, candidate: Candidate)
     channel a gain that drifts.
     """
     recorded = [run for run in runs if candidate.axis in run.inputs]
-    if len(recorded) != 1 or _is_driven(recorded[0], device, candidate.axis):
+    if len(recorded) != 1 or is_moved_by_drive(recorded[0], device, candidate.axis):
         return ()
     outputs = [output for output in recorded[0].outputs if candidate.axis in output.axes]
     motion_only = len(outputs) == 1 and outputs[0].kind == "sense"

@@ -12,11 +12,13 @@ from estimation.identification.calibrate import identify
 from scanner.channel import make_channel
 from scanner.device import Axis, Device
 from scanner.errors import BadInput
+from scanner.forward_model import DriveInput, simulate_axis
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Position
 from tests.support.simulated import imaging, shared_electrode, with_sense
 
 TIME = np.arange(5000) / 1e4
+NOISE = 1e-4 * np.random.default_rng(3).normal(size=TIME.size)
 DECAY = np.exp(-3.0 * TIME) * np.cos(2 * np.pi * 100.0 * TIME) + 0.01 * np.random.default_rng(1).normal(size=TIME.size)
 
 
@@ -75,16 +77,35 @@ def test_a_motion_that_persists_without_a_recorded_drive_is_refused(shape: np.nd
             diagnose_with_optics([without_drive])
 
 
+def test_noise_that_moves_the_axis_is_its_drive() -> None:
+    """A drive of white noise gives a motion near the resonance, of which the amplitude may end as it began."""
+    of = device(100.0, driven=True)
+    voltage = np.random.default_rng(4).normal(size=TIME.size)
+    inputs = DriveInput(np.repeat(voltage[:, None], 3, axis=1), 1e-4)
+    motion = simulate_axis(of.axes["x"], (), inputs, (0.0, 0.0)).angle[:-1]
+    sense = 10.0 * (motion + 2.0 * np.abs(motion).max() * np.cos(2 * np.pi * 100.0 * TIME))
+    made = Recording.from_arrays({"sense_x": (sense, "V", 1e4), "drive_x": (voltage, "V", 1e4)}, of)
+    assert steady_without_drive(made, of) is None
+
+
 @pytest.mark.parametrize(
     ("voltage", "shape", "message"),
     [
         (np.zeros(TIME.size), np.exp(-(((TIME - 0.25) / 0.05) ** 2)) + 0.1, "under a constant drive_x"),
         (np.full(TIME.size, 2.0), np.ones(TIME.size), "under a constant drive_x"),
         (np.full(TIME.size, 2.0), np.exp(-0.5 * TIME), None),
+        (NOISE, np.ones(TIME.size), "under noise alone in drive_x"),
         (np.where(TIME < 0.1, np.nan, 0.0), np.ones(TIME.size), None),
         (np.sin(2 * np.pi * 100.0 * TIME), np.ones(TIME.size), None),
     ],
-    ids=["swept, recorded as zero", "steady, recorded as constant", "slow decay", "not finite", "driven"],
+    ids=[
+        "swept, recorded as zero",
+        "steady, recorded as constant",
+        "slow decay",
+        "noise of a drive that is off",
+        "not finite",
+        "driven",
+    ],
 )
 def test_a_motion_that_a_constant_drive_cannot_keep_up_is_refused(
     voltage: np.ndarray, shape: np.ndarray, message: str | None
