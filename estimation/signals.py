@@ -15,6 +15,7 @@ from estimation.reference import (
     sampled_too_slowly,
     tone_frequency,
 )
+from scanner.active_terms import check_effects
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import Device
@@ -47,12 +48,14 @@ def require_device(recording: Recording, device: Device | None) -> Device:
     """The device given, else the recording's own.
 
     Raises:
-        DeviceInvalid: there is none.
+        DeviceInvalid: there is none, or it states a term that has no effect.
+        BadInput: it states a term that cannot be used.
     """
     chosen = device or recording.device
     if chosen is None:
         hint = "give one with --device, or record it under /device"
         raise DeviceInvalid("states no device", file=recording.path, channel="/device", hint=hint)
+    check_effects(chosen)
     return chosen
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from phantoms.drift_term import drift_terms
 from phantoms.optics import Detector, detect, sample_scene
 from phantoms.waveforms import Waveform
-from scanner.active_terms import ActiveTerm, stated_terms
+from scanner.active_terms import ActiveTerm, check_effects, stated_terms
 from scanner.arrays import Array
 from scanner.channel import CHANNEL_UNITS
 from scanner.coupled_motion import simulate_coupled
@@ -259,11 +259,12 @@ def check_plan(device: Device, plan: Plan, settles: bool = True) -> None:
 
     Raises:
         BadInput: the plan holds less than two samples or too many, its steps do not resolve the motion, or the device
-            lacks mechanics or a readout that can be simulated.
+            lacks mechanics or a readout that can be simulated, or states a term that has no effect.
     """
     _check_samples(device, plan, settles)
     _check_steps(device, plan)
     sense_channels(device)
+    check_effects(device)
 
 
 def _check_samples(device: Device, plan: Plan, settles: bool) -> None:

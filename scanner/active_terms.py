@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
-from scanner.device import Axis
+from scanner.device import Axis, Device
 from scanner.device_toml import INDEX, checked_number
 from scanner.errors import BadInput, DeviceInvalid
 from scanner.integrator.abi import MAX_TERMS_PER_STAGE
+from scanner.stages import Amdm
 from scanner.terms import STAGES, Term, catalogue
 from scanner.terms.driven_modes import EFFECT as DRIVEN_MODES
 from scanner.terms.driven_modes import driven_modes
@@ -97,6 +98,40 @@ def _catalogue_term(term: Term, values: Mapping[str, Any]) -> ActiveTerm:
     hint = f"remove the term if it has no effect; its law is {term.equation}"
     checked = tuple(checked_number(values[p.name], p.condition(channel), p.name, hint) for p in term.parameters)
     return ActiveTerm(term, checked, channel)
+
+
+def check_effects(device: Device) -> None:
+    """Check that every stated term has something to act on.
+
+    Raises:
+        BadInput: as :func:`stated_terms`.
+        DeviceInvalid: a law of a stage that the axis lacks, or of the motion of another axis where there is one axis.
+    """
+    for name in device.axes:
+        axis = device.sensed_axis(name)
+        for active in stated_terms(axis):
+            if (lacking := _missing_object(active, axis, len(device.axes))) is not None:
+                key, hint = f"{name}.terms.{active.term.effect}", "remove the term, or state what it acts on"
+                raise DeviceInvalid(f"has no effect {lacking}", file=axis.source, channel=key, hint=hint)
+
+
+def _missing_object(active: ActiveTerm, axis: Axis, axes: int) -> str | None:
+    """What a term acts on and a device lacks, as the end of a sentence; None if it lacks nothing."""
+    term = active.term
+    if term.coupled and axes == 1:
+        return "in a device with one axis"
+    if term.capacitance is not None and axis.capacitance is None:
+        return "without a capacitance"
+    before_demodulation = term.pre_demodulation is not None and not isinstance(axis.readout, Amdm)
+    if before_demodulation or (term.constants is not None and _keeps_constants(active, axis)):
+        return f"on a {axis.readout.kind} readout" if axis.readout else "without a readout"
+    return None
+
+
+def _keeps_constants(active: ActiveTerm, axis: Axis) -> bool:
+    """Whether a law leaves all constants of an axis as they are, with its own values and with others."""
+    others = replace(active, values=tuple(2.0 * value + 1.0 for value in active.values))
+    return all(with_constants(axis, [each]) == axis for each in (active, others))
 
 
 def place_in_signal_path(active: ActiveTerm) -> tuple[int, bool]:

@@ -5,10 +5,13 @@ from dataclasses import replace
 
 import pytest
 
+from phantoms.forward import Plan, simulate
+from phantoms.waveforms import Sine
 from scanner import devices
-from scanner.active_terms import stated_terms
+from scanner.active_terms import check_effects, stated_terms
 from scanner.device import Device
 from scanner.errors import DeviceInvalid
+from scanner.stages import Drive, Position
 from scanner.terms import catalogue
 
 POSITIVE = "must be a number greater than 0"
@@ -71,3 +74,26 @@ def test_every_term_accepts_positive_values(term) -> None:  # type: ignore[no-un
     values = {parameter.name: 1.0 for parameter in term.parameters}
     axis = replace(devices.load("imaging").axis("x"), terms={term.effect: values})
     assert stated_terms(axis)[0].values == tuple(values.values())
+
+
+@pytest.mark.parametrize(
+    ("effect", "values", "what"),
+    [
+        ("square-law", {"w": 3e10}, "on a position readout"),
+        ("filter-lag", {"s": 1.1}, "on a position readout"),
+        ("profile-shape", {"a": 0.1}, "without a capacitance"),
+        ("sensor-crosstalk", {"c": 0.1}, "in a device with one axis"),
+        ("cross-axis-coupling", {"kappa": 1e-8}, "in a device with one axis"),
+    ],
+)
+def test_a_term_without_an_effect_is_refused_in_one_line(effect: str, values: dict[str, float], what: str) -> None:
+    """It was accepted, and changed nothing."""
+    imaging = devices.load("imaging")
+    axis = replace(imaging.axis("x"), terms={effect: values})
+    check_effects(replace(imaging, axes={**imaging.axes, "x": axis}))
+    bare = replace(axis, capacitance=None, drive=Drive("linear", 1e-9), readout=Position(10.0, 1e-3))
+    with pytest.raises(DeviceInvalid, match=rf"x\.terms\.{effect}: has no effect {what}; remove the term"):
+        check_effects(Device("stage", {"x": bare}))
+    plan = Plan({"x": Sine(15_500.0, 1.0)}, 0.001, 1e6)
+    with pytest.raises(DeviceInvalid, match="has no effect"):
+        simulate(Device("stage", {"x": bare}), plan)
