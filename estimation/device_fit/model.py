@@ -27,8 +27,8 @@ from scanner.stages import Amdm
 from scanner.terms import NaturalScales, Term
 
 START_STATE_SD = 3.0
-"""Prior standard deviation of the initial angle and rate in amplitudes of the motion: so wide that the data determine
-both."""
+"""Prior standard deviation of the initial angle and rate, and of the states of stated terms, in their natural sizes: so
+wide that the data determine them."""
 
 AXIS_CACHE_SIZE = 64
 """Axes with fitted nominal values that a model caches: about as many as one Jacobian has columns."""
@@ -100,6 +100,11 @@ class Model:
         for r, run in enumerate(self.runs):
             for axis in run.inputs:
                 specs += [ParameterSpec("start", axis, name, r, START_STATE_SD**-2) for name in ("angle", "rate")]
+                specs += [
+                    ParameterSpec("hidden", _stated_key(axis, active.term), str(i), r, START_STATE_SD**-2)
+                    for active in self.given[axis]
+                    for i in range(len(active.term.hidden_state_scales))
+                ]
             for candidate in self.candidates:
                 if candidate.axis in run.inputs:
                     specs += [
@@ -189,19 +194,24 @@ class Model:
 
     def active_terms(self, axis: str, r: int, x: Array) -> tuple[ActiveTerm, ...]:
         """The stated and the added terms of an axis with their values, as the simulation takes them."""
-        terms = list(self.given[axis])
+        terms = [
+            replace(active, hidden_state=self._hidden_state(active.term, _stated_key(axis, active.term), axis, r, x))
+            for active in self.given[axis]
+        ]
         for candidate in self.candidates:
             if candidate.axis == axis:
-                scales = self.scales(axis)
-                hidden = [
-                    size(scales) * x[self._indices[("hidden", candidate.key, str(i), r)]]
-                    for i, size in enumerate(candidate.term.hidden_state_scales)
-                ]
-                padded = [*hidden, 0.0, 0.0][:2]
-                terms.append(
-                    ActiveTerm(candidate.term, self.values(candidate, x), candidate.channel, (padded[0], padded[1]))
-                )
+                hidden = self._hidden_state(candidate.term, candidate.key, axis, r, x)
+                terms.append(ActiveTerm(candidate.term, self.values(candidate, x), candidate.channel, hidden))
         return tuple(terms)
+
+    def _hidden_state(self, term: Term, owner: str, axis: str, r: int, x: Array) -> tuple[float, float]:
+        """Hidden states of a term at the first sample of run ``r``; 0 where it has none."""
+        states = [
+            size(self.scales(axis)) * x[self._indices[("hidden", owner, str(i), r)]]
+            for i, size in enumerate(term.hidden_state_scales)
+        ]
+        first, second, *_ = [*states, 0.0, 0.0]
+        return first, second
 
     def outputs(self, x: Array, stop: float = 1.0) -> list[list[Array]]:
         """Every compared channel of every run, up to the fraction ``stop`` of the recording.
@@ -293,6 +303,11 @@ class Model:
         return np.array(
             [0.0 if (i := other.index(f.kind, f.owner, f.name, f.run)) is None else x[i] for f in self.parameters]
         )
+
+
+def _stated_key(axis: str, term: Term) -> str:
+    """Owner of the hidden states of a term that the device states."""
+    return f"stated {axis}.{term.effect}"
 
 
 def _on_grid(waveforms: Array, output: Output, run: Run) -> Array:

@@ -55,8 +55,8 @@ class Predicted:
 def predict(recording: Recording, device: Device) -> dict[str, Predicted]:
     """Predict every recorded sense and angle channel from the recorded drive, with the terms of ``device`` included.
 
-    Only the mirror's angle and rate at the first sample are fitted, to the first few periods of the channels. The
-    values of the device are not adjusted.
+    Only the mirror's angle and rate at the first sample, and the states of stated terms there, such as the motion of a
+    second mode, are fitted, to the first few periods of the channels. The values of the device are not adjusted.
 
     Returns:
         The prediction of each channel by its name.
