@@ -1,4 +1,4 @@
-"""Carrier that reaches the detector without passing the comb. It adds to the signal as a vector."""
+"""Carrier that reaches the detector without passing the comb. It adds to that through the comb as a vector."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from scanner.stages import Amdm
 from scanner.terms.term import Parameter, SignalContext, Term
 
 
-def output(signal: Array, p: Sequence[float], context: SignalContext) -> Array:
-    a, q = p
-    return np.sqrt((signal + a) ** 2 + q**2)
+def pre_demodulation(capacitance: Array, p: Sequence[float], context: SignalContext) -> Array:
+    readout = context.readout
+    if not isinstance(readout, Amdm):
+        return capacitance
+    a, q = (value / readout.a_cir for value in p)
+    return np.sqrt((capacitance + a) ** 2 + q**2)
 
 
 TERM = Term(
     effect="carrier-leakage",
     stage="readout",
-    equation="y = |y_nominal + ε exp(iψ)|,  a = ε cos ψ, q = ε sin ψ",
+    equation="y = a_cir |C + ε exp(iψ)/a_cir| + b_cir,  a = ε cos ψ, q = ε sin ψ",
     parameters=(
         Parameter("a", "V", lambda s: 0.02 * s.sense_peak),
         Parameter("q", "V", lambda s: 0.02 * s.sense_peak),
@@ -29,5 +32,5 @@ TERM = Term(
         "offset-drift": "an offset drifts, leakage is constant: record for longer, or change the carrier's phase"
     },
     applies=lambda axis, scales: isinstance(scales.readout, Amdm),
-    output=output,
+    pre_demodulation=pre_demodulation,
 )
