@@ -238,18 +238,22 @@ def _run_round(
 
 
 def _attempt(reader_files: Sequence[Path], work: Work, path: Path, folder: Path) -> Failure | None:
-    """Do the work in a worker; an expected error becomes a failure with its reason."""
+    """Do the work in a worker; an error becomes a failure with its reason, so that it stops no other recording."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for file in reader_files:
         register(file)
     try:
         work(path, folder)
     except BadInput as error:
+        error.file = error.file or path
         return Failure(str(error), 2)
     except MemoryError:
         return Failure(f"{path}: needs more memory than there is; cut it into shorter ones", 2)
     except OSError as error:  # such as a full disk
         return Failure(line_of(error, folder), 1)
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        return Failure(f"{path}: ended with {reason}; the same command with this recording alone shows where", 1)
     return None
 
 

@@ -8,7 +8,7 @@ import pytest
 from recon.cli.diagnose_each import diagnose_each
 from recon.cli.reconstruct_many import reconstruct_files
 from recon.runtime import fleet
-from recon.runtime.fleet import plan_fleet, state_inputs
+from recon.runtime.fleet import plan_fleet, run_fleet, state_inputs
 from recon.steps.reconstruction import Options
 from scanner import devices
 from scanner.errors import BadInput
@@ -77,3 +77,23 @@ def test_registered_files_are_part_of_what_results_were_made_with(
         path.write_text(text, encoding="utf-8")
         stated.append(state_inputs(None, None))
     assert len(set(stated)) == 3
+
+
+def work_with_errors(path: Path, folder: Path) -> None:
+    if path.stem == "report":
+        raise ValueError("All-NaN slice\nencountered")
+    if path.stem == "light":
+        raise BadInput("is constant", channel="intensity")
+    folder.mkdir()
+
+
+def test_an_error_of_one_recording_is_stated_with_its_name_and_stops_no_other(tmp_path: Path) -> None:
+    recordings = [tmp_path / f"{name}.h5" for name in ("report", "light", "good")]
+    for path in recordings:
+        path.write_bytes(b"")
+    plan = plan_fleet(recordings, tmp_path / "out", "options", "summary.json", False)
+    failures = run_fleet(plan, work_with_errors, "reconstruct", workers=1)
+    assert plan.folders[recordings[2]].is_dir()
+    assert {path: failure.exit for path, failure in failures.items()} == {recordings[0]: 1, recordings[1]: 2}
+    assert failures[recordings[0]].reason.startswith(f"{recordings[0]}: ended with ValueError: All-NaN slice encounter")
+    assert failures[recordings[1]].reason == f"{recordings[1]}: intensity: is constant"
