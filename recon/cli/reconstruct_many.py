@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 TABLE_KEYS = ("estimator", "samples", "fill", "phase_sd_deg", "within_bound", "sign", "trouble", "notes", "seconds")
 """Keys of one recording's summary that the summary of all repeats."""
 
+STACK_FILES = ("stack.ome.tif", "stack_sd.ome.tif", "stack.ome.zarr", "stack.mp4", "stack.gif")
+"""Files of the output that a stack gives only."""
+
 
 class StackOptions(NamedTuple):
     """A stack of several recordings, with the distance of one plane from the next [m]; None for that of position_z."""
@@ -83,7 +86,7 @@ def reconstruct_files(
             summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
             rows.append(row | {"failed": None} | {key: summary[key] for key in TABLE_KEYS})
     failed = [row for row in rows if row["failed"]]
-    with replacing_folder(output) as folder:
+    with replacing_folder(output, optional=STACK_FILES) as folder:
         made = None
         if stack is not None and not failed:
             made = write_recording_stack(folder, read_planes(fleet.folders), stack.spacing, options.zarr, options.movie)

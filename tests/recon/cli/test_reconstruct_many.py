@@ -136,3 +136,13 @@ def test_a_recording_that_changed_is_not_taken_as_done(tmp_path: Path) -> None:
 def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="holds no recording"):
         find_recordings([tmp_path])
+
+
+def test_the_stack_of_an_earlier_run_does_not_stay_beside_new_results(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_bytes(b"no recording")  # a failed recording makes no stack
+    out = tmp_path / "out"
+    (out / "stack.ome.zarr").mkdir(parents=True)
+    for name in ("stack.ome.tif", "stack_sd.ome.tif", "stack.mp4", "stack.gif", "notes.txt"):
+        (out / name).write_text("of an earlier run", encoding="utf-8")
+    assert reconstruct_files([tmp_path / "a.h5"], out, OPTIONS, workers=1)["exit"] == 2
+    assert {path.name for path in out.iterdir()} == {"notes.txt", "summary.json", "index.html", "job.json"}
