@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -85,7 +84,6 @@ def estimate(
         recording: a recording or a file.
         device: in place of the recording's own.
         estimator: ``"tracker"``, ``"ukf"``, ...; chosen by what was recorded where None.
-        sample_motion: estimate a motion of the sample and remove it.
         mapping: needed where ``recording`` is an instrument's file.
         flip_x, flip_y: turn the sign of an axis, which an even capacitance cannot determine.
 
@@ -96,8 +94,8 @@ def estimate(
     from estimation.estimate import estimate as estimate_motion
 
     check_flags(flip_x=flip_x, flip_y=flip_y)
-    opened = _opened(recording, device, mapping)
-    return estimate_motion(opened, _stated_device(opened), estimator, {"x": flip_x, "y": flip_y})
+    opened = _opened(recording, mapping)
+    return estimate_motion(opened, _nominal_device(opened, device), estimator, {"x": flip_x, "y": flip_y})
 
 
 def reconstruct(
@@ -163,7 +161,16 @@ def reconstruct(
         raise BadInput(f"is {intensity_drift!r}", channel="intensity_drift", hint="give 'offset', 'gain' or None")
     check_flags(flip_x=flip_x, flip_y=flip_y, sense_only=sense_only)
     check_flags(allow_outside=allow_outside, sample_motion=sample_motion)
+    if isinstance(recording, Mapping):
+        recording = _recording_of_arrays(recording, sample_rate)
+    elif sample_rate is not None and isinstance(recording, (Recording, str, Path)):
+        raise BadInput("is for arrays; a recording has its own rates", channel="sample_rate", hint="leave it out")
+    known = truth_from_simulation(truth) if truth is not None else None
+    if known is None and isinstance(recording, (str, Path)) and mapping is None:
+        known = load_truth(Path(recording))
+    opened = _opened(recording, mapping)
     options = Options(
+        device=_nominal_device(opened, device),
         estimator=estimator,
         pixels=pixels,
         picture=picture,
@@ -175,15 +182,6 @@ def reconstruct(
         intensity_drift=intensity_drift,
         sample_motion=sample_motion,
     )
-    if isinstance(recording, Mapping):
-        recording = _recording_of_arrays(recording, sample_rate)
-    elif sample_rate is not None and isinstance(recording, (Recording, str, Path)):
-        raise BadInput("is for arrays; a recording has its own rates", channel="sample_rate", hint="leave it out")
-    known = truth_from_simulation(truth) if truth is not None else None
-    if known is None and isinstance(recording, (str, Path)) and mapping is None:
-        known = load_truth(Path(recording))
-    opened = _opened(recording, device, mapping)
-    _stated_device(opened)
     return reconstruct_recording(opened, options, known, quiet=True)
 
 
@@ -207,9 +205,8 @@ def diagnose(
     """
     from recon.diagnose_recordings import diagnose_recordings
 
-    opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
-    nominal = _stated_device(opened[0]) if device is None else load_device(device)
-    return diagnose_recordings(opened, nominal, progress)
+    opened = [_opened(each, mapping) for each in _as_list(recordings)]
+    return diagnose_recordings(opened, _nominal_device(opened[0], device), progress)
 
 
 def identify(
@@ -230,10 +227,9 @@ def identify(
     """
     from estimation.identification.calibrate import identify as identify_device
 
-    opened = [_opened(each, None, mapping) for each in _as_list(recordings)]
+    opened = [_opened(each, mapping) for each in _as_list(recordings)]
     stating = next((each for each in opened if each.device), opened[0])
-    nominal = _stated_device(stating) if device is None else load_device(device)
-    return identify_device(opened, nominal)
+    return identify_device(opened, _nominal_device(stating, device))
 
 
 def predict(
@@ -257,12 +253,12 @@ def predict(
     """
     from estimation.device_fit.predict import predict as predict_channels
 
-    opened = _opened(recording, device, mapping)
-    return predict_channels(opened, _stated_device(opened))
+    opened = _opened(recording, mapping)
+    return predict_channels(opened, _nominal_device(opened, device))
 
 
-def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: MappingSource | None) -> Recording:
-    """The recording, opened if a path is given; ``device``, if given, replaces the device of the recording."""
+def _opened(recording: RecordingSource, mapping: MappingSource | None) -> Recording:
+    """The recording, opened if a path is given."""
     from recon.io.convert import open_any
 
     if not isinstance(recording, (Recording, str, Path)):
@@ -272,15 +268,17 @@ def _opened(recording: RecordingSource, device: DeviceSource | None, mapping: Ma
         raise BadInput(f"is a {type(recording).__name__}, no recording", channel="recording", hint=hint)
     if not isinstance(recording, Recording):
         recording = open_any(Path(recording), None if mapping is None else _as_mapping(mapping))
-    return recording if device is None else replace(recording, device_toml=load_device(device).to_toml())
+    return recording
 
 
-def _stated_device(recording: Recording) -> Device:
-    """The device of a recording.
+def _nominal_device(recording: Recording, device: DeviceSource | None) -> Device:
+    """The device that is given, whose errors then name its file; else that of the recording.
 
     Raises:
-        DeviceInvalid: it states none.
+        BadInput: it is not valid, or none is given and the recording states none.
     """
+    if device is not None:
+        return load_device(device)
     if recording.device is None:
         raise DeviceInvalid("states no device", file=recording.path, channel="/device", hint="give one as device=")
     return recording.device

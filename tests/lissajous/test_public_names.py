@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import lissajous
+from scanner import devices
 from tests.support.simulated import imaging
 
 ROOT = Path(__file__).parent.parent.parent
@@ -277,3 +278,13 @@ def test_a_table_that_is_no_mapping_is_named_although_a_sample_rate_is_given() -
         lissajous.reconstruct(SimpleNamespace(columns=("sense_x",)), sample_rate=1e6)
     with pytest.raises(lissajous.BadInput, match="sample_rate: is for arrays; a recording has its own rates"):
         lissajous.reconstruct(small_recording(), sample_rate=1e6)
+
+
+@pytest.mark.parametrize("function", [lissajous.estimate, lissajous.predict, lissajous.reconstruct])
+def test_an_error_in_the_device_names_the_file_of_the_device(tmp_path: Path, function: Callable[..., object]) -> None:
+    text = devices.load("imaging").to_toml()
+    begin = text.index("[y.capacitance]")
+    (tmp_path / "device.toml").write_text(text[:begin] + text[text.index("[", begin + 1) :], encoding="utf-8")
+    with pytest.raises(lissajous.BadInput, match="is missing and needed here") as error:
+        function(imaging()[0], tmp_path / "device.toml")
+    assert str(error.value).startswith(f"{tmp_path / 'device.toml'}: y.capacitance: ")
