@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from math import isfinite, pi
+from math import ceil, isfinite, pi
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,6 +24,9 @@ MIN_SAMPLE_RATE_HZ, MAX_SAMPLE_RATE_HZ = 1e-6, 1e15
 MAX_TIME_ROUNDING_SAMPLES = 1e-3
 """Largest accepted rounding of the time of a sample [samples]. At ten samples in a period of the motion it is a phase
 error of 0.02 degrees. Times since 1970 at 1 MS/s are rounded to a quarter of a sample."""
+
+CUT_ROUNDING_SAMPLES = 1e-6
+"""A sample that lies less than this before a cut belongs to the part after it [samples]: rounding of times moved it."""
 
 MAX_MAGNITUDE = 1e100
 """Largest accepted magnitude of a sample: no measurement reaches it, and sums of its square do not overflow."""
@@ -146,6 +149,16 @@ class Channel:
     def end(self) -> float:
         """Time one sample after the last one [s]."""
         return self.start + self.size / self.sample_rate
+
+    def sample_from(self, time: float) -> int:
+        """Return the number of the first sample at or after a time [s], from 0 to ``size``.
+
+        Parts of a recording begin and end there, so that parts that adjoin share no sample.
+        """
+        samples = (time - self.start) * self.sample_rate - CUT_ROUNDING_SAMPLES
+        if not isfinite(samples):
+            return 0 if samples < 0 else self.size
+        return min(max(ceil(samples), 0), self.size)
 
     def read(self, first: int = 0, stop: int | None = None) -> Array:
         """Return samples ``first`` up to ``stop`` (as in a Python slice), shape (n,) or (n, detectors), in ``unit``.

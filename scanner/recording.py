@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import ceil, isfinite
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Protocol
@@ -38,9 +37,6 @@ from scanner.recording_file import (
 )
 from scanner.truth import Truth, write_truth
 from scanner.wording import counted
-
-# A sample less than this fraction of a sample before a cut belongs to the part after it: rounding of times moved it.
-_ROUNDING = 1e-6
 
 
 class Closeable(Protocol):
@@ -344,11 +340,7 @@ def _as_numbers(values: ArrayLike, name: str) -> NDArray[Any]:
 
 
 def _cut(channel: Channel, t0: float, t1: float) -> Channel:
-    def index(t: float) -> int:
-        samples = (t - channel.start) * channel.sample_rate - _ROUNDING
-        return min(max(ceil(samples), 0), channel.size) if isfinite(samples) else (0 if samples < 0 else channel.size)
-
-    low = index(t0)
-    high = max(index(t1), low)
+    low = channel.sample_from(t0)
+    high = max(channel.sample_from(t1), low)
     start = channel.start + low / channel.sample_rate
     return replace(channel, start=start, first=channel.first + low, stop=channel.first + high)

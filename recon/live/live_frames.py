@@ -164,7 +164,7 @@ def add_part(
     intensity = estimated.prepared.for_picture(options.undo_lag).intensity
     known = scan.readout_phase if scan else {}
     estimated = replace(estimated, motion=apply_readout_phase(sensed, known))
-    first = max(0, round((start - intensity.start) * intensity.sample_rate))
+    first = intensity.sample_from(start)
     unlocated = to_sample_ranges(unrecoverable_intervals(estimated.motion, estimated.prepared.defects), intensity)
     beam, grid = estimated.beam, estimated.grid
     if frame is None:

@@ -83,6 +83,17 @@ def test_a_frame_in_parts_is_the_frame(kind: str) -> None:
     assert np.nanmedian(scan.estimate.sd / whole.picture_sd) == pytest.approx(1.0, abs=0.05)
 
 
+def test_each_sample_belongs_to_one_part_wherever_their_edges_lie() -> None:
+    recording, _ = imaging()
+    options, intensity = Options(pixels=(40, 40), sense_only=True), recording["intensity"]
+    scan, first = add_part(recording, 0.0, 0.01, None, None, options)
+    scan = finish_frame(scan, first, options)
+    edge = 0.015 + 0.3 / intensity.sample_rate
+    scan, frame = add_part(recording, 0.01, edge, scan, None, options)
+    scan, frame = add_part(recording, edge, 0.02, scan, frame, options)
+    assert frame.sums.samples == recording.slice(0.01, 0.02)["intensity"].size
+
+
 @pytest.mark.parametrize("kind", ["kernel", "posterior"])
 def test_a_frame_without_samples_is_refused_and_the_next_one_is_shown(kind: str) -> None:
     recording, _ = imaging()
