@@ -15,6 +15,10 @@ UNIQUE_NAME_THRESHOLD = 6.0
 """Difference in -2 log evidence from which a term is reported as the only explanation: a factor of 20 in probability.
 Within it, the next candidate is reported as a rival."""
 
+MIN_RIVAL_PROBABILITY = 1e-4
+"""Probability from which a rival is reported with it. A less probable one is reported only if it is not excluded: it
+fits as well with more parameters, or was not compared."""
+
 MAX_HELD_OUT_CHI2 = 1.3
 """Held-out reduced chi-square above which a part of the misfit is reported as unexplained."""
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from estimation.candidate_terms.discrepancy import is_discrepancy
 from estimation.candidate_terms.screening import ScoreTest
-from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD
+from estimation.candidate_terms.significance import MIN_RIVAL_PROBABILITY, UNIQUE_NAME_THRESHOLD
 from estimation.device_fit.fit import Fit, Likelihood
 from estimation.device_fit.parameters import Candidate
 from estimation.device_fit.profile_likelihood import profile_interval
@@ -48,7 +48,7 @@ class Rival:
 
     Attributes:
         effect: its name.
-        probability: posterior probability that it is the true effect.
+        probability: posterior probability that it is the true effect; 0 for a confounder that was not compared.
         distance: norm of the finding's signal that remains if the rival is fitted to it [sigma]; None for an effect
             without a law and for the optics, where it is not computed.
         stage: of an ``unknown`` rival of an ``unknown`` finding; None for others.
@@ -105,7 +105,7 @@ def find_effect(
         Rival(name, probability, distance_of.get(name))
         for name, probability in sorted(probabilities.items(), key=lambda item: -item[1])
         # a rival that fits as well with more parameters is improbable, but the data do not exclude it
-        if name != effect and (probability > 1e-4 or name in fits_as_well)
+        if name != effect and (probability > MIN_RIVAL_PROBABILITY or name in fits_as_well)
     )
     advice = _advice(result, step, distance)
     known = {rival.effect for rival in rivals}
@@ -122,7 +122,7 @@ def find_effect(
         where=describe_localisation(result.likelihood, candidate, step.before, step.after),
         probability=probabilities[effect] * (1.0 - sum(rival.probability for rival in elsewhere)),
         share=share_of_finding(result, step),
-        rivals=(*(rival for rival in elsewhere if rival.probability > 1e-4), *rivals),
+        rivals=(*(rival for rival in elsewhere if rival.probability > MIN_RIVAL_PROBABILITY), *rivals),
         heldout={"metric": METRIC, "before": step.before.validation_chi2, "after": result.final.validation_chi2},
         channel=candidate.channel,
         source=candidate.term.source,

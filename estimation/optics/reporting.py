@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimation.candidate_terms.significance import UNIQUE_NAME_THRESHOLD
+from estimation.candidate_terms.significance import MIN_RIVAL_PROBABILITY, UNIQUE_NAME_THRESHOLD
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
 from estimation.optics.candidates import OpticsEffect, optics_scales
@@ -32,9 +32,6 @@ LAG_SEARCH_RANGE = (0.7, 1.5)
 
 MAX_SCORE = 1400.0
 """Bound on a difference in -2 log evidence before exp(-x / 2) is taken, which would underflow beyond it."""
-
-MIN_REPORTED_PROBABILITY = 1e-4
-"""Rivals below this probability are not listed."""
 
 
 PHASE_EFFECTS = ("phase", "detector-delay")
@@ -214,7 +211,7 @@ def build_finding(
         parameters=description.parameters,
         where=description.where,
         probability=1.0 / total,
-        rivals=tuple(Rival(name, p) for p, name in probabilities if p > MIN_REPORTED_PROBABILITY),
+        rivals=tuple(Rival(name, p) for p, name in probabilities if p > MIN_RIVAL_PROBABILITY),
         heldout=heldout,
         channel="intensity",
         source=description.source,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimation.candidate_terms.significance import MIN_RIVAL_PROBABILITY
 from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
@@ -49,9 +50,6 @@ MIN_SHARE = 0.9
 
 MIN_REMAINDER = 0.005
 """Share of the misfit below which no remainder is reported: the accuracy of a share."""
-
-MIN_RIVAL_PROBABILITY = 1e-4
-"""Probability below which a law is not listed as a rival."""
 
 METRIC = "error of the amplitude on samples not used in the fit, as a fraction of the amplitude (rms)"
 

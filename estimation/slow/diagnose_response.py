@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimation.candidate_terms.significance import MIN_RIVAL_PROBABILITY
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
@@ -95,7 +96,9 @@ def _finding(
     for effects, weight in without.items():
         for other in set(effects) - set(best.effects):
             others[other] = others.get(other, 0.0) + weight
-    rivals = [Rival(other, p) for other, p in sorted(others.items(), key=lambda each: -each[1]) if p > 1e-4]
+    rivals = [
+        Rival(other, p) for other, p in sorted(others.items(), key=lambda each: -each[1]) if p > MIN_RIVAL_PROBABILITY
+    ]
     probability = 1.0 - sum(without.values())
     if effect == SECOND_MODE and has_other_axis:  # the same equations of motion
         probability *= 0.5

@@ -120,6 +120,7 @@ def _format_plan(summary: dict[str, Any]) -> str:
 
 
 def _format_diagnosis(summary: dict[str, Any]) -> str:
+    from estimation.candidate_terms.significance import MIN_RIVAL_PROBABILITY
     from recon.report.conclusions import name_rival
     from recon.report.numbers import format_interval, format_probability
 
@@ -136,12 +137,11 @@ def _format_diagnosis(summary: dict[str, Any]) -> str:
             f"    {p['name']} = {format_interval(p['value'], p['ci95'][0], p['ci95'][1], p['unit'])}"
             for p in finding["parameters"]
         ]
-        if finding["rivals"]:
-            rivals = [
-                f"{name_rival(r['effect'], r.get('stage'))} ({format_probability(r['probability'])})"
-                for r in finding["rivals"]
-            ]
-            lines.append(f"    alternative: {', '.join(rivals)}")
+        names = [(name_rival(r["effect"], r.get("stage")), r["probability"]) for r in finding["rivals"]]
+        probable = [f"{name} ({format_probability(p)})" for name, p in names if p > MIN_RIVAL_PROBABILITY]
+        others = [name for name, p in names if p <= MIN_RIVAL_PROBABILITY]
+        lines += [f"    alternative: {', '.join(probable)}"] if probable else []
+        lines += [f"    not excluded by this recording: {', '.join(others)}"] if others else []
         if "advice" in finding:
             lines.append(f"    to distinguish them: {finding['advice']}")
     if summary["unexplained"]:

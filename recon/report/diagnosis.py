@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from estimation.candidate_terms.significance import MIN_RIVAL_PROBABILITY
 from estimation.device_fit.data import Run
 from estimation.device_fit.fit import Fit
 from estimation.device_fit.posterior import PredictionPhaseError, phase_error, phase_portrait, waveform
@@ -108,7 +109,8 @@ def _finding_section(finding: Finding, index: int, search: SelectionResult | Non
     rows = [[p.name, format_interval(p.value, *p.ci95, p.unit)] for p in finding.parameters]
     for rival in finding.rivals:
         distance = "" if rival.distance is None else f"; differs from it by {rival.distance:.1f} σ at most"
-        probability = f"probability {format_probability(rival.probability)}" if rival.probability > 1e-4 else ""
+        is_probable = rival.probability > MIN_RIVAL_PROBABILITY
+        probability = f"probability {format_probability(rival.probability)}" if is_probable else ""
         name = f"alternative: {name_rival(rival.effect, rival.stage)}"
         rows.append([name, (probability or "not excluded by this recording") + distance])
     figures = [measured_curve_figure(finding.curve)] if finding.curve and "columns" in finding.curve else []

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from recon.cli.diagnose import format_summary
 from recon.report.conclusions import conclude_diagnosis
 
 CORRECTED, NOMINAL = "Use the corrected device.toml", "device.toml is the nominal device"
@@ -141,3 +142,13 @@ def test_values_far_outside_their_tolerances_are_named(pulls: dict[str, float], 
     listed = "x.capacitance.C0 by 7.7, x.readout.R_s by 3.3, x.capacitance.theta0 by −2.9 tolerances"
     assert (listed in text) == stated
     assert ("Check that the device file belongs to this device" in text) == stated
+
+
+def test_an_alternative_that_was_not_compared_is_not_called_improbable() -> None:
+    finding = found("cubic-damping", 0.998, ("damping-drift", 0.002), ("gain-drift", 0.0)) | {
+        "heldout": {"metric": "error", "before": 0.1, "after": 0.01}
+    }
+    summary = {"verdict": "mismatch", "conclusion": "", "findings": [finding], "unexplained": None, "output": "out"}
+    lines = format_summary(summary).splitlines()
+    assert "    alternative: damping-drift (0.2 %)" in lines
+    assert "    not excluded by this recording: gain-drift" in lines
