@@ -37,3 +37,16 @@ def test_quiet_shows_no_stage(capsys: pytest.CaptureFixture[str]) -> None:
     with stage_progress.stage_progress(quiet=True) as progress:
         progress("report")
     assert not capsys.readouterr().err
+
+
+def test_an_interrupt_states_the_stage_and_how_the_work_takes_less_time(capsys: pytest.CaptureFixture[str]) -> None:
+    def work() -> None:
+        with stage_progress.stage_progress(quiet=False) as progress:
+            progress("fits with x cubic-stiffness")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    shown = capsys.readouterr().err
+    assert shown.startswith("stopped during: fits with x cubic-stiffness; a part of the recording takes less time")
+    assert shown.count("\n") == 1
