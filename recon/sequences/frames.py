@@ -192,8 +192,9 @@ def frames(
     if length < 1:
         what = f"has {intensity.sample_rate:.4g} samples a second, and frames of {time:.3g} s would hold none"
         raise BadInput(what, channel="intensity", hint="give fewer frames or more time to each")
-    number = count or max(1, math.ceil(intensity.size / length - 1e-6))
-    edges = [min(round(k * length), intensity.size) for k in range(number + 1)]
+    # A last frame begins at least half a sample before the end, so that it holds one.
+    number = count or max(1, math.ceil((intensity.size - 0.5) / length - 1e-6))
+    edges = [*(round(k * length) for k in range(number)), intensity.size]
     times = [intensity.start + edge / intensity.sample_rate for edge in edges[:-1]]
     return ScanFrames(result, FrameAxis("t", times, time), list(pairwise(edges)), unlocated, independent)
 

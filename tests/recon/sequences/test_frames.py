@@ -60,6 +60,18 @@ def test_frames_are_written_in_every_format(result: Reconstruction, tmp_path: Pa
     assert labels == ["green", "red", "green, standard deviation", "red, standard deviation"]
 
 
+@pytest.mark.parametrize("missing", [0.4, 0.6, 1.0])
+def test_the_last_frame_holds_a_sample_wherever_the_frames_end(
+    result: Reconstruction, tmp_path: Path, missing: float
+) -> None:
+    size, rate = result.intensity.size, result.intensity.sample_rate
+    options = replace(OPTIONS, frames=None, frame_time=(size - missing) / 3.0 / rate, fill_radius=0, zarr=False)
+    spans = write_scan_frames(tmp_path, result, options).spans
+    assert len(spans) == (3 if missing < 0.5 else 4)
+    assert spans[-1][1] == size
+    assert all(begin < end for begin, end in spans)
+
+
 @pytest.mark.parametrize("kind", ["mean", "kernel", "posterior"])
 def test_a_frame_without_samples_is_empty(kind: str) -> None:
     rate, size = 1e6, 120_000
