@@ -264,6 +264,8 @@ def map_edges(request: Request) -> Edges:
     if stated["unit"] in CONVERSIONS["V"] and variable.sample_rate:  # the sync signal itself
         event = str(stated.get("event", "both-edges"))
         times = find_edges(np.asarray(times, np.float64), variable.sample_rate, variable.start or 0.0, event)
+        if not times.size:
+            raise request.bad(f"{spec['variable']!r} has no edge: it stays at one level", "name the sync signal")
         stated["unit"] = "s"
     return make_edges(request.name, times, stated, request.place)
 

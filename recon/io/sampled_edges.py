@@ -7,7 +7,7 @@ import numpy as np
 from scanner.arrays import Array
 
 LEVEL_QUANTILE = 1e-3
-"""Quantile of the samples at which the signal is low, and from the top at which it is high: a pulse may be short."""
+"""Quantile of the low samples at which the signal is low, and from the top of the high ones at which it is high."""
 
 HYSTERESIS = 0.25
 """Distance from the middle, relative to that of both levels, that a sample has to pass before the next edge counts."""
@@ -31,7 +31,7 @@ def find_edges(values: Array, rate: float, start: float, event: str) -> Array:
     values = values[at]
     if values.size < 2:
         return np.empty(0)
-    low, high = np.quantile(values, [LEVEL_QUANTILE, 1.0 - LEVEL_QUANTILE])
+    low, high = _levels(values)
     middle, margin = 0.5 * (low + high), HYSTERESIS * (high - low)
     outside = np.flatnonzero(np.abs(values - middle) > margin)
     side = np.sign(values[outside] - middle)
@@ -43,3 +43,17 @@ def find_edges(values: Array, rate: float, start: float, event: str) -> Array:
         share = (middle - values[last]) / (values[last + 1] - values[last])
         times.append(start + (at[last] + share * (at[last + 1] - at[last])) / rate)
     return np.sort(np.concatenate(times))
+
+
+def _levels(values: Array) -> tuple[float, float]:
+    """The two levels of a signal, however short its pulses are.
+
+    The low samples are separated from the high ones where the variance within both is smallest (Otsu 1979).
+    """
+    ordered = np.sort(values)
+    below = np.arange(1, ordered.size)
+    sums = np.cumsum(ordered - ordered[0])
+    difference = sums[:-1] / below - (sums[-1] - sums[:-1]) / below[::-1]
+    count = 1 + int(np.argmax(below * below[::-1] * difference**2))
+    low = np.quantile(ordered[:count], LEVEL_QUANTILE)
+    return float(low), float(np.quantile(ordered[count:], 1.0 - LEVEL_QUANTILE))
