@@ -144,6 +144,20 @@ def infer_clock(times: SampleSource) -> tuple[float | None, float | None, str]:
     return float(1 / step), first, ""
 
 
+def agree_on_clock(times: SampleSource, stated: float | None) -> tuple[float | None, float | None, str]:
+    """Sample rate [Hz] and start [s] of a column of times [s] beside a stated rate [Hz], and a note, else empty.
+
+    The stated rate has more digits than printed times, and is used where both agree within a sample over the column.
+    Elsewhere that of the times is, as in a table of which every tenth row was kept.
+    """
+    measured, start, note = infer_clock(times)
+    if measured is None or not stated:
+        return measured, start, note
+    if abs(stated / measured - 1.0) * times.shape[0] <= 1.0:
+        return stated, start, note
+    return float(f"{measured:.12g}"), start, f"its times give {measured:.6g} Hz, and the header states {stated:.6g} Hz"
+
+
 def _find_jump(times: SampleSource, size: int) -> str:
     """Where times first fall, or else jump, for good, in words; empty where single times are off or none is."""
     usual = float(np.median(np.diff(np.asarray(times[: min(size, READ_CHUNK_SAMPLES)], np.float64))))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon.io.readers.contents import (
     Contents,
     Variable,
-    infer_clock,
+    agree_on_clock,
     map_blocks,
     normalise_unit,
     rate_from_step,
@@ -113,8 +113,7 @@ def _variable(
         values = values[np.arange(len(values)) % int(longest) < size]
         note = f"{size:g} of each {longest:g} rows"
     elif times is not None:
-        measured_rate, _, note = infer_clock(times)
-        rate = rate if measured_rate is not None else None
+        rate, _, note = agree_on_clock(times, rate)
     x_unit = (head.get("X_Dimension") or ["Time"] * (index + 1))[index : index + 1]
     if x_unit != ["Time"]:
         rate, note = None, f"its X is {''.join(x_unit) or 'unnamed'}, not Time"

@@ -17,6 +17,7 @@ from recon.io.readers.column_names import TIME_NAMES, TIME_UNITS, find_time_colu
 from recon.io.readers.contents import (
     Contents,
     Variable,
+    agree_on_clock,
     infer_clock,
     map_blocks,
     normalise_unit,
@@ -122,8 +123,7 @@ def read_csv(path: Path) -> Contents:
 def _variables(layout: Layout, table: Array) -> dict[str, Variable]:
     rate, start, note = layout.rate, layout.starts.get(len(table), layout.start), ""
     if layout.times is not None:
-        measured_rate, start, note = infer_clock(table[:, layout.times])
-        rate = None if measured_rate is None else rate or measured_rate
+        rate, start, note = agree_on_clock(table[:, layout.times], rate)
     elif layout.index is not None:
         samples_per_row, _, note = infer_clock(table[:, layout.index])
         rate = None if samples_per_row is None else rate

@@ -118,3 +118,23 @@ def test_messages_name_the_keys_of_a_mapping_that_are_missing(tmp_path: Path) ->
     plan = {"channels": {"sense_x": {"variable": "x", "sample_rate": 1e6, "unit": "counts"}}}
     with pytest.raises(UnitUnknown, match=r'its size per count: scale = 0\.0005, unit = "V"'):
         convert(tmp_path / "counts.npz", plan)
+
+
+@pytest.mark.parametrize(("kept", "rate"), [(1, 2.5e6), (10, 2.5e5)])
+def test_the_times_of_a_table_of_which_rows_were_removed_are_its_clock(tmp_path: Path, kept: int, rate: float) -> None:
+    head = ["Model,MDO", "Horizontal Units,s", "Sample Interval,4e-07", "Vertical Units,V", "TIME,CH1"]
+    rows = [f"{4e-7 * k - 0.02:.6e},{k % 7}" for k in range(0, 5000, kept)]
+    (tmp_path / "scope.csv").write_text("\n".join([*head, *rows]), encoding="utf-8")
+    variable = read(tmp_path / "scope.csv").variables["CH1"]
+    assert variable.sample_rate == pytest.approx(rate, rel=1e-9)
+    assert variable.start == pytest.approx(-0.02)
+    assert ("the header states 2.5e+06 Hz" in variable.note) == (kept > 1)
+
+
+@pytest.mark.parametrize("step", ["", "Delta_X\t0.001\t\n"])
+def test_the_times_of_a_labview_table_are_its_clock(tmp_path: Path, step: str) -> None:
+    lines = ["LabVIEW Measurement", "Separator\tTab", "X_Columns\tOne", "***End_of_Header***", "Channels\t1"]
+    lines += [f"{step}Y_Unit_Label\tVolts", "***End_of_Header***", "X_Value\tCH1"]
+    lines += [f"{1e-4 * k:.6f}\t{k % 7}" for k in range(200)]
+    (tmp_path / "decay.lvm").write_text("\n".join(lines), encoding="utf-8")
+    assert read(tmp_path / "decay.lvm").variables["CH1"].sample_rate == pytest.approx(1e4, rel=1e-9)
