@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -79,12 +81,13 @@ def info(path: Path, format: str | None = None, mapping: Path | None = None) -> 
 
 def suggestion(variables: Any, format: str | None = None) -> str:
     """A mapping (TOML) of all signals; values that the file does not state are commented out, to be filled in."""
-    lines = [HEADING, *([f"format = {_quoted(format)}"] if format else [])]
+    lines, taken = [HEADING, *([f"format = {_quoted(format)}"] if format else [])], set[str]()
     for name, variable in variables.items():
         is_clock = name.rpartition(".")[2].lower() in TIME_NAMES and variable.sample_rate is None
         if not variable.is_signal or variable.raw.shape[0] < 2 or (is_clock and len(variables) > 1):
             continue
-        channel = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name) or "_"
+        channel = _bare_key(name, taken)
+        taken.add(channel)
         lines += ["", f"[channels.{channel}]", f"variable = {_quoted(name)}"]
         lines.append(f"unit = {_quoted(variable.unit)}" if variable.unit else '# unit = "V"')
         if variable.raw.dtype.kind in "iu" and not variable.unit:
@@ -126,6 +129,13 @@ def _of_recording(path: Path, mapping: Path | None) -> dict[str, Any]:
 def _variable_summary(variable: Variable) -> dict[str, Any]:
     statements = {key: getattr(variable, key) for key in ("unit", "sample_rate", "start", "note")}
     return {"shape": variable.raw.shape, "dtype": str(variable.raw.dtype)} | statements
+
+
+def _bare_key(name: str, taken: Collection[str]) -> str:
+    """A key that TOML takes without quotes for a variable, none of ``taken``: other characters become _."""
+    key = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name) or "_"
+    free = (f"{key}-{number}" for number in count(2))
+    return key if key not in taken else next(each for each in free if each not in taken)
 
 
 def _quoted(text: str) -> str:

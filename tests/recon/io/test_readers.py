@@ -281,6 +281,13 @@ def test_the_suggested_mapping_is_complete_if_the_file_states_everything(tmp_pat
         convert(tmp_path / "b.csv", parse_toml(bare, "suggestion"))
 
 
+def test_the_suggested_channels_have_different_names(tmp_path: Path) -> None:
+    rows = "".join(f"{k},1,2,3,4\n" for k in range(9))
+    path = write_text(tmp_path / "a.csv", f"Time (s),电压,电流,CH 1,CH_1\n{rows}")
+    channels = parse_toml(info(path)["suggestion"], "suggestion")["channels"]
+    assert [spec["variable"] for spec in channels.values()] == ["电压", "电流", "CH 1", "CH_1"]
+
+
 def test_info_lists_the_channels_of_a_recording(tmp_path: Path) -> None:
     Recording.from_arrays({"sense_x": (VALUES, "mV", 10.0, 0.5)}, name="n").write(tmp_path / "a.h5")
     description = info(tmp_path / "a.h5")
