@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from recon.io.readers.column_names import TIME_UNITS, split_label
-from recon.io.readers.contents import Contents, Variable, flatten_row, infer_clock, matrix_row
+from recon.io.readers.contents import Contents, Variable, flatten_vector, infer_clock, matrix_row
 from recon.io.sampled_edges import find_edges
 from scanner.arrays import Array
 from scanner.channel import (
@@ -217,7 +217,7 @@ def _find(request: Request, name: str) -> Variable:
 
 def _samples(request: Request, variable: Variable) -> SampleSource:
     """Samples of the channel, shape (n,) or (n, detectors)."""
-    spec, raw = request.spec, flatten_row(variable.raw)
+    spec, raw = request.spec, flatten_vector(variable.raw)
     if "row" in spec:
         if raw.ndim != 2 or spec["row"] not in range(raw.shape[0]):
             raise request.bad(
@@ -256,10 +256,12 @@ def map_edges(request: Request) -> Edges:
         raise request.bad("says no variable", f"write [channels.{request.name}] with variable = ...")
     if unknown := [key for key in spec if key not in EDGE_KEYS]:
         raise request.bad(f"{unknown[0]} is not a known key of edges", f"known: {', '.join(EDGE_KEYS)}")
-    if spec["variable"] not in request.contents.variables:
-        raise request.bad(f"there is no variable {spec['variable']!r}", request.holds)
-    variable = request.contents.variables[spec["variable"]]
-    times = flatten_row(variable.raw)[0 : variable.raw.shape[-1]]
+    variable = _find(request, spec["variable"])
+    column = flatten_vector(variable.raw)
+    if not variable.is_signal or column.ndim != 1:
+        what = f"variable {spec['variable']!r} of shape {variable.raw.shape} is no list of numbers"
+        raise request.bad(what, f"name the list of edge times, or the sync signal; {request.holds}")
+    times = column[0 : column.shape[0]]
     stated = {"unit": variable.unit} | {key: value for key, value in spec.items() if key != "variable"}
     if stated["unit"] in CONVERSIONS["V"] and variable.sample_rate:  # the sync signal itself
         event = str(stated.get("event", "both-edges"))
@@ -271,7 +273,7 @@ def map_edges(request: Request) -> Edges:
 
 
 def _clock(times: Variable, name: str, bad: Any) -> tuple[float, float]:
-    column = flatten_row(times.raw)
+    column = flatten_vector(times.raw)
     if not times.is_signal or column.ndim != 1:
         raise bad(f"time = {name!r} is no column of numbers", "name the variable that holds the times [s]")
     rate, start, note = infer_clock(column)
@@ -297,7 +299,7 @@ def join_columns(variables: Sequence[Variable], names: Sequence[str], bad: Calla
         BadInput: they differ in length, clock or unit.
     """
     first = variables[0]
-    columns = [flatten_row(each.raw) for each in variables]
+    columns = [flatten_vector(each.raw) for each in variables]
     if any(each.ndim != 1 for each in columns):
         raise bad("variable lists a matrix", "list columns, or name the matrix alone")
     sizes = [each.shape[0] for each in columns]

@@ -76,10 +76,12 @@ class Contents:
     close: Callable[[], None] = _close_nothing
 
 
-def flatten_row(raw: SampleSource) -> SampleSource:
-    """Samples of shape (1, n) as (n,); other shapes unchanged."""
-    if raw.ndim != 2 or raw.shape[0] != 1:
+def flatten_vector(raw: SampleSource) -> SampleSource:
+    """Samples of shape (1, n) or (n, 1) as (n,); other shapes unchanged."""
+    if raw.ndim != 2 or 1 not in raw.shape:
         return raw
+    if raw.shape[0] != 1:
+        return LazySamples(raw.shape[:1], raw.dtype, lambda first, stop: raw[first:stop][:, 0])
     return LazySamples(raw.shape[1:], raw.dtype, lambda first, stop: raw[0:1][0, first:stop])
 
 

@@ -73,6 +73,27 @@ def test_a_row_of_a_matrix_is_a_channel(tmp_path: Path) -> None:
             convert(tmp_path / "a.npz", {"channels": {"sense_x": spec | {"row": row}}})
 
 
+def test_a_matrix_of_one_column_is_a_list_of_edge_times_or_of_samples(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", volts=np.arange(8.0)[:, None], edges=np.arange(5.0)[:, None], one=np.float64(3.0))
+    channels = {
+        "sense_x": {"variable": "volts", "unit": "V", "sample_rate": 100.0},
+        "sync_x": {"variable": "edges", "unit": "ms", "angle": 0.02},
+    }
+    with convert(tmp_path / "a.npz", {"channels": channels}) as made:
+        np.testing.assert_array_equal(made["sense_x"].read(2, 5), [2.0, 3.0, 4.0])
+        np.testing.assert_allclose(made.edges["sync_x"].times, 1e-3 * np.arange(5.0))
+    channels["sync_x"]["variable"] = "one"
+    with pytest.raises(BadInput, match=r"variable 'one' of shape \(\) is no list of numbers"):
+        convert(tmp_path / "a.npz", {"channels": channels})
+
+
+def test_edges_are_named_as_the_heading_with_its_unit(tmp_path: Path) -> None:
+    lines = ["Time (s),Sync (V)", *(f"{k * 1e-6:.6f},{5 * (k // 50 % 2)}" for k in range(500))]
+    (tmp_path / "scope.csv").write_text("\n".join(lines), encoding="utf-8")
+    mapping = {"channels": {"sync_x": {"variable": "Sync (V)", "event": "both-edges"}}}
+    assert convert(tmp_path / "scope.csv", mapping).edges["sync_x"].times.size == 9
+
+
 def test_edge_times_become_a_sync_channel(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", light=np.ones(50), edges=np.arange(20.0))
     channels = {
