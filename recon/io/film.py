@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from scanner.errors import BadInput
 
 COLOURS = (2, 3, 6, 8)
 """Photometric interpretations of colour pictures: RGB, palette, YCbCr, CIELAB (TIFF 6.0)."""
+
+OME_LENGTHS = ("PhysicalSizeX", "PhysicalSizeY", "PhysicalSizeZ", "TimeIncrement")
+"""Attributes of OME's pixels that hold for a film whose values are changed; each may have a unit."""
 
 
 @dataclass(frozen=True)
@@ -163,11 +167,28 @@ def write_film(path: Path, film: Film, planes: Iterable[NDArray[Any]]) -> None:
 
 
 def _description(file: Any, page: Any) -> dict[str, Any]:
-    """Arguments for tifffile that write the resolution and ImageJ's time and length units again."""
+    """Arguments for tifffile that write again the resolution, and what ImageJ or OME states of length and time."""
     stated: dict[str, Any] = {"imagej": bool(file.is_imagej), "ome": bool(file.is_ome)}
     if "XResolution" in page.tags and "YResolution" in page.tags:
         stated["resolution"], stated["resolutionunit"] = page.resolution, page.resolutionunit
     if file.is_imagej:
         kept = ("unit", "finterval", "fps", "spacing", "tunit")
         stated["metadata"] = {key: value for key, value in file.imagej_metadata.items() if key in kept}
+    elif file.is_ome:
+        stated["metadata"] = _ome_statements(file.ome_metadata)
     return stated
+
+
+def _ome_statements(description: str) -> dict[str, Any]:
+    """Sizes of a pixel, time from frame to frame and names of the channels in a description by OME; empty without."""
+    try:
+        root = ElementTree.fromstring(description)
+    except ElementTree.ParseError:
+        return {}
+    pixels = root.find(".//{*}Pixels")
+    if pixels is None:
+        return {}
+    keys = [key for length in OME_LENGTHS for key in (length, f"{length}Unit")]
+    stated: dict[str, Any] = {key: pixels.attrib[key] for key in keys if key in pixels.attrib}
+    names = [channel.get("Name") for channel in pixels.iterfind("{*}Channel")]
+    return stated | ({"Channel": {"Name": names}} if names and all(names) else {})
