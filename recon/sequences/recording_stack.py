@@ -140,17 +140,25 @@ def _order(planes: Sequence[Plane], spacing: float | None) -> tuple[Sequence[Pla
 
 
 def _mirrored_planes(planes: Sequence[Plane]) -> list[tuple[str, ...]]:
-    """Axes in which each plane has to be mirrored to agree best with the one before, where its sign is ambiguous."""
-    mirrored: list[tuple[str, ...]] = [()]
-    before = planes[0].read("image")
-    for plane in planes[1:]:
-        ambiguous = [axis for axis in AXES if plane.summary["sign"][axis] == "ambiguous"]
-        options = [tuple(axis for axis, turn in zip(ambiguous, turns, strict=True) if turn)
-                   for turns in product((False, True), repeat=len(ambiguous))]  # fmt: skip
-        best = max(options, key=lambda axes: _correlation(before.image, plane.read("image", axes).image))
-        mirrored.append(best)
-        before = plane.read("image", best)
+    """Axes in which each plane has to be mirrored to agree best with its neighbour, where its sign is ambiguous.
+
+    The comparison begins at the first of the planes with the fewest ambiguous signs, and continues to both ends.
+    """
+    origin = min(range(len(planes)), key=lambda k: len(_ambiguous_axes(planes[k])))
+    mirrored: list[tuple[str, ...]] = [()] * len(planes)
+    for order in (range(origin, len(planes)), range(origin, -1, -1)):
+        for known, k in pairwise(order):
+            neighbour, ambiguous = planes[known].read("image", mirrored[known]), _ambiguous_axes(planes[k])
+            options = [tuple(axis for axis, turn in zip(ambiguous, turns, strict=True) if turn)
+                       for turns in product((False, True), repeat=len(ambiguous))]  # fmt: skip
+            agreement = [_correlation(neighbour.image, planes[k].read("image", axes).image) for axes in options]
+            mirrored[k] = options[int(np.argmax(agreement))]
     return mirrored
+
+
+def _ambiguous_axes(plane: Plane) -> list[str]:
+    """Axes of which the recording of a plane does not determine the sign."""
+    return [axis for axis in AXES if plane.summary["sign"][axis] == "ambiguous"]
 
 
 def _correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
@@ -178,10 +186,12 @@ def _describe_movement(planes: Sequence[Plane], axis: FrameAxis) -> Iterator[str
 
 def _describe_mirrored(planes: Sequence[Plane], mirrored: Sequence[Sequence[str]]) -> Iterator[str]:
     """A note on signs that the recordings do not determine."""
-    ambiguous = [axis for axis in AXES if any(plane.summary["sign"][axis] == "ambiguous" for plane in planes)]
+    ambiguous = [axis for axis in AXES if any(axis in _ambiguous_axes(plane) for plane in planes)]
     if ambiguous:
         turned = [f"{plane.name} in {' and '.join(axes)}" for plane, axes in zip(planes, mirrored, strict=True) if axes]
+        unknown = [axis for axis in AXES if all(axis in _ambiguous_axes(plane) for plane in planes)]
         yield (
             f"the sign of {' and '.join(ambiguous)} is ambiguous: planes are mirrored where that agrees better with "
-            f"the plane before ({', '.join(turned) or 'none'}), and the whole stack may be mirrored"
+            f"the plane beside ({', '.join(turned) or 'none'})"
+            + (f", and the whole stack may be mirrored in {' and '.join(unknown)}" if unknown else "")
         )

@@ -103,6 +103,18 @@ def test_ambiguous_signs_follow_the_plane_before(tmp_path: Path) -> None:
         assert np.nanstd(image - scene()) < 0.6
 
 
+def test_ambiguous_signs_of_first_planes_follow_the_plane_whose_signs_are_known(tmp_path: Path) -> None:
+    signs = {"a": {"x": "ambiguous", "y": "ambiguous"}, "b": KNOWN | {"y": "ambiguous"}, "c": KNOWN, "d": KNOWN}
+    turns = {"a": (-1, -1), "b": (-1, 1), "c": (1, 1), "d": (1, 1)}
+    planes = {
+        name: completed(tmp_path / name, scene()[:: turns[name][0], :: turns[name][1]], 1e-6 * k, sign)
+        for k, (name, sign) in enumerate(signs.items())
+    }
+    assert write(tmp_path, planes)["mirrored"] == {"a.h5": ["x", "y"], "b.h5": ["y"]}
+    for image in tifffile.imread(tmp_path / "out" / "stack.ome.tif"):
+        np.testing.assert_array_equal(image, scene())
+
+
 @pytest.mark.parametrize(
     ("changed", "line"),
     [
