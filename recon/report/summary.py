@@ -289,6 +289,7 @@ def summarise(result: Reconstruction, slices: ZSlices | None = None) -> dict[str
         "readout_delay_us": common_delay_summary(result),
         "tolerance_px": result.p,
         "detectors": list(result.picture.detectors),
+        "intensity_unit": result.intensity.unit,
         "clock_doubted": result.clock_doubted,
         "fill": fill_factor(result.picture.coverage),
         "resolution_px": result.resolution_px,

@@ -77,7 +77,8 @@ def write_recording_stack(
         movie: write a movie too, ``"mp4"`` or ``"gif"``.
 
     Raises:
-        BadInput: pictures of different fields, sizes or detectors, some without a position, or two at one position.
+        BadInput: pictures of different fields, sizes, units or detectors, some without a position, or two at one
+            position.
     """
     _check_alike(planes)
     planes, axis = _order(planes, spacing)
@@ -113,6 +114,11 @@ def _check_alike(planes: Sequence[Plane]) -> None:
             what = f"has half angles of {own[0]:.5g} x {own[1]:.5g} mrad, and {first.name} of {known[0]:.5g} x "
             what += f"{known[1]:.5g} mrad: they are no stack"
             hint = "state one field, [scan], in the device file, and give it with --device"
+            raise BadInput(what, file=other.name, channel="--stack", hint=hint)
+        units = [plane.summary.get("intensity_unit") for plane in (other, first)]
+        if units[0] != units[1]:
+            what = f"has an intensity in {units[0]!r}, and {first.name} in {units[1]!r}: they are no stack"
+            hint = "convert one of them with the unit of the other"
             raise BadInput(what, file=other.name, channel="--stack", hint=hint)
         if other.summary["detectors"] != first.summary["detectors"]:
             what = f"has other detectors than {first.name}: they are no stack"

@@ -26,13 +26,18 @@ def scene(seed: int = 0) -> np.ndarray:
 
 
 def completed(
-    folder: Path, image: np.ndarray, z: float | None, sign: Mapping[str, str] = KNOWN, grid: Grid = GRID
+    folder: Path,
+    image: np.ndarray,
+    z: float | None,
+    sign: Mapping[str, str] = KNOWN,
+    grid: Grid = GRID,
+    unit: str = "V",
 ) -> Path:
     """A folder as a reconstruction leaves it."""
     folder.mkdir()
     position = None if z is None else {"mean_m": z, "range_m": 0.0}
     write_json(folder / "summary.json", {
-        "grid": vars(grid), "detectors": [], "sign": sign, "position_z": position,
+        "grid": vars(grid), "detectors": [], "intensity_unit": unit, "sign": sign, "position_z": position,
     })  # fmt: skip
     write_tiff(folder / "image.tif", image, grid)
     write_tiff(folder / "image_sd.tif", 0.1 * image, grid)
@@ -120,6 +125,7 @@ def test_ambiguous_signs_of_first_planes_follow_the_plane_whose_signs_are_known(
     [
         ({"z": None}, "b.h5: position_z: is not in the recording; record it with every plane"),
         ({"z": 1e-6}, "b.h5: position_z: is 1e-06 m, as that of a.h5"),
+        ({"unit": "mV"}, "b.h5: --stack: has an intensity in 'mV', and a.h5 in 'V': they are no stack"),
         ({"grid": Grid(40, 30, 0.11, 0.08, 1e-3)}, "has half angles of 110 x 80 mrad, and a.h5 of 100 x 80 mrad"),
     ],
 )
