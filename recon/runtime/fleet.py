@@ -62,18 +62,25 @@ class Failure:
 def find_recordings(places: Sequence[Path]) -> list[Path]:
     """Return the files, and the recordings (``*.h5``) in the folders, in the order of their names.
 
+    Hidden files in folders are left out: some systems write one, as ``._scan.h5``, beside each file that is copied. A
+    file that is named twice is returned once.
+
     Raises:
         BadInput: a folder holds no recording, or nothing of all that is there.
     """
     found: list[Path] = []
     for place in places:
-        inside = sorted(place.glob("*.h5")) if place.is_dir() else [place]
+        visible = (path for path in place.glob("*.h5") if not path.name.startswith("."))
+        inside = sorted(visible) if place.is_dir() else [place]
         if not inside:
             raise BadInput("holds no recording (*.h5)", file=place, hint="name the folder of the recordings")
         found += inside
     if not any(path.exists() for path in found):
         raise BadInput("no such file or folder", file=places[0], hint="name recordings (HDF5), or their folder")
-    return list(dict.fromkeys(found))
+    unique: dict[Path, Path] = {}
+    for path in found:
+        unique.setdefault(path.absolute(), path)
+    return list(unique.values())
 
 
 def state_inputs(device: Device | str | Path | None, mapping: Path | None) -> str:

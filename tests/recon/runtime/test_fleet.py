@@ -8,7 +8,7 @@ import pytest
 from recon.cli.diagnose_each import diagnose_each
 from recon.cli.reconstruct_many import reconstruct_files
 from recon.runtime import fleet
-from recon.runtime.fleet import plan_fleet, run_fleet, state_inputs
+from recon.runtime.fleet import find_recordings, plan_fleet, run_fleet, state_inputs
 from recon.steps.reconstruction import Options
 from scanner import devices
 from scanner.errors import BadInput
@@ -97,3 +97,10 @@ def test_an_error_of_one_recording_is_stated_with_its_name_and_stops_no_other(tm
     assert {path: failure.exit for path, failure in failures.items()} == {recordings[0]: 1, recordings[1]: 2}
     assert failures[recordings[0]].reason.startswith(f"{recordings[0]}: ended with ValueError: All-NaN slice encounter")
     assert failures[recordings[1]].reason == f"{recordings[1]}: intensity: is constant"
+
+
+def test_each_visible_recording_is_found_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("b.h5", "a.h5", "._a.h5", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    monkeypatch.chdir(tmp_path)
+    assert find_recordings([tmp_path, Path("a.h5")]) == [tmp_path / "a.h5", tmp_path / "b.h5"]
