@@ -241,7 +241,10 @@ def write_scan_frames(folder: Path, result: Reconstruction, options: Options) ->
             shown = filled() if options.fill_radius else (picture for picture, _ in pairs())
             # Slices show different scenes, which differ from their mean more than successive frames do.
             compared = [result.picture.image] if own.slices is None else (picture.image for picture, _ in pairs())
-            limits = np.array([np.nanpercentile(image, [0.5, 99.5]) for image in compared])
-            low, high = float(np.nanmin(limits[:, 0])), float(np.nanmax(limits[:, 1]))
-            write_movie(folder / f"frames.{options.movie}", shown, axis, (low, high))
+            known = (image[np.isfinite(image)] for image in compared)
+            limits = np.array([[0.0, 1.0]])
+            if ranges := [np.percentile(values, [0.5, 99.5]) for values in known if values.size]:
+                limits = np.array(ranges)
+            shades = float(limits[:, 0].min()), float(limits[:, 1].max())
+            write_movie(folder / f"frames.{options.movie}", shown, axis, shades)
     return own

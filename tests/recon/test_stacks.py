@@ -19,6 +19,7 @@ from recon.steps.z_rests import rest_ranges
 from recon.steps.z_slices import ZSlices, find_z_slices
 from scanner.channel import Channel, make_channel
 from scanner.errors import BadInput
+from scanner.recording import Recording
 from tests.support.simulated import imaging
 from tests.support.stacks import DURATION_S, MOVE_S, POSITIONS, lights, recording_of, stack, staircase
 
@@ -304,3 +305,17 @@ def test_bad_stacks_end_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert line in error
         assert "Traceback" not in error
         assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_slice_without_a_value_is_shown_empty_and_without_a_warning(tmp_path: Path) -> None:
+    recording = recording_of(lights()[0], staircase(times(20e3), POSITIONS, MOVE_S))
+    light = recording["intensity"].read().astype(float)
+    light[light.size // 2 :] = np.nan  # from the middle of the second slice on
+    channels = {name: (c.read(), c.unit, c.sample_rate, c.start) for name, c in recording.channels.items()}
+    dark = Recording.from_arrays(channels | {"intensity": (light, *channels["intensity"][1:])}, recording.device)
+    options = Options(pixels=(40, 40), z_stack=True, movie="gif", sense_only=True)
+    write_scan_frames(tmp_path, reconstruct(dark, options, quiet=True), options)
+    shares = [np.isfinite(image).mean() for image in tifffile.imread(tmp_path / "frames.ome.tif")]
+    assert shares == pytest.approx([1.0, 1.0, 0.0], abs=0.1)
+    assert (tmp_path / "frames.gif").stat().st_size > 0
