@@ -29,6 +29,10 @@ MIN_MIDDLE_SAMPLES_PER_JUMP = 1.0
 """Samples in the middle of the range for each jump: a signal reaches the end at which it overflows through the middle,
 and returns through it. One that switches between two levels, as bright beads on a dark ground, is not there."""
 
+MIN_LEVELS = 16
+"""Different values of a signal that overflows: those of a converter of four bits. Rare photons are counts from 0 to 2,
+which jump from one end of this range to the other wherever two arrive at once."""
+
 
 def describe_overflows(recording: Recording) -> list[str]:
     """A line for each signal of the motion or the light that jumps from one end of its range to the other and back."""
@@ -59,4 +63,6 @@ def count_overflows(values: Array) -> int:
     if min(np.sum(wraps > 0.0), np.sum(wraps < 0.0)) < MIN_OVERFLOWS or wraps.size < MIN_WRAP_FRACTION * jumps.size:
         return 0
     middle = np.abs(finite - 0.5 * (low + high)) < (0.5 - MIDDLE_SHARE) * (high - low)
-    return int(wraps.size) if middle.sum() >= MIN_MIDDLE_SAMPLES_PER_JUMP * wraps.size else 0
+    if middle.sum() < MIN_MIDDLE_SAMPLES_PER_JUMP * wraps.size or np.unique(finite).size < MIN_LEVELS:
+        return 0
+    return int(wraps.size)

@@ -50,6 +50,13 @@ def test_a_converter_that_overflows_is_named(name: str) -> None:
     assert any(line.startswith(f"{name}: jumps ") and "overflows, and the picture is wrong" in line for line in limits)
 
 
+def test_rare_photons_do_not_overflow() -> None:
+    for seed in range(3):
+        counts = np.random.default_rng(seed).poisson(0.015, 200_000).astype(float)
+        assert counts.max() == 2.0
+        assert count_overflows(counts) == 0
+
+
 def test_only_overflows_jump_from_one_end_to_the_other_and_back() -> None:
     rng, time = np.random.default_rng(776_003), np.arange(100_000)
     sine = np.sin(2 * np.pi * time / 500.0)
