@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> dict[str, Any]:
     from recon.io.convert import open_any
     from recon.io.output import check_folder, finite, replacing_folder, write_json
-    from recon.io.point_files import require_format, write_points
+    from recon.io.point_files import FORMATS, require_format, write_points
     from recon.point_cloud import make_point_cloud
     from recon.report.conclusions import conclude_point_cloud
     from recon.report.point_cloud import point_cloud_report
@@ -38,7 +38,8 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     summary: dict[str, Any] = finite(cloud.summary())
     summary["conclusion"] = conclude_point_cloud(summary, points)
     summary |= {"file": points, "recording": str(args.recording), "output": str(args.output)}
-    with replacing_folder(args.output, args.device, args.recording) as folder:
+    of_formats = [f"points.{name}" for name in FORMATS]
+    with replacing_folder(args.output, args.device, args.recording, optional=of_formats) as folder:
         write_points(folder / points, cloud, args.format)
         write_json(folder / "summary.json", summary)
         (folder / "report.html").write_text(point_cloud_report(cloud, summary), encoding="utf-8")

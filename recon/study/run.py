@@ -85,7 +85,7 @@ def run_study(
             }
         )
         summary["conclusion"] = conclude_study(summary)
-        with replacing_folder(output) as folder:
+        with replacing_folder(output, optional=["table.parquet"]) as folder:
             write_csv(folder / "table.csv", table)
             if parquet:
                 write_parquet(folder / "table.parquet", table)

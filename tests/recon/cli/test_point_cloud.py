@@ -202,3 +202,15 @@ def test_the_covariance_has_the_noise_of_sensed_angles() -> None:
     error = cloud.position - locate_points(cloud.geometry, true["x"][at], true["y"][at], distance[at])
     ratio = error[:, :2] / np.sqrt(cloud.covariance[:, [0, 3]])
     assert 0.93 < float(np.mean(np.abs(ratio) < 1.96)) < 0.97
+
+
+def test_the_points_of_an_earlier_run_do_not_stay_beside_those_in_another_format(tmp_path: Path) -> None:
+    time = np.arange(40_000) / 1e6
+    x, y = (0.1 * np.sin(2.0 * np.pi * frequency * time) for frequency in (5010.0, 3030.0))
+    channels = {"angle_x": (x, "rad", 1e6), "angle_y": (y, "rad", 1e6), "range": (2.0 + np.sin(60.0 * x), "m", 1e6)}
+    device = Device.from_toml('[scan]\nhalf_angle_x = 0.1001\nhalf_angle_y = 0.1001\nangle = "mechanical"\n[x]\n[y]\n')
+    Recording.from_arrays(channels, device).write(tmp_path / "lidar.h5")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "points.las").write_bytes(b"of an earlier run")
+    assert main(["point-cloud", str(tmp_path / "lidar.h5"), "-o", str(tmp_path / "out")]) == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"points.pcd", "summary.json", "report.html"}

@@ -4,6 +4,7 @@ import csv
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -67,6 +68,16 @@ def test_a_study_writes_table_summary_and_report(finished_study: Path) -> None:
     page = (finished_study / "report.html").read_text()
     assert page.count('src="data:image/svg') == 3
     assert "://" not in page.replace("http://www.w3.org", "")
+
+
+@pytest.mark.slow
+def test_the_parquet_table_of_an_earlier_run_does_not_stay_beside_a_newer_table(
+    finished_study: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(finished_study, tmp_path / "out")
+    study = str(small_study(tmp_path))
+    assert main(["blur-study", study, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
+    assert not (tmp_path / "out" / "table.parquet").exists()
 
 
 @pytest.mark.slow
