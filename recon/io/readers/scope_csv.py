@@ -50,6 +50,8 @@ NO_TABLE_HINT = "name its format in the mapping, or make every column numbers, w
 """What to do about a text without a row of numbers."""
 _NUMBER_LIKE = re.compile(r"[+-]?\d[\d.,]*([eE][+-]?\d+)?")
 """Digits with marks anywhere, as ``1,234.5``."""
+BESIDE_COLUMNS = (3, 4)
+"""Columns of time and signal in a Tektronix table that stands beside its settings, which others write above theirs."""
 NAMES_OF_SECONDS = ("s", "sec", "second", "seconds")
 """Spellings of the unit of a column of times."""
 
@@ -100,7 +102,8 @@ def read_csv(path: Path) -> Contents:
     head = list(islice(read_lines(path), MAX_HEADER_LINES + 1))
     if not head:
         raise BadInput("the file is empty", file=path, hint="copy it again")
-    if _fields(head[0])[0].lower() == "record length":
+    first_line = _fields(head[0])
+    if first_line[0].lower() == "record length" and len(first_line) > max(BESIDE_COLUMNS):
         layout, separator, decimal = _tektronix_beside(head), ",", "."
     else:
         first = find_table(head)
@@ -217,12 +220,13 @@ def _rigol(head: list[list[str]]) -> Layout:
 
 
 def _tektronix_above(head: list[list[str]], keys: dict[str, list[str]], width: int) -> Layout:
-    """MSO, DPO, MDO, TBS: lines of ``key,value``, the last one ``TIME,CH1``."""
+    """MSO, DPO, MDO, TBS, and Siglent: lines of ``key,value``, the last one ``TIME,CH1`` or ``Second,Volt``."""
     seconds = "".join(keys["horizontal units"][:1]).lower() in NAMES_OF_SECONDS
-    units = ["", *_padded(keys.get("vertical units", []), width - 1)]
+    stated = [unit.rpartition(":")[2] for unit in keys.get("vertical units", [])]  # Siglent writes CH1:V
+    units = ["", *_padded(stated, width - 1)]
     rate = rate_from_step(parse_number("".join(keys["sample interval"][:1]))) if seconds else None
     device = " ".join(keys.get("model", [])[:1])
-    times = 0 if seconds and head[-1][0].lower() == "time" else None
+    times = 0 if seconds and head[-1][0].lower() in TIME_NAMES else None
     names = _padded(head[-1], width)
     about = {"device": device}
     return Layout("Tektronix CSV", names, units, range(width), len(head), times, None, rate, None, about)
@@ -236,7 +240,7 @@ def _tektronix_beside(head: list[str]) -> Layout:
         "Tektronix TDS CSV",
         ["TIME", header.get("source") or "CH1"],
         ["", header.get("vertical units", "")],
-        columns=(3, 4),
+        columns=BESIDE_COLUMNS,
         first=0,
         times=0 if seconds else None,
         rate=rate_from_step(parse_number(header.get("sample interval", ""))) if seconds else None,

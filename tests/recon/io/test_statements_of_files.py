@@ -138,3 +138,12 @@ def test_the_times_of_a_labview_table_are_its_clock(tmp_path: Path, step: str) -
     lines += [f"{1e-4 * k:.6f}\t{k % 7}" for k in range(200)]
     (tmp_path / "decay.lvm").write_text("\n".join(lines), encoding="utf-8")
     assert read(tmp_path / "decay.lvm").variables["CH1"].sample_rate == pytest.approx(1e4, rel=1e-9)
+
+
+def test_a_table_below_a_record_length_is_no_table_beside_it(tmp_path: Path) -> None:
+    head = ["Record Length,Analog:30", "Sample Interval,Analog:1e-06", "Vertical Units,CH1:V", "Horizontal Units,s"]
+    rows = [f"{1e-6 * k - 1e-5:.7f},{k % 5}" for k in range(30)]
+    (tmp_path / "scope.csv").write_text("\n".join([*head, "Second,Volt", *rows]), encoding="utf-8")
+    variable = read(tmp_path / "scope.csv").variables["Volt"]
+    assert (variable.unit, variable.sample_rate) == ("V", pytest.approx(1e6))
+    assert variable.start == pytest.approx(-1e-5)
