@@ -1,4 +1,8 @@
-"""Amplitude and phase as a lock-in amplifier or an envelope detector recorded them."""
+"""Amplitude and phase as a lock-in amplifier or an envelope detector recorded them.
+
+Behind a sensor of the motion they are those of its voltage. Amplitude and phase of the angle follow from the complex
+gain of the sensor, which turns the phase by a right angle with each time derivative, and by pi if it is negative.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ from scanner.arrays import Array, Complex, Mask
 from scanner.channel import Channel
 from scanner.device import Axis
 from scanner.errors import BadInput
+from scanner.harmonics import readout_response
 from scanner.recording import Recording
 from scanner.signal_check import check_signal
 from scanner.stages import MotionSensor
@@ -18,10 +23,11 @@ from scanner.stages import MotionSensor
 def lock_in_amplitude(recording: Recording, axis: Axis) -> tuple[Array, Array, bool]:
     """Times [s] and amplitude of an axis, shape (n,), and whether the amplitude is in rad.
 
-    A voltage is converted by the gain of a sensor of the motion, at the resonance for velocity and acceleration; behind
-    another readout it stays a voltage. A constant amplitude, as under a control loop, is one.
+    A voltage is converted by the gain of a sensor of the motion; behind another readout it stays a voltage. A constant
+    amplitude, as under a control loop, is one.
 
     Raises:
+        ChannelMissing: the channel of the reference frequency, where the gain depends on it.
         BadInput: it holds no sample that can be used, or is zero.
     """
     channel = recording[f"amplitude_{axis.name}"]
@@ -29,10 +35,38 @@ def lock_in_amplitude(recording: Recording, axis: Axis) -> tuple[Array, Array, b
     values = channel.read()
     if not np.nan_to_num(values).any():
         raise BadInput("is 0 throughout", file=channel.file, channel=channel.name, hint="check that it was connected")
-    if channel.unit == "rad" or not isinstance(axis.readout, MotionSensor):
-        return channel.time(), values, channel.unit == "rad"
-    rate = 2 * np.pi * axis.resonance if axis.readout.order else 1.0
-    return channel.time(), values / abs(axis.readout.gain) / rate**axis.readout.order, True
+    time = channel.time()
+    if not is_voltage_of_motion(recording, axis):
+        return time, values, channel.unit == "rad"
+    gain = np.abs(_sensor_gain(recording, axis, time))
+    return time, values / np.where(gain > 0.0, gain, np.nan), True  # none at a frequency of 0
+
+
+def is_voltage_of_motion(recording: Recording, axis: Axis) -> bool:
+    """Whether amplitude and phase are those of the voltage of a sensor of the motion."""
+    return recording[f"amplitude_{axis.name}"].unit != "rad" and isinstance(axis.readout, MotionSensor)
+
+
+def recorded_derivatives(recording: Recording, axis: Axis) -> int:
+    """Time derivatives of the angle that amplitude and phase are of."""
+    readout = axis.readout
+    return readout.order if is_voltage_of_motion(recording, axis) and isinstance(readout, MotionSensor) else 0
+
+
+def _sensor_gain(recording: Recording, axis: Axis, time: Array) -> Complex:
+    """Complex gain of a sensor of the motion at the reference frequency, without one at the resonance [V / rad].
+
+    Returns:
+        Shape () of a gain that does not depend on the frequency, or of one frequency; else (n,), that of ``time``.
+    """
+    readout = axis.require_readout()
+    if not isinstance(readout, MotionSensor) or not readout.order:
+        return readout_response(readout, 1.0)
+    reference = _reference(recording, axis)
+    if isinstance(reference, Channel):
+        at, frequency = _finite_samples(reference)
+        return readout_response(readout, np.interp(time, at, frequency))
+    return readout_response(readout, axis.resonance if reference is None else reference)
 
 
 class LockInAngle(NamedTuple):
@@ -51,6 +85,8 @@ class LockInAngle(NamedTuple):
 def lock_in_angle(recording: Recording, axis: Axis, time: Array) -> LockInAngle:
     """Angle A sin(2 pi f t + phase) at ``time`` [s] from ``amplitude_x``, ``phase_x`` and their reference.
 
+    Behind a sensor of the motion, phase is that of the angle.
+
     Raises:
         ChannelMissing: no phase. BadInput: the amplitude is no angle, no reference frequency is stated, or a channel
             holds no finite sample.
@@ -63,19 +99,21 @@ def lock_in_angle(recording: Recording, axis: Axis, time: Array) -> LockInAngle:
     turn, _ = reference_turn(recording, axis, time)
     known = np.isfinite(amplitude)
     size = np.interp(time, at[known], amplitude[known])
-    values = np.asarray(size * np.sin(turn + _unwrapped_phase(phase, time)))
+    values = np.asarray(size * np.sin(turn + _unwrapped_phase(phase, time) - _sensor_phase(recording, axis)))
     return LockInAngle(values, _missing_values(recording, axis, time))
 
 
 def lock_in_values(recording: Recording, axis: Axis) -> tuple[Array, Complex]:
-    """Times (n,) [s] and amplitude exp(i phase) (n,) [rad or V], as recorded; missing values are left out.
+    """Times (n,) [s] and amplitude exp(i phase) (n,) of the angle [rad], or of a voltage [V] whose gain is not known.
+
+    Missing values are left out.
 
     Raises:
         ChannelMissing: no phase. BadInput: a channel holds no finite sample.
     """
     time, amplitude, _ = lock_in_amplitude(recording, axis)
     phase = recording.require(f"phase_{axis.name}", "the frequency of the motion needs it beside the amplitude")
-    values = amplitude * np.exp(1j * _unwrapped_phase(phase, time))
+    values = amplitude * np.exp(1j * (_unwrapped_phase(phase, time) - _sensor_phase(recording, axis)))
     known = ~_missing_values(recording, axis, time)
     return time[known], values[known]
 
@@ -118,11 +156,13 @@ def _reference(recording: Recording, axis: Axis) -> float | Channel | None:
     Raises:
         ChannelMissing: the channel is not in the recording.
     """
-    phase = recording[f"phase_{axis.name}"]
-    stated = phase.reference if phase.reference is not None else recording[f"amplitude_{axis.name}"].reference
-    if isinstance(stated, str):
-        return recording.require(stated, f"it is the reference of {phase.name}")
-    return None if stated is None else float(stated)
+    for name in (f"phase_{axis.name}", f"amplitude_{axis.name}"):
+        stated = recording[name].reference if name in recording else None
+        if isinstance(stated, str):
+            return recording.require(stated, f"it is the reference of {name}")
+        if stated is not None:
+            return float(stated)
+    return None
 
 
 def _finite_samples(channel: Channel) -> tuple[Array, Array]:
@@ -141,6 +181,13 @@ def _unwrapped_phase(phase: Channel, time: Array) -> Array:
     """Phase without jumps of 2 pi at ``time`` [s], interpolated between the finite samples, shape (n,) [rad]."""
     at, values = _finite_samples(phase)
     return np.asarray(np.interp(time, at, np.unwrap(values)))
+
+
+def _sensor_phase(recording: Recording, axis: Axis) -> float:
+    """Phase of the recorded signal against the angle [rad]: 0 where this is an angle or its gain is not known."""
+    return (
+        float(np.angle(readout_response(axis.require_readout(), 1.0))) if is_voltage_of_motion(recording, axis) else 0.0
+    )
 
 
 def _missing_values(recording: Recording, axis: Axis, time: Array) -> Mask:

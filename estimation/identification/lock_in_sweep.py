@@ -105,7 +105,8 @@ class _Model:
         step = size / rate / band.size
         self.output, self.spacing, self.size = output, spacing, band.size
         self.w = 2.0 * np.pi * band * rate / size
-        self.torque = fft(torque - torque.mean(), size)[band] * (2.0 / size)
+        recorded = (band * (rate / size / output.frequency)) ** output.order
+        self.torque = fft(torque - torque.mean(), size)[band] * (2.0 / size) * recorded
         self.elapsed = np.arange(band.size) * step
         self.time = float(record.time[0]) + self.elapsed
         carrier = 2.0 * np.pi * centre * rate / size * self.elapsed

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.lock_in_channels import lock_in_angle
+from estimation.lock_in_channels import is_voltage_of_motion, lock_in_angle
 from estimation.reference import dominant_frequency
 from scanner.arrays import Array
 from scanner.channel import Channel, make_channel
@@ -68,6 +68,7 @@ def find_reference_angle(recording: Recording, axis: Axis, default_tolerance: fl
             )
     if f"drive_{name}" not in recording:
         return None
+    tolerance = axis.tolerance.get("gain", default_tolerance)
     if f"amplitude_{name}" in recording and f"phase_{name}" in recording:
         drive = recording[f"drive_{name}"]
         held = recording[f"amplitude_{name}"]
@@ -77,13 +78,13 @@ def find_reference_angle(recording: Recording, axis: Axis, default_tolerance: fl
             hint = "check their start times and rates"
             raise BadInput(f"has no time in common with drive_{name}", file=held.file, channel=held.name, hint=hint)
         angle = lock_in_angle(recording, axis, time[inside]).values
-        return ReferenceAngle(_channel(name, angle, drive.sample_rate, float(time[inside][0])), held.name)
+        channel = _channel(name, angle, drive.sample_rate, float(time[inside][0]))
+        return ReferenceAngle(channel, held.name, tolerance if is_voltage_of_motion(recording, axis) else 0.0)
     if f"sense_{name}" in recording and isinstance(axis.readout, MotionSensor):
         sense, readout = recording[f"sense_{name}"], axis.readout
         check_signal(sense)
         motion = (sense.read() - readout.offset) / readout.gain
         channel = _integrated(sense, axis, motion, readout.order)
-        tolerance = axis.tolerance.get("gain", default_tolerance)
         return ReferenceAngle(channel, sense.name, tolerance, readout.order, readout)
     return None
 

@@ -50,12 +50,14 @@ class LockInOutput:
         values: amplitude exp(i phase), shape (m,) [rad].
         turn: phase of the reference at given times [rad].
         frequency: mean frequency of the reference [Hz].
+        order: time derivatives of the angle that were recorded, converted to ``values`` at ``frequency``.
     """
 
     time: Array
     values: Complex
     turn: Callable[[Array], Array]
     frequency: float
+    order: int = 0
 
 
 @dataclass(frozen=True)

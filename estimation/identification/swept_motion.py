@@ -11,7 +11,7 @@ import numpy as np
 from estimation.identification.agreement import Found, IdentifiedValue, combine_values, contradiction_notes
 from estimation.identification.lock_in_sweep import fit_lock_in_sweep
 from estimation.identification.sweep import LockInOutput, SweptRecord, fit_swept
-from estimation.lock_in_channels import lock_in_values, reference_turn
+from estimation.lock_in_channels import lock_in_values, recorded_derivatives, reference_turn
 from scanner.arrays import Array
 from scanner.device import Axis
 from scanner.recording import Recording
@@ -49,7 +49,8 @@ def lock_in_output(recording: Recording, axis: Axis) -> LockInOutput:
     """Amplitude and phase of an axis with their reference. Raises as ``reference_turn``."""
     time, values = lock_in_values(recording, axis)
     _, frequency = reference_turn(recording, axis, time)
-    return LockInOutput(time, values, partial(_turn, recording, axis), frequency)
+    order = recorded_derivatives(recording, axis)
+    return LockInOutput(time, values, partial(_turn, recording, axis), frequency, order)
 
 
 def _turn(recording: Recording, axis: Axis, time: Array) -> Array:

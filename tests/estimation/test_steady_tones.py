@@ -20,7 +20,7 @@ from scanner.errors import BadInput
 from scanner.forward_model import DriveInput, sense_signal, simulate_axis
 from scanner.integrator.nodes import to_nodes
 from scanner.recording import Recording
-from scanner.stages import Drive, Mechanics, Position
+from scanner.stages import Acceleration, Drive, Mechanics, MotionSensor, Position, Velocity
 
 F0, Q = 800.0, 300.0
 W0 = 2 * np.pi * F0
@@ -109,6 +109,20 @@ def test_a_device_with_a_linear_drive_takes_the_second_mode_relative_to_the_firs
     assert ratio / ratio[0] == pytest.approx(np.ones(4), abs=0.03)
     loop = found.open_loop["amplitude_x"]
     assert loop["improved"]["fraction"] < 0.02 < 0.1 < loop["nominal"]["fraction"]
+
+
+@pytest.mark.parametrize("readout", [Velocity(0.01, 1e-4), Acceleration(-1e-6, 1e-4)], ids=["velocity", "acceleration"])
+def test_a_linear_response_in_volts_is_that_of_the_angle(readout: MotionSensor) -> None:
+    """Converted at the resonance, tones beside it differed by a constant: that was a finding of feedthrough."""
+    frequency = np.linspace(720.0, 880.0, 41)
+    ratio = frequency / F0
+    angle = 0.1 / 30.0 / (1.0 - ratio**2 + 1j * ratio / 30.0)
+    made = recording(angle * (2j * np.pi * frequency) ** readout.order * readout.gain, frequency)
+    volts = {"amplitude_x": replace(made["amplitude_x"], unit="V")}
+    sensed = Device("lever", {"x": replace(AXIS, readout=readout)})
+    found = diagnose_with_optics([replace(made, channels={**made.channels, **volts})], sensed)
+    assert (found.verdict, names(found)) == ("consistent", [])
+    assert found.device.axes["x"].resonance == pytest.approx(F0, abs=0.05)
 
 
 @pytest.mark.parametrize("k3", [1e7, -1e7])
