@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scanner.arrays import Array, Complex, Mask
-from scanner.channel import Channel
+from scanner.channel import MAX_TIME_ROUNDING_SAMPLES, Channel
 from scanner.device import Axis
 from scanner.errors import BadInput
 from scanner.harmonics import readout_response
@@ -190,13 +190,33 @@ def _sensor_phase(recording: Recording, axis: Axis) -> float:
     )
 
 
-def _missing_values(recording: Recording, axis: Axis, time: Array) -> Mask:
-    """Whether amplitude, phase or recorded reference frequency lacks a sample beside each ``time`` [s], shape (n,)."""
-    channels = [recording[f"{kind}_{axis.name}"] for kind in ("amplitude", "phase")]
+def lock_in_span(recording: Recording, axis: Axis) -> tuple[float, float]:
+    """Begin and end of the time [s] that amplitude, phase and recorded reference frequency have in common.
+
+    The last value holds for less than one sample, so that none follows from it on the clock of another channel.
+    """
+    spans = [
+        (each.start - rounding, each.end - rounding)
+        for each in _channels(recording, axis)
+        for rounding in (MAX_TIME_ROUNDING_SAMPLES / each.sample_rate,)
+    ]
+    return max(begin for begin, _ in spans), min(end for _, end in spans)
+
+
+def _channels(recording: Recording, axis: Axis) -> list[Channel]:
+    """Amplitude, phase and recorded reference frequency."""
     reference = _reference(recording, axis)
-    if isinstance(reference, Channel):
-        channels.append(reference)
-    missing = np.zeros(time.size, bool)
-    for channel in channels:
+    pair = [recording[f"{kind}_{axis.name}"] for kind in ("amplitude", "phase")]
+    return [*pair, reference] if isinstance(reference, Channel) else pair
+
+
+def _missing_values(recording: Recording, axis: Axis, time: Array) -> Mask:
+    """Whether amplitude, phase or recorded reference frequency lacks a sample beside each ``time`` [s], shape (n,).
+
+    That is so outside their common time too.
+    """
+    begin, end = lock_in_span(recording, axis)
+    missing = (time < begin) | (time > end)
+    for channel in _channels(recording, axis):
         missing |= np.interp(time, channel.time(), ~np.isfinite(channel.read())) > 0.0
     return missing

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.lock_in_channels import is_voltage_of_motion, lock_in_angle
+from estimation.lock_in_channels import is_voltage_of_motion, lock_in_angle, lock_in_span
 from estimation.reference import dominant_frequency
 from scanner.arrays import Array
 from scanner.channel import Channel, make_channel
@@ -73,7 +73,8 @@ def find_reference_angle(recording: Recording, axis: Axis, default_tolerance: fl
         drive = recording[f"drive_{name}"]
         held = recording[f"amplitude_{name}"]
         time = drive.time()
-        inside = (time >= held.start) & (time <= held.end)
+        begin, end = lock_in_span(recording, axis)
+        inside = (time >= begin) & (time <= end)
         if not inside.any():
             hint = "check their start times and rates"
             raise BadInput(f"has no time in common with drive_{name}", file=held.file, channel=held.name, hint=hint)

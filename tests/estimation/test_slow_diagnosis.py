@@ -224,6 +224,27 @@ def test_a_missing_value_of_a_lock_in_amplifier_affects_the_samples_beside_it_on
     assert np.angle(values) == pytest.approx(np.angle(np.exp(20j * used)))
 
 
+@pytest.mark.parametrize("channel", ["amplitude_x", "phase_x", "frequency"])
+def test_lock_in_channels_of_differing_length_are_used_in_their_common_time(channel: str) -> None:
+    """The last phase was held after its end: angles there were wrong by up to the amplitude, without a line."""
+    slow, time = np.arange(0.0, 0.2, 1e-3), np.arange(20_000) / 1e5
+    extra = {"reference": "frequency"}
+    channels = {
+        "intensity": (time, "V", 1e5),
+        "amplitude_x": (0.1 - 0.1 * slow, "rad", 1e3, 0.0, extra),
+        "phase_x": (np.angle(np.exp(1j * 20.0 * slow)), "rad", 1e3, 0.0, extra),
+        "frequency": (700.0 + 50.0 * slow, "Hz", 1e3),
+    }
+    channels[channel] = (channels[channel][0][50:150], *channels[channel][1:3], slow[50], *channels[channel][4:])
+    recording = Recording.from_arrays(channels, Device.from_toml("[x]\n"))
+    motion = estimate(recording)
+    known = np.flatnonzero(np.isfinite(motion.axes["x"].angle.read()))
+    assert (known[0], known[-1]) == (5_000, 14_999)
+    assert [note for note in motion.notes if "left out 10000 samples of the intensity" in note]
+    used, _ = lock_in_values(recording, recording.device.axes["x"])
+    assert used == pytest.approx(slow[50:150])
+
+
 def test_a_lock_in_phase_without_a_finite_sample_is_refused() -> None:
     slow = np.arange(0.0, 0.2, 1e-3)
     channels = {
