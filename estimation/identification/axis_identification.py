@@ -186,12 +186,14 @@ class AxisIdentification:
         self.found.append(Found(recording.name, found))
 
     def _volt(self, recording: Recording) -> float:
-        """Voltage on the combs during a free decay [V].
+        """Voltage on the combs during a free decay [V], on which the voltage of a linear actuator is not.
 
         Raises:
             BadInput: a sample of it is not finite.
         """
-        voltages = [recording[name] for name in (f"bias_{self.name}", f"drive_{self.name}") if name in recording]
+        is_linear = self.axis.drive is not None and self.axis.drive.kind == "linear"
+        kinds = ("bias",) if is_linear else ("bias", "drive")
+        voltages = [recording[f"{kind}_{self.name}"] for kind in kinds if f"{kind}_{self.name}" in recording]
         for voltage in voltages:
             check_signal(voltage, constant_ok=True)
         return sum((float(voltage.read().mean()) for voltage in voltages), start=0.0)
