@@ -163,7 +163,8 @@ def _values(ratios: Array) -> dict[str, float]:
 def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tuple[dict[str, IdentifiedValue], Array]:
     """``k_over_J`` [1/s2], ``b_over_J`` [1/s] and, under a bias, ``J`` from a free decay, by fitting its trajectory.
 
-    J is left out where the 95 % interval of 1/J contains zero: then the bias changes the decay too little.
+    J is left out where the 95 % interval of 1/J contains zero: then the bias changes the decay too little. Without a
+    bias the offset of the angle is fitted too; a bias acts on the angle itself.
 
     Args:
         angle: shape (n,) [rad]. rate: [Hz].
@@ -188,22 +189,25 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
     n = (used.size - 1) * steps_a_stride
     voltage, time = np.full((n, 3), bias), np.arange(used.size) * stride / rate
     w0, loss0 = _first_guess(used, rate / stride, mechanics)
-    scale = np.array([1e-3 * w0, 0.1 * loss0, 0.01 * np.abs(used).max(), 0.01 * w0 * np.abs(used).max(), 0.1])
+    size = 0.01 * np.abs(used).max()
+    scale = np.array([1e-3 * w0, 0.1 * loss0, size, w0 * size, 0.1 if comb else size])
 
     def trajectory(x: Array) -> Array:
-        w, loss, theta, omega, inverse = start + scale * np.append(x, np.zeros(5 - x.size))
+        w, loss, theta, omega, last = start + scale * x
         if comb is None:
-            return free_decay(time, w, min(max(loss, 1e-6 * loss0), w), theta, omega)
-        J = mechanics.J / inverse
+            return free_decay(time, w, min(max(loss, 1e-6 * loss0), w), theta, omega) + last
+        J = mechanics.J / last
         tried = Axis(Mechanics(J, max(loss, 1e-6 * loss0) * J, w * w * J), comb)  # a step of the fit may overshoot
         return integrate(tried, (theta, omega), voltage, step)[0][::steps_a_stride]
 
     around = np.arange(min(used.size, 2 * STEPS_PER_CYCLE))
     line = np.polynomial.polynomial.polyfit(around[:9] * stride / rate, used[:9], 3)
-    start = np.array([w0, loss0, line[0], line[1], 1.0])
-    free = 5 if comb else 4
+    centre = 0.0 if comb else float(used.mean())
+    start = np.array([w0, loss0, line[0] - centre, line[1], 1.0 if comb else centre])  # the last: 1/J, or the offset
+    free = start.size
     x, lowest = np.zeros(free), np.full(free, -np.inf)
-    lowest[4:] = (MIN_INVERSE_INERTIA - start[4]) / scale[4]
+    if comb:
+        lowest[4] = (MIN_INVERSE_INERTIA - start[4]) / scale[4]
     for part in (used.size // 8, used.size // 3, used.size):  # growing windows keep the phase error below half a cycle
         if part > 4 * free:
             fit = least_squares(lambda x, part=part: trajectory(x)[:part] - used[:part], x, bounds=(lowest, np.inf))
@@ -216,15 +220,15 @@ def fit_ringdown(angle: Array, rate: float, axis: Axis, bias: float = 0.0) -> tu
         )
     variance = float(residual @ residual) / (used.size - free)
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * variance
-    sd = scale[:free] * np.sqrt(np.diag(covariance))
+    sd = scale * np.sqrt(np.diag(covariance))
     w, loss = start[:2] + scale[:2] * x[:2]
-    change = _amplitude_dependence(fit.jac / scale[:free], residual, time, (w, loss), start[2:4] + scale[2:4] * x[2:4])
+    change = _amplitude_dependence(fit.jac / scale, residual, time, (w, loss), start[2:4] + scale[2:4] * x[2:4])
     names, chosen, factors = ["k_over_J", "b_over_J"], [0, 1], [2.0 * float(w), 1.0]
     found = [IdentifiedValue(float(w * w), float(2 * w * sd[0])), IdentifiedValue(float(loss), float(sd[1]))]
-    inverse = start[4] + scale[4] * x[4:]
-    if comb and inverse[0] > Z_95 * sd[4]:
-        J = mechanics.J / float(inverse[0])
-        names, chosen, factors = [*names, "J"], [*chosen, 4], [*factors, J / float(inverse[0])]
+    inverse = float(start[4] + scale[4] * x[4])
+    if comb and inverse > Z_95 * sd[4]:
+        J = mechanics.J / inverse
+        names, chosen, factors = [*names, "J"], [*chosen, 4], [*factors, J / inverse]
         found.append(IdentifiedValue(J, factors[-1] * float(sd[4])))
     values = dict(zip(names, widen(found, change.select(chosen, factors)), strict=True))
     return values, residual

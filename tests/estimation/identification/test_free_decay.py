@@ -27,3 +27,11 @@ def decay(offset: float = 0.0, volt: float = 0.0, seed: int = 5) -> dict[str, Id
 def test_a_constant_voltage_on_a_linear_actuator_is_no_bias_of_combs() -> None:
     """It was refused for a capacitance that such a device does not have."""
     assert decay(volt=1e-3) == decay()
+
+
+def test_the_offset_of_the_angle_widens_no_interval() -> None:
+    """An offset of a fifth of the amplitude made the interval of k/J 2000 times as wide."""
+    shifted, plain = decay(offset=0.02), decay()
+    for key in ("k_over_J", "b_over_J"):
+        assert abs(shifted[key].value - plain[key].value) < 0.1 * plain[key].sd
+        assert shifted[key].sd < 1.01 * plain[key].sd
