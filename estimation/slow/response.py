@@ -42,8 +42,8 @@ HELD_OUT_EVERY = 4
 MODEL_ERROR = 1e-3
 """Error of the response, relative to its rms, that is expected of every model: the accuracy of a lock-in amplifier."""
 
-MAX_QUALITY = 1e6
-"""Largest quality factor of a fitted mode."""
+MAX_QUALITY = 1e7
+"""Largest quality factor of a fitted mode: numerical derivatives by its frequency are then rounded to a tenth."""
 
 SECOND_MODE_SHIFTS = (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)
 """Starts of the second mode's frequency relative to the largest peak, in widths of that peak."""
@@ -160,13 +160,14 @@ def frequency_responses(recording: Recording, device: Device) -> list[Response]:
 
 
 class _Model(NamedTuple):
-    """Response by its nonlinear parameters: relative frequency shift and ln Q of every fitted mode, then the laws.
+    """Response by its nonlinear parameters: shift in widths of the peak and ln Q of every fitted mode, then the laws.
 
     Attributes:
         response: of one axis, or the first of several.
         values: complex amplitudes of the axes that have these modes, shape (n, axes).
         effects: of ``EFFECTS``.
         center: frequency of the largest amplitude [Hz].
+        width: of the peak over ``center``; the unit of the shifts and laws, so that they are numbers near 1 at any Q.
         nominal: frequency [Hz] and quality factor of the first mode if they are not fitted.
     """
 
@@ -174,6 +175,7 @@ class _Model(NamedTuple):
     values: Complex
     effects: tuple[str, ...]
     center: float
+    width: float
     nominal: tuple[float, float] | None
 
     @property
@@ -198,12 +200,13 @@ class _Model(NamedTuple):
     def law_scales(self) -> list[float]:
         """Coefficient c of every law over its parameter."""
         w, size = 2.0 * np.pi * self.response.frequency, np.abs(self.response.values) / self.response.largest
-        return [float((2 * np.pi * self.center) ** 2 / np.abs(AMPLITUDE_LAWS[law](w, size)).max()) for law in self.laws]
+        unit = self.width * (2.0 * np.pi * self.center) ** 2
+        return [float(unit / np.abs(AMPLITUDE_LAWS[law](w, size)).max()) for law in self.laws]
 
     def mode_values(self, x: Array) -> Array:
         """Frequency [Hz] and quality factor of every mode, shape (modes, 2)."""
         pairs = x[: 2 * self.fitted_modes].reshape(-1, 2)
-        fitted = np.column_stack([self.center * (1.0 + pairs[:, 0]), np.exp(pairs[:, 1])])
+        fitted = np.column_stack([self.center * (1.0 + self.width * pairs[:, 0]), np.exp(pairs[:, 1])])
         return fitted if self.nominal is None else np.vstack([self.nominal, fitted])
 
     def solve(self, x: Array) -> tuple[Complex, Complex]:
@@ -215,7 +218,7 @@ class _Model(NamedTuple):
         w, used = 2.0 * np.pi * self.response.frequency, ~self.response.held_out
         added = np.zeros(w.size, complex)
         for value, shape in zip(x[2 * self.fitted_modes :], self.shapes(), strict=True):
-            added += value * (2.0 * np.pi * self.center) ** 2 * shape
+            added += value * self.width * (2.0 * np.pi * self.center) ** 2 * shape
         columns = []
         for f0, quality in self.mode_values(x):
             w0 = 2.0 * np.pi * f0
@@ -261,7 +264,9 @@ def _fit(
     response: Response, values: Complex, effects: tuple[str, ...], nominal: tuple[float, float] | None
 ) -> tuple[float, list[ResponseFit]]:
     power = np.sum(np.abs(values) ** 2 / np.mean(np.abs(values) ** 2, axis=0), axis=1)
-    model = _Model(response, values, effects, float(response.frequency[np.argmax(power)]), nominal)
+    center = float(response.frequency[np.argmax(power)])
+    width = _half_width(response.frequency, np.linalg.norm(values, axis=1)) / center
+    model = _Model(response, values, effects, center, width, nominal)
     x, jacobian = _minimise(model)
     heights, predicted = model.solve(x)
     squares = np.sum(model.residual(x).reshape(values.shape[1], -1) ** 2, axis=1)
@@ -272,7 +277,7 @@ def _fit(
     modes, count = model.mode_values(x), 2 * model.fitted_modes
     mode_sd = np.zeros_like(modes)
     mode_sd[model.modes - model.fitted_modes :] = sd[:count].reshape(-1, 2)
-    mode_sd *= np.column_stack([np.full(model.modes, model.center), modes[:, 1]])
+    mode_sd *= np.column_stack([np.full(model.modes, center * width), modes[:, 1]])
     coefficients = zip(model.laws, x[count:], sd[count:], model.law_scales(), strict=True)
     laws = {law: (float(value * scale), float(spread * scale)) for law, value, spread, scale in coefficients}
     price = 2.0 * float(np.log(comb(len(EFFECTS), len(effects)))) + free * float(np.log(n * squares.size))
@@ -294,23 +299,25 @@ def _minimise(model: _Model) -> tuple[Array, Array]:
     """The parameters of the least misfit from several starts, and the Jacobian of the residual there."""
     from scipy.optimize import least_squares
 
-    width = _half_width(model.response.frequency, np.linalg.norm(model.values, axis=1)) / model.center
-    log_quality, count = float(np.log(0.5 / width)), model.fitted_modes
+    log_quality, count = float(np.log(0.5 / model.width)), model.fitted_modes
     if not count + len(model.laws):
         return np.empty(0), np.empty((1, 0))
     signed = [law == "cubic-stiffness" for law in model.laws]
     begins = [
         np.array(
-            [*np.ravel([(0.0, log_quality), (shift * width, log_quality)][model.modes - count : model.modes])]
-            + [START_LAW * width * (sign if each else 1) for each in signed]
+            [*np.ravel([(0.0, log_quality), (shift, log_quality)][model.modes - count : model.modes])]
+            + [START_LAW * (sign if each else 1) for each in signed]
         )
         for shift in (SECOND_MODE_SHIFTS if model.modes == 2 else (0.0,))
         for sign in ((-1, 1) if any(signed) else (1,))
     ]
-    low = np.array([*([-0.5, 0.0] * count), *(-0.5 if each else 0.0 for each in signed)])
-    high = np.array([*([0.5, np.log(MAX_QUALITY)] * count), *([0.5] * len(signed))])
-    scale = np.array([*([width, 1.0] * count), *([START_LAW * width] * len(signed))])
-    fits = [least_squares(model.residual, begin, bounds=(low, high), x_scale=scale) for begin in begins]
+    most = 0.5 / model.width
+    low = np.array([*([-most, 0.0] * count), *(-most if each else 0.0 for each in signed)])
+    high = np.array([*([most, np.log(MAX_QUALITY)] * count), *([most] * len(signed))])
+    scale = np.array([*([1.0, 1.0] * count), *([START_LAW] * len(signed))])
+    fits = [
+        least_squares(model.residual, np.clip(begin, low, high), bounds=(low, high), x_scale=scale) for begin in begins
+    ]
     best = min(fits, key=lambda fit: fit.cost)
     return np.asarray(best.x), np.asarray(best.jac)
 
@@ -318,7 +325,7 @@ def _minimise(model: _Model) -> tuple[Array, Array]:
 def _half_width(frequency: Array, size: Array) -> float:
     """Distance [Hz] between the tones around the peak at which the power is half of it, at least that of two tones."""
     top = int(np.argmax(size))
-    below = size < size[top] / np.sqrt(2.0)
+    below = (size < size[top] / np.sqrt(2.0)) & (frequency != frequency[top])
     left, right = np.flatnonzero(below[:top]), np.flatnonzero(below[top:])
     low = frequency[left[-1]] if left.size else frequency[0]
     high = frequency[top + right[0]] if right.size else frequency[-1]

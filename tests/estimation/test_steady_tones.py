@@ -11,7 +11,7 @@ import pytest
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.identification.calibrate import identify
-from estimation.slow.response import frequency_responses
+from estimation.slow.response import fit_response, frequency_responses
 from recon.io.convert import convert
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
@@ -57,6 +57,25 @@ def test_a_linear_response_is_consistent_and_corrects_resonance_and_damping() ->
     assert found.device.axes["x"].resonance == pytest.approx(F0, abs=0.01)
     loop = found.open_loop["amplitude_x"]
     assert loop["improved"]["fraction"] < 0.1 * loop["nominal"]["fraction"]
+
+
+@pytest.mark.parametrize("quality", [1e5, 5e6])
+def test_a_very_high_quality_factor_is_found(quality: float) -> None:
+    """Above 1e6 it ended with a traceback, as the start of the fit was beyond its limits."""
+    frequency = F0 * (1.0 + np.linspace(-2.0, 2.0, 41) / quality)
+    ratio = frequency / F0
+    made = recording(0.1 / quality / (1.0 - ratio**2 + 1j * ratio / quality), frequency)
+    found = diagnose_with_optics([made])
+    assert (found.verdict, names(found)) == ("consistent", [])
+    assert found.device.axes["x"].quality == pytest.approx(quality, rel=5e-3)
+
+
+def test_tones_repeated_beside_one_glitch_have_a_width() -> None:
+    """Half of the power was reached at the repetitions themselves: a width of 0 ended with a traceback."""
+    angle, frequency = np.repeat(mode(F0, Q, 0.1), 3), np.repeat(FREQUENCY, 3)
+    angle[np.argmax(np.abs(angle)) + 1] *= 1.6
+    (response,) = frequency_responses(recording(angle, frequency), Device("lever", {"x": AXIS}))
+    assert fit_response(response, ()).modes[0] == pytest.approx([F0, Q], rel=0.3)
 
 
 @pytest.mark.parametrize("missing", ["frequency", "amplitude_x", "phase_x"])
