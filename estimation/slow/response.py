@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from estimation.lock_in_channels import lock_in_amplitude
 from scanner.arrays import Array
+from scanner.channel import Channel
 from scanner.device import Device
 from scanner.errors import BadInput
 from scanner.recording import Recording
@@ -44,6 +45,10 @@ MODEL_ERROR = 1e-3
 
 MAX_QUALITY = 1e7
 """Largest quality factor of a fitted mode: numerical derivatives by its frequency are then rounded to a tenth."""
+
+MIN_SCORE_GAIN = 12.0
+"""Gain of the score over a single linear mode from which effects, or the other sign of the phase, are claimed: odds of
+400 to 1."""
 
 SECOND_MODE_SHIFTS = (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)
 """Starts of the second mode's frequency relative to the largest peak, in widths of that peak."""
@@ -132,7 +137,7 @@ def frequency_responses(recording: Recording, device: Device) -> list[Response]:
     """The axes of a recording whose amplitude and phase were taken at steady tones, whose frequencies a channel holds.
 
     Raises:
-        BadInput: too few tones, or channels of different lengths.
+        BadInput: too few tones, channels of different lengths, or a phase of the wrong sign.
     """
     found = []
     for name, axis in device.axes.items():
@@ -156,7 +161,24 @@ def frequency_responses(recording: Recording, device: Device) -> list[Response]:
             raise BadInput(what, channel=key, hint="measure tones on both sides of the resonance")
         scale = float(np.abs(recording[key].read())[good].max() / amplitude[good].max())
         found.append(Response(name, frequency[good], amplitude[good] * np.exp(1j * phase[good]), in_rad, scale))
+        _check_phase_sign(found[-1], recording[phase_key])
     return found
+
+
+def _check_phase_sign(response: Response, phase: Channel) -> None:
+    """Check that the phase falls with the frequency, as it does through every resonance that loses energy.
+
+    Raises:
+        BadInput: one mode with or without feedthrough explains the response better with the other sign of the phase.
+    """
+    stated, turned = (
+        min(fit_response(each, effects).score for effects in ((), (FEEDTHROUGH,)))
+        for each in (response, response._replace(values=response.values.conj()))
+    )
+    if stated - turned > MIN_SCORE_GAIN:
+        what = "rises with the frequency through the resonance, where the phase of a motion falls"
+        hint = "its sign is reversed: state gain = -1 for it, or scale = -1 in its mapping"
+        raise BadInput(what, file=phase.file, channel=phase.name, hint=hint)
 
 
 class _Model(NamedTuple):

@@ -9,6 +9,7 @@ import numpy as np
 from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.slow.response import (
     FEEDTHROUGH,
+    MIN_SCORE_GAIN,
     SECOND_MODE,
     SUBSETS,
     Response,
@@ -16,9 +17,6 @@ from estimation.slow.response import (
     fit_common_modes,
     fit_response,
 )
-
-MIN_SCORE_GAIN = 12.0
-"""Gain of the score over a single linear mode from which effects are claimed: odds of 400 to 1."""
 
 
 def fit_subsets(response: Response) -> dict[tuple[str, ...], ResponseFit]:

@@ -59,6 +59,15 @@ def test_a_linear_response_is_consistent_and_corrects_resonance_and_damping() ->
     assert loop["improved"]["fraction"] < 0.1 * loop["nominal"]["fraction"]
 
 
+def test_a_phase_of_the_wrong_sign_is_refused() -> None:
+    """It gave a resonance at 1200 Hz, and feedthrough with cubic damping."""
+    made = recording(mode(F0, Q, 0.1).conj())
+    with pytest.raises(BadInput, match=r"^phase_x: rises with the frequency .* state gain = -1"):
+        diagnose_with_optics([made])
+    with pytest.raises(BadInput, match=r"^phase_x: rises with the frequency"):
+        identify([made], made.device)
+
+
 @pytest.mark.parametrize("quality", [1e5, 5e6])
 def test_a_very_high_quality_factor_is_found(quality: float) -> None:
     """Above 1e6 it ended with a traceback, as the start of the fit was beyond its limits."""
