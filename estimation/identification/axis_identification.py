@@ -36,7 +36,7 @@ from estimation.identification.sweep import SweptRecord, has_one_frequency
 from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
 from estimation.reference import drive_reference
 from estimation.slow.response import Response, ResponseFit, frequency_responses
-from estimation.slow.response_selection import select_response_effects
+from estimation.slow.response_selection import MAX_CONSISTENT_ERROR, prediction_error, select_response_effects
 from scanner.arrays import Array
 from scanner.clock import on_clock
 from scanner.device import DEFAULT_TOLERANCE, Axis, Device
@@ -78,6 +78,13 @@ class AxisIdentification:
             self.responses.append((responses[0], fit))
             self.found.append(Found(recording.name, values_of_mode(fit)))
             self.notes.append(f"{self.name}: J is the nominal one; steady tones determine only k/J and b/J")
+            missed = prediction_error(responses[0], fit)
+            if missed.error > MAX_CONSISTENT_ERROR * missed.deviation:
+                self.notes.append(
+                    f"{self.name}: the fitted modes miss the response of {recording.name} by "
+                    f"{missed.error / missed.deviation:.1%} (rms), which the intervals do not allow for; see the "
+                    "frequency response in the report"
+                )
             return
         kind = classify_recording(recording, self.name)
         if kind is None:

@@ -13,13 +13,16 @@ from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
 from estimation.slow.diagnose import MIN_REMAINDER
 from estimation.slow.response import AMPLITUDE_LAWS, FEEDTHROUGH, SECOND_MODE, Response, ResponseFit, fit_response
-from estimation.slow.response_selection import fit_subsets, prediction_error, select_response_effects, with_common_modes
+from estimation.slow.response_selection import (
+    MAX_CONSISTENT_ERROR,
+    fit_subsets,
+    prediction_error,
+    select_response_effects,
+    with_common_modes,
+)
 from scanner.device import Axis, Device
 from scanner.terms import catalogue
 from scanner.terms.driven_modes import EFFECT as DRIVEN_MODES
-
-MAX_CONSISTENT_ERROR = 0.05
-"""Error on held-out tones, as a fraction of the response, up to which a fit may be called consistent."""
 
 METRIC = "error of the response on tones not used in the fit, as a fraction of the response (rms)"
 

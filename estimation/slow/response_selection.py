@@ -18,6 +18,9 @@ from estimation.slow.response import (
     fit_response,
 )
 
+MAX_CONSISTENT_ERROR = 0.05
+"""Error on held-out tones, as a fraction of the response, up to which a fit may be called consistent."""
+
 
 def fit_subsets(response: Response) -> dict[tuple[str, ...], ResponseFit]:
     """A fit of every combination of effects."""

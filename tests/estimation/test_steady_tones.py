@@ -165,6 +165,14 @@ def test_a_cubic_spring_is_found_with_its_size(k3: float) -> None:
     assert found.device.axes["x"].terms["cubic-stiffness"]["k3"] == pytest.approx(k3, rel=0.05)
 
 
+@pytest.mark.parametrize("more_modes", [False, True])
+def test_identification_states_a_response_that_its_modes_miss(more_modes: bool) -> None:
+    """Nothing said that the resonance and the quality factor were those of modes that miss the response by a third."""
+    angle = mode(F0, Q, 0.1) + mode(798.0, 2000.0, 0.05) + mode(802.5, 2000.0, 0.05j)
+    found = identify([recording(angle if more_modes else mode(F0, Q, 0.1))], Device("lever", {"x": AXIS}))
+    assert any("the fitted modes miss the response" in note for note in found.notes) == more_modes
+
+
 def test_feedthrough_is_found() -> None:
     assert names(diagnose_with_optics([recording(mode(F0, Q, 0.1) + 0.01j)])) == ["feedthrough"]
 
