@@ -96,7 +96,7 @@ def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, Iden
         records: of steady motion.
 
     Raises:
-        BadInput: one frequency only.
+        BadInput: one frequency only, or as ``check_driven_signs``.
     """
     frequencies = {round(record.frequency, 3) for record in records}
     if len(frequencies) < 2:
@@ -119,11 +119,32 @@ def fit_mechanics(axis: Axis, records: Sequence[DrivenRecord]) -> dict[str, Iden
         targets += [w**2 * np.abs(theta), np.zeros(theta.size)]
     columns, target = np.concatenate(rows), np.concatenate(targets)
     ratios, covariance = fit_linear(columns, target)
+    check_driven_signs(axis.name, ratios)
     one_amplitude = np.ptp(amplitudes) < MAX_AMPLITUDE_CHANGE * max(amplitudes)
     if one_amplitude or len(frequencies) < 3 or not torque_is_linear(axis):  # five unknowns need three frequencies
         return values_from_ratios(ratios, covariance)
     change = difference_by_extra_columns(columns, np.concatenate(extra), target - columns @ ratios)
     return values_from_ratios(ratios, covariance, change.excess, float(change.conflict.max()))
+
+
+def check_driven_signs(name: str, ratios: Array) -> None:
+    """Check that a driven motion follows its torque and loses energy.
+
+    Args:
+        name: of the axis. ratios: k/J [1/s2], b/J [1/s] and 1/J [1/(kg m2)].
+
+    Raises:
+        BadInput: 1/J or b/J is not above 0.
+    """
+    if not ratios[2] > 0.0:
+        hint = f"the sign of angle_{name}, drive_{name} or of a constant of the torque is reversed: state gain = -1"
+        raise BadInput("moves against the torque of its drive", channel=f"angle_{name}", hint=hint)
+    if not ratios[1] > 0.0:
+        what = f"gains energy while it is driven: b/J is {ratios[1]:.3g} 1/s"
+        hint = (
+            f"it is early against drive_{name}, as by a delay of one of them or times that fall; else record for longer"
+        )
+        raise BadInput(what, channel=f"angle_{name}", hint=hint)
 
 
 def values_from_ratios(

@@ -24,7 +24,13 @@ from estimation.identification.agreement import (
     difference_by_extra_columns,
     linearly_independent,
 )
-from estimation.identification.fits import DrivenRecord, drive_torque, torque_is_linear, values_from_ratios
+from estimation.identification.fits import (
+    DrivenRecord,
+    check_driven_signs,
+    drive_torque,
+    torque_is_linear,
+    values_from_ratios,
+)
 from estimation.least_squares import fit_linear
 from estimation.reference import PhaseReference
 from scanner.arrays import Array, Complex, Mask
@@ -87,6 +93,9 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
 
     Returns:
         Values by name; none if 1/J is not determined, as by one steady frequency.
+
+    Raises:
+        BadInput: as ``check_driven_signs``.
     """
     equations = [_equations(axis, record) for record in records]
     columns, target = (np.concatenate([getattr(each, part) for each in equations]) for part in ("columns", "target"))
@@ -102,8 +111,9 @@ def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, Identifie
     ratios = fitted - change @ _noise_bias(equations, fitted, known)
     covariance = change @ _covariance(equations, ratios, known) @ change.T
     stiffness, _, inverse = ratios
-    if not (stiffness > 0.0 and inverse > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
+    if not (stiffness > 0.0 and abs(inverse) > MIN_INVERSE_INERTIA_SDS * np.sqrt(covariance[2, 2])):
         return {}
+    check_driven_signs(axis.name, ratios)
     if not torque_is_linear(axis):
         return values_from_ratios(ratios, covariance)
     differences = _amplitude_dependence(equations, fitted, known)
