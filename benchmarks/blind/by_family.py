@@ -125,9 +125,13 @@ def summarise(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def open_loop_ratios(outcome: Outcome) -> list[float]:
-    """By channel of the unused recording, the improved device's open-loop error over the nominal device's."""
+    """By channel of the unused recording, the improved device's open-loop error over the nominal device's.
+
+    Infinite where the improved device gives no prediction and the nominal one does.
+    """
     nominal, improved = outcome.open_loop.get("nominal", {}), outcome.open_loop.get("improved", {})
-    return [improved[name] / nominal[name] for name in nominal if name in improved and np.isfinite(improved[name])]
+    ratios = {name: improved.get(name, np.inf) / nominal[name] for name in nominal}
+    return [ratio if np.isfinite(ratio) else np.inf for ratio in ratios.values()]
 
 
 def _imaging(outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -140,6 +144,7 @@ def _imaging(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     improved = [after for _, after in pairs]
     return {
         "of": len(pairs),
+        "no reconstruction, improved device alone": sum("improved" not in o.imaging for o in outcomes if o.imaging),
         "largest phase error [deg]": max(e["phase_deg"] for e in improved),
         "worst field": max((e["field"] for e in improved), key=lambda ratio: abs(ratio - 1)),
         "largest picture error over that of the true motion": max(e["picture"] for e in improved),

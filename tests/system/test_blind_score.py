@@ -242,6 +242,16 @@ def test_an_improved_device_is_compared_on_the_unused_recording() -> None:
     assert "| ring |" in family_table(summarise_families([better, worse]))
 
 
+@pytest.mark.parametrize("improved", [{}, {"improved": {}}, {"improved": {"sense_x": np.nan}}])
+def test_an_improved_device_that_predicts_nothing_is_worse(improved: dict) -> None:
+    """Such a recording was left out of the rate and of the largest error."""
+    errors = {"nominal": {"sense_x": 1.0}} | improved
+    result = summarise([Outcome("a", key(effects=[target()]), diagnosis_of(finding()), 1.0, "", errors)])
+    rate = result["improved device not worse, unused recording"]
+    assert (rate["right"], rate["of"]) == (0, 1)
+    assert result["open-loop error, improved over nominal"]["largest"] == np.inf
+
+
 def test_errors_of_a_reconstructed_scan_equal_the_simulated_errors() -> None:
     rate, time = 1e6, np.arange(60_000) / 1e6
     rng = np.random.default_rng(1)
