@@ -14,7 +14,7 @@ from estimation.filters.measured_motion import MIN_BLOCKS, axis_motion_from_angl
 from estimation.filters.to_motion import BLOCK_CYCLES
 from estimation.held_samples import find_held_runs
 from estimation.initial import fit_initial_motion
-from estimation.isolated_spikes import find_dropouts, find_spikes
+from estimation.isolated_spikes import REACH, Spikes, find_dropouts, find_spikes
 from estimation.lock_in_channels import lock_in_angle
 from estimation.missing_samples import MAX_FILLED_GAP_PERIODS, Filled, fill_missing
 from estimation.reference import (
@@ -151,7 +151,7 @@ def _measure_axis(recording: Recording, device: Device, name: str) -> _MeasuredA
     longest = 1 if reference.kind == "blocks" else MAX_FILLED_GAP_PERIODS * channel.sample_rate / reference.frequency
     filled = fill_missing(channel, int(longest))
     repaired = with_replaced(channel, filled.at, filled.values)
-    spikes = find_spikes(repaired)
+    spikes = _away_from(filled.left_out, find_spikes(repaired))
     repaired = with_replaced(repaired, spikes.at, spikes.values)
     angle = replace(repaired, unit="rad", gain=repaired.gain / scale, offset=(repaired.offset - zero) / scale)
     held = [] if reference.kind == "blocks" else find_held_runs(channel, reference.frequency)
@@ -166,6 +166,14 @@ def _measure_axis(recording: Recording, device: Device, name: str) -> _MeasuredA
         *_describe_noise(channel, abs(scale), noise_sd, motion.angle_noise_sd),
     ]
     return _MeasuredAxis(motion, measure, angle, channel, scale, notes)
+
+
+def _away_from(gaps: Sequence[tuple[int, int]], spikes: Spikes) -> Spikes:
+    """The spikes that are not beside a gap (first, stop), at either end of which its straight line has a corner."""
+    kept = np.ones(spikes.at.size, bool)
+    for first, stop in gaps:
+        kept &= (spikes.at < first - REACH) | (spikes.at >= stop + REACH)
+    return Spikes(spikes.at[kept], spikes.values[kept])
 
 
 def _describe_noise(channel: Channel, gain: float, stated: float | None, found: float) -> list[str]:

@@ -84,3 +84,11 @@ def test_a_signal_with_a_gap_in_every_part_is_refused() -> None:
     gaps = [(first, first + 300) for first in range(0, TIME.size, 1000)]
     with pytest.raises(BadInput, match="sense_x: stands at one value, or lacks samples, in nearly all"):
         motion_of(without(*gaps))
+
+
+@pytest.mark.parametrize("first", range(20_000, 20_500, 50))
+def test_samples_beside_a_long_gap_are_no_spikes(first: int) -> None:
+    """The corner of the straight line through a gap was one: good samples were replaced, with advice on the cable."""
+    values = SINE + 0.02 * NOISE
+    values[first : first + 6_100] = np.nan
+    assert [note.split(": ")[1][:8] for note in motion_of(values).notes] == ["left out"]
