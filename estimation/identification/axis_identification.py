@@ -32,8 +32,8 @@ from estimation.identification.fits import (
 from estimation.identification.lock_in_decay import fit_lock_in_decay
 from estimation.identification.reference_angle import ReferenceAngle, find_reference_angle, with_angle
 from estimation.identification.steady_segments import steady_segments
-from estimation.identification.sweep import SweptRecord, has_one_frequency
 from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
+from estimation.identification.swept_record import SweptRecord, has_one_frequency
 from estimation.reference import drive_reference
 from estimation.slow.response import Response, ResponseFit, frequency_responses
 from estimation.slow.response_selection import MAX_CONSISTENT_ERROR, prediction_error, select_response_effects

@@ -20,7 +20,8 @@ import numpy as np
 
 from estimation.identification.agreement import IdentifiedValue
 from estimation.identification.fits import drive_torque, values_from_ratios
-from estimation.identification.sweep import MIN_INVERSE_INERTIA_SDS, LockInOutput, SweptRecord
+from estimation.identification.sweep import MIN_INVERSE_INERTIA_SDS
+from estimation.identification.swept_record import LockInOutput, SweptRecord
 from scanner.arrays import Array, Complex
 from scanner.device import Axis
 

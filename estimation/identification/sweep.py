@@ -13,7 +13,7 @@ balance of power, which holds for any k/J; k/J is its average over the record.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,14 +25,13 @@ from estimation.identification.agreement import (
     linearly_independent,
 )
 from estimation.identification.fits import (
-    DrivenRecord,
     check_driven_signs,
     drive_torque,
     torque_is_linear,
     values_from_ratios,
 )
+from estimation.identification.swept_record import SweptRecord, has_one_frequency
 from estimation.least_squares import fit_linear
-from estimation.reference import PhaseReference
 from scanner.arrays import Array, Complex, Mask
 from scanner.device import Axis
 
@@ -45,44 +44,6 @@ HOPS_PER_WINDOW = 16
 
 MIN_INVERSE_INERTIA_SDS = 3.0
 """Estimate of 1/J over its standard deviation from which J is reported: below, its interval includes infinity."""
-
-
-@dataclass(frozen=True)
-class LockInOutput:
-    """Amplitude and phase of a motion behind a lock-in amplifier.
-
-    Attributes:
-        time: shape (m,) [s].
-        values: amplitude exp(i phase), shape (m,) [rad].
-        turn: phase of the reference at given times [rad].
-        frequency: mean frequency of the reference [Hz].
-        order: time derivatives of the angle that were recorded, converted to ``values`` at ``frequency``.
-    """
-
-    time: Array
-    values: Complex
-    turn: Callable[[Array], Array]
-    frequency: float
-    order: int = 0
-
-
-@dataclass(frozen=True)
-class SweptRecord:
-    """Driven motion of any frequency and amplitude.
-
-    Attributes:
-        driven: angle and drive voltage.
-        time: of its samples, shape (n,) [s].
-        reference: phase of the motion's drive.
-        lock_in: what a lock-in amplifier recorded, where the angle is interpolated from that.
-        recording: its name.
-    """
-
-    driven: DrivenRecord
-    time: Array
-    reference: PhaseReference
-    lock_in: LockInOutput | None = None
-    recording: str = ""
 
 
 def fit_swept(axis: Axis, records: Sequence[SweptRecord]) -> dict[str, IdentifiedValue]:
@@ -131,6 +92,7 @@ class _Equations:
         windows: of the angle, its velocity and its acceleration, each of shape (window,).
         hop: samples between two points.
         balance: whether only the balance of power is used, the imaginary part.
+        torque_rate: derivative of the torque, shape (points,), the column of a delay over J.
     """
 
     motion: Complex
@@ -138,6 +100,7 @@ class _Equations:
     windows: tuple[Complex, ...]
     hop: int
     balance: bool
+    torque_rate: Complex
 
     @property
     def columns(self) -> Complex:
@@ -164,13 +127,52 @@ def _equations(axis: Axis, record: SweptRecord) -> _Equations:
         for each in (plain, 1j * w * plain + first, second + 2j * w * first - w**2 * plain)
     )
     z, velocity, acceleration = (_averaged(angle, window, hop) for window in windows)
-    motion = np.stack([z, velocity, -_averaged(torque, plain, hop)], axis=1)
+    lag = record.delay  # what is slow against the carrier is delayed by its series
+    late = np.exp(-1j * w * lag) * (plain - lag * first + 0.5 * lag**2 * second)
+    torque_rate = _averaged(torque, np.exp(-1j * w * lag) * (1j * w * plain + first), hop)
+    motion = np.stack([z, velocity, -_averaged(torque, late, hop)], axis=1)
     balance = has_one_frequency(record)
     if balance:
         direction = z.conj() / np.maximum(np.abs(z), np.finfo(float).tiny)
         motion, acceleration = direction[:, None] * motion, direction * acceleration
         motion[:, 0] = np.abs(z)
-    return _Equations(motion, -acceleration, windows, hop, balance)
+    return _Equations(motion, -acceleration, windows, hop, balance, torque_rate)
+
+
+def _with_amplitude_laws(equations: Sequence[_Equations]) -> list[_Equations]:
+    """The equations with two more columns: k/J and b/J that change with the square of the amplitude."""
+    largest = max(float(np.max(np.abs(each.motion[:, 0]))) for each in equations)
+    extended = []
+    for each in equations:
+        relative = (np.abs(each.motion[:, :1]) / largest) ** 2
+        extended.append(replace(each, motion=np.column_stack([each.motion, relative * each.motion[:, :2]])))
+    return extended
+
+
+def fit_delay(axis: Axis, records: Sequence[SweptRecord]) -> IdentifiedValue | None:
+    """Further delay [s] of the angle against the drive, fitted with k and b that may depend on the amplitude.
+
+    Args:
+        axis: its torque does not depend on the angle, or the error of that would be a delay.
+
+    Returns:
+        None where it is not distinguished from the mechanics, as by one frequency.
+    """
+    equations = [_equations(axis, record) for record in records]
+    if not torque_is_linear(axis) or any(each.balance for each in equations):
+        return None
+    extended = [
+        replace(each, motion=np.column_stack([each.motion, each.torque_rate]))
+        for each in _with_amplitude_laws(equations)
+    ]
+    columns, target = (np.concatenate([getattr(each, part) for each in extended]) for part in ("columns", "target"))
+    together = np.concatenate([columns.real, columns.imag])
+    if len(target) < HOPS_PER_WINDOW or not linearly_independent(together):
+        return None
+    ratios, _ = fit_linear(together, np.concatenate([target.real, target.imag]))
+    spread = _covariance(extended, ratios, np.ones(ratios.size, bool))
+    inverse = float(ratios[2])
+    return IdentifiedValue(float(ratios[-1]) / inverse, float(np.sqrt(spread[-1, -1])) / abs(inverse))
 
 
 def _amplitude_dependence(equations: Sequence[_Equations], ratios: Array, known: Mask) -> Differences:
@@ -179,11 +181,7 @@ def _amplitude_dependence(equations: Sequence[_Equations], ratios: Array, known:
     A cubic stiffness adds 3/4 k3 |Z|^2 Z / J to the equation of motion, a damping by the squared angle a part of
     |Z|^2 DZ.
     """
-    largest = max(float(np.max(np.abs(each.motion[:, 0]))) for each in equations)
-    extended = []
-    for each in equations:
-        relative = (np.abs(each.motion[:, :1]) / largest) ** 2
-        extended.append(replace(each, motion=np.column_stack([each.motion, relative * each.motion[:, :2]])))
+    extended = _with_amplitude_laws(equations)
     columns, target = (np.concatenate([getattr(each, part) for each in extended]) for part in ("columns", "target"))
     used = np.asarray(columns.any(axis=0))
     used[:3] &= known
@@ -197,12 +195,6 @@ def _amplitude_dependence(equations: Sequence[_Equations], ratios: Array, known:
     spread = _covariance(extended, coefficients, used)[count:, count:]
     columns, extra = together[:, :count], together[:, count:]
     return difference_by_extra_columns(columns, extra, residual - columns @ ratios[known], spread)
-
-
-def has_one_frequency(record: SweptRecord) -> bool:
-    """Whether the phase of the reference stays within half a turn of that of a constant frequency."""
-    psi = record.reference.phase(record.time)
-    return bool(np.ptp(psi - np.linspace(psi[0], psi[-1], psi.size)) < np.pi)
 
 
 def _mean_stiffness(equations: Sequence[_Equations], others: Array) -> tuple[float, Array]:
