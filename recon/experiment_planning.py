@@ -259,6 +259,7 @@ def plan_to_json(runs: Sequence[Run], device: Device, detectabilities: Sequence[
                 "stage": each.candidate.term.stage,
                 "effect": each.candidate.term.effect,
                 "channel": each.candidate.channel,
+                "key": each.candidate.key,
                 "sigma": each.sigma,
                 "nearest": each.nearest.key,
                 "distance": each.distance,

@@ -112,7 +112,7 @@ def _format_plan(summary: dict[str, Any]) -> str:
 
     lines = [conclude_plan(summary)]
     lines += [
-        f"  {effect['axis']} {effect['effect']}: {effect['sigma']:.3g} sigma, {effect['distance']:.3g} from "
+        f"  {effect['key']}: {effect['sigma']:.3g} sigma, {effect['distance']:.3g} from "
         f"{effect['nearest']}" + (f" ({effect['advice']})" if effect["advice"] else "")
         for effect in summary["effects"]
     ]

@@ -272,7 +272,7 @@ def plan_report(plan: Mapping[str, Any], effects: Sequence[Detectability]) -> st
     runs = [[run["name"], f"{1e3 * run['duration']:.4g}", ", ".join(run["channels"])] for run in plan["excitations"]]
     ambiguous = [
         [
-            effect["effect"],
+            effect["key"],
             f"{effect['stage']} of axis {effect['axis']}",
             f"{effect['sigma']:.3g}",
             f"{effect['distance']:.3g}",

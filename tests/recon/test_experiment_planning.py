@@ -115,12 +115,16 @@ def test_the_command_writes_plan_and_report(tmp_path: Path, capsys: pytest.Captu
     simulate_excitation(read_excitation(tmp_path / "down.toml"), DEVICE).write(tmp_path / "rec<b>.h5")
     words = ["diagnose", "--plan", str(tmp_path / "down.toml"), str(tmp_path / "rec<b>.h5")]
     assert main([*words, "--device", str(tmp_path / "stage.toml"), "-o", str(tmp_path / "out")]) == 0
-    assert "could identify" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "could identify" in shown
     plan = json.loads((tmp_path / "out" / "plan.json").read_text())
     assert plan["schema"] == "lissajous-plan/1"
     assert plan["excitations"][0]["name"] == "down"
     assert {"cubic-stiffness", "gain-drift"} <= {effect["effect"] for effect in plan["effects"]}
     assert all(effect["distance"] <= effect["sigma"] * 1.001 for effect in plan["effects"])
+    listed = [line.split(" sigma")[0].rpartition(":")[0].strip() for line in shown.splitlines()[1:-1]]
+    assert listed == [effect["key"] for effect in plan["effects"]]
+    assert len(set(listed)) == len(listed)
     page = (tmp_path / "out" / "report.html").read_text()
     assert "What a measurement can show" in page
     assert "<b>" not in page
