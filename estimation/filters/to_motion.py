@@ -111,7 +111,8 @@ def synthesize_angle(
 ) -> SampledAngle:
     """The angle A sin(psi + phi) of slow phase and amplitude, with the third harmonic that the torque adds.
 
-    The third harmonic is about 0.1 % of A in a fixed relation to the fundamental; it is averaged over all of ``theta``.
+    The third harmonic is about 0.1 % of A in a fixed relation to the fundamental; it is fitted to all of ``theta`` by
+    least squares, so that a mirror at rest, where the rest of ``theta`` is noise, adds nothing to it.
 
     Args:
         theta: filtered angle at the samples of ``channel``, shape (n,) [rad].
@@ -123,7 +124,8 @@ def synthesize_angle(
         return reference.phase(time) + _extrapolate(time, knots, phase), _extrapolate(time, knots, amplitude)
 
     total_phase, size = fundamental(channel.time())
-    third = 2.0 * np.mean((theta - size * np.sin(total_phase)) / size * np.exp(-3j * total_phase))
+    rest = theta - size * np.sin(total_phase)
+    third = 2.0 * np.sum(size * rest * np.exp(-3j * total_phase)) / np.sum(size**2)
     rate, start, n = clock
     time = start + np.arange(n) / rate
     if (rate, start, n) != (channel.sample_rate, channel.start, channel.size):
