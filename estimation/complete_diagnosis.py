@@ -274,11 +274,13 @@ def _sense_evidence(diagnosis: Diagnosis) -> Callable[[Device], float]:
 def add_optics(diagnosis: Diagnosis, recording: Recording, follow_signs: FollowSigns) -> Diagnosis:
     """Return the diagnosis with the optical effects that the picture of one recording shows.
 
-    The motion is estimated with the improved device of ``diagnosis``, so that its terms are not diagnosed again.
+    The motion is estimated with the improved device of ``diagnosis``, so that its terms are not diagnosed again. An
+    effect that is found beside a term of the same name is added to it.
     """
     from estimation.estimate import estimate
     from estimation.optics.correction import beam_motion, correct_intensity
     from estimation.optics.selection import diagnose_optics
+    from estimation.optics.stated_effects import describe_total, with_remainders
 
     device = diagnosis.device
     corrected = correct_intensity(recording, device)
@@ -287,10 +289,11 @@ def add_optics(diagnosis: Diagnosis, recording: Recording, follow_signs: FollowS
     kind, recorded = DETECTORS.get(motion.estimator), {*recording.channels, *recording.edges}
     detectors = {axis: f"{kind}_{axis}" for axis in AXES if f"{kind}_{axis}" in recorded} if kind else {}
     optics = diagnose_optics(motion, corrected["intensity"], device, detectors)
+    improved = with_remainders(device, optics.terms)
     return replace(
         diagnosis,
         verdict="mismatch" if optics.findings else diagnosis.verdict,
-        findings=(*diagnosis.findings, *optics.findings),
-        device=device.with_terms(optics.terms),
+        findings=(*diagnosis.findings, *(describe_total(each, device, improved) for each in optics.findings)),
+        device=improved,
         optics=(*diagnosis.optics, {"recording": recording.name, "effects": optics.to_json()}),
     )

@@ -214,6 +214,26 @@ def test_the_improved_device_restores_the_picture() -> None:
     assert np.nanstd(corrected - truth) < 0.35 * np.nanstd(uncorrected - truth)
 
 
+@pytest.mark.parametrize(
+    ("hidden", "effect", "stated", "true"),
+    [
+        ({"late": 8e-6}, "intensity-delay", {"tau": 3e-6}, 8e-6),
+        ({"fade": 0.4}, "bleaching", {"tau": DURATION_S / 0.2}, DURATION_S / 0.4),
+        ({"creep": 0.1}, "sample-motion", {"v": 0.05 * HALF_ANGLE_RAD / DURATION_S}, 0.1 * HALF_ANGLE_RAD / DURATION_S),
+    ],
+)
+def test_an_effect_beside_a_stated_one_is_added_to_it(
+    hidden: dict[str, float], effect: str, stated: dict[str, float], true: float
+) -> None:
+    """The remainder replaced the stated value: of a delay of 8 us, 3 us of them stated, the device had 5 us."""
+    diagnosis = diagnose_with_optics([scan(**hidden)], DEVICE.with_terms({"x": {effect: stated}}))  # type: ignore[arg-type]
+    (finding,) = diagnosis.findings
+    (value,) = diagnosis.device.axis("x").terms[effect].values()
+    assert finding.effect == effect
+    assert value == pytest.approx(true, rel=0.12)
+    assert "beside the stated" in finding.where
+
+
 def test_optics_terms_change_beam_position_and_intensity() -> None:
     terms = "[x.terms.sample-motion]\nv = 0.5\n[x.terms.bleaching]\ntau = 0.1\n[x.terms.detector-lag]\nf_c = 1e5\n"
     device = Device.from_toml(f"[x]\n[y]\n[y.terms.field-distortion]\nc3 = 2.0\n{terms}")
