@@ -19,7 +19,7 @@ from estimation.held_samples import held_while_driven
 from estimation.signals import require_device
 from estimation.slow.diagnose import diagnose_decays, slow_decays
 from estimation.slow.diagnose_response import diagnose_responses
-from estimation.slow.response import frequency_responses
+from estimation.slow.steady_tones import frequency_responses
 from scanner.channel import Channel
 from scanner.device import AXES, Device
 from scanner.errors import BadInput

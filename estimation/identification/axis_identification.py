@@ -35,8 +35,9 @@ from estimation.identification.steady_segments import steady_segments
 from estimation.identification.swept_motion import fit_swept_motion, lock_in_output
 from estimation.identification.swept_record import SweptRecord, has_one_frequency
 from estimation.reference import drive_reference
-from estimation.slow.response import Response, ResponseFit, frequency_responses
+from estimation.slow.response import Response, ResponseFit
 from estimation.slow.response_selection import MAX_CONSISTENT_ERROR, prediction_error, select_response_effects
+from estimation.slow.steady_tones import frequency_responses
 from scanner.arrays import Array
 from scanner.clock import on_clock
 from scanner.device import DEFAULT_TOLERANCE, Axis, Device

@@ -138,8 +138,7 @@ def _parameters(response: Response, axis: Axis, effect: str, fit: ResponseFit) -
         )
     if effect == FEEDTHROUGH:
         size = abs(fit.feedthrough) / response.largest
-        spread = Z_95 * float(np.sqrt(np.mean(np.abs(response.values - fit.predicted) ** 2)) / response.largest)
-        spread /= np.sqrt(response.frequency.size)
+        spread = Z_95 * fit.feedthrough_sd / response.largest
         return (ParameterEstimate("fraction_of_largest_amplitude", size, (size - spread, size + spread), "1"),)
     value, sd = fit.laws[effect]
     if not response.in_rad or axis.mechanics is None:

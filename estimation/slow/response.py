@@ -24,18 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.lock_in_channels import lock_in_amplitude
 from scanner.arrays import Array
-from scanner.channel import Channel
-from scanner.device import Device
-from scanner.errors import BadInput
-from scanner.recording import Recording
-from scanner.wording import counted
 
 Complex = NDArray[np.complexfloating[Any, Any]]
-
-MIN_TONES = 10
-"""Tones that are needed: a fit has up to ten parameters and a tone has two numbers, and some tones are held out."""
 
 HELD_OUT_EVERY = 4
 """One tone in so many is held out, the first and the last are not."""
@@ -55,6 +46,9 @@ SECOND_MODE_SHIFTS = (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)
 
 START_LAW = 0.1
 """Start of a law's shift of frequency or of its damping, in widths of the peak."""
+
+DERIVATIVE_STEP = 1e-5
+"""Step of a numerical derivative by a parameter of a fit, which is a number near 1."""
 
 SECOND_MODE, FEEDTHROUGH = "second-mode", "feedthrough"
 
@@ -117,6 +111,7 @@ class ResponseFit:
         modes: frequency [Hz] and quality factor of every mode, that of the largest peak first, shape (modes, 2).
         residues: R of every mode [unit of the response times (rad/s)^2], shape (modes,).
         feedthrough: a constant of the response, 0 where it is not fitted.
+        feedthrough_sd: standard deviation of its magnitude.
         laws: by effect its coefficient c with its standard deviation, for amplitudes relative to the largest.
         mode_sd: standard deviations of ``modes``.
         score: N ln(misfit) + (parameters) ln N + 2 ln(number of subsets of that size).
@@ -127,58 +122,11 @@ class ResponseFit:
     modes: Array
     residues: Complex
     feedthrough: complex
+    feedthrough_sd: float
     laws: Mapping[str, tuple[float, float]]
     mode_sd: Array
     score: float
     predicted: Complex
-
-
-def frequency_responses(recording: Recording, device: Device) -> list[Response]:
-    """The axes of a recording whose amplitude and phase were taken at steady tones, whose frequencies a channel holds.
-
-    Raises:
-        BadInput: too few tones, channels of different lengths, or a phase of the wrong sign.
-    """
-    found = []
-    for name, axis in device.axes.items():
-        key, phase_key = f"amplitude_{name}", f"phase_{name}"
-        if key not in recording or phase_key not in recording:
-            continue
-        reference = recording[phase_key].reference or recording[key].reference
-        if not isinstance(reference, str):
-            continue
-        held = recording.require(reference, f"it is the reference of {phase_key}")
-        _, amplitude, in_rad = lock_in_amplitude(recording, axis)
-        phase, frequency = recording[phase_key].read(), held.read()
-        if not amplitude.size == phase.size == frequency.size:
-            hint = "state one amplitude, phase and frequency for every tone"
-            raise BadInput("differs from its phase or its frequency in length", channel=key, hint=hint)
-        order = np.argsort(frequency)
-        finite = np.isfinite(amplitude) & np.isfinite(phase) & np.isfinite(frequency)
-        good = order[(finite & (amplitude > 0.0))[order]]
-        if np.unique(frequency[good]).size < MIN_TONES:
-            what = f"holds {counted(np.unique(frequency[good]).size, 'steady tone')}, {MIN_TONES} are needed"
-            raise BadInput(what, channel=key, hint="measure tones on both sides of the resonance")
-        scale = float(np.abs(recording[key].read())[good].max() / amplitude[good].max())
-        found.append(Response(name, frequency[good], amplitude[good] * np.exp(1j * phase[good]), in_rad, scale))
-        _check_phase_sign(found[-1], recording[phase_key])
-    return found
-
-
-def _check_phase_sign(response: Response, phase: Channel) -> None:
-    """Check that the phase falls with the frequency, as it does through every resonance that loses energy.
-
-    Raises:
-        BadInput: one mode with or without feedthrough explains the response better with the other sign of the phase.
-    """
-    stated, turned = (
-        min(fit_response(each, effects).score for effects in ((), (FEEDTHROUGH,)))
-        for each in (response, response._replace(values=response.values.conj()))
-    )
-    if stated - turned > MIN_SCORE_GAIN:
-        what = "rises with the frequency through the resonance, where the phase of a motion falls"
-        hint = "its sign is reversed: state gain = -1 for it, or scale = -1 in its mapping"
-        raise BadInput(what, file=phase.file, channel=phase.name, hint=hint)
 
 
 class _Model(NamedTuple):
@@ -231,13 +179,9 @@ class _Model(NamedTuple):
         fitted = np.column_stack([self.center * (1.0 + self.width * pairs[:, 0]), np.exp(pairs[:, 1])])
         return fitted if self.nominal is None else np.vstack([self.nominal, fitted])
 
-    def solve(self, x: Array) -> tuple[Complex, Complex]:
-        """Heights of the modes and the feedthrough, by linear least squares, and the response at all tones.
-
-        Returns:
-            Shapes (modes, or one more, axes) and (n, axes).
-        """
-        w, used = 2.0 * np.pi * self.response.frequency, ~self.response.held_out
+    def table(self, x: Array) -> Complex:
+        """Response of modes and feedthrough of height 1 at all tones, shape (n, modes) or one column more."""
+        w = 2.0 * np.pi * self.response.frequency
         added = np.zeros(w.size, complex)
         for value, shape in zip(x[2 * self.fitted_modes :], self.shapes(), strict=True):
             added += value * self.width * (2.0 * np.pi * self.center) ** 2 * shape
@@ -247,9 +191,33 @@ class _Model(NamedTuple):
             columns.append(w0**2 / quality / (w0**2 - w**2 + 1j * w0 * w / quality + added))
         if FEEDTHROUGH in self.effects:
             columns.append(np.ones(w.size, complex))
-        table = np.array(columns).T
+        return np.array(columns).T
+
+    def solve(self, x: Array) -> tuple[Complex, Complex]:
+        """Heights of the modes and the feedthrough, by linear least squares, and the response at all tones.
+
+        Returns:
+            Shapes (modes, or one more, axes) and (n, axes).
+        """
+        table, used = self.table(x), ~self.response.held_out
         heights = np.linalg.lstsq(table[used], self.values[used], rcond=None)[0]
         return heights, table @ heights
+
+    def height_variance(self, x: Array, covariance: Array, noise: Array) -> Array:
+        """Variance of the magnitude of every height, shape as that of the heights.
+
+        Args:
+            covariance: of ``x``.
+            noise: variance of real and imaginary part of a tone, shape (axes,).
+        """
+        used, heights = ~self.response.held_out, self.solve(x)[0]
+        inverse = np.linalg.pinv(self.table(x)[used])
+        variance = np.sum(np.abs(inverse) ** 2, axis=1)[:, None] * noise
+        direction = np.exp(-1j * np.angle(heights))
+        steps = DERIVATIVE_STEP * np.eye(x.size)
+        slopes = [(self.solve(x + step)[0] - self.solve(x - step)[0]) / (2 * DERIVATIVE_STEP) for step in steps]
+        along = np.array([(slope * direction).real for slope in slopes]).reshape(x.size, *heights.shape)
+        return np.asarray(variance + np.einsum("ika,ij,jka->ka", along, covariance, along))
 
     def residual(self, x: Array) -> Array:
         """Error at the fitted tones over the rms of each response, shape (2 tones axes,)."""
@@ -295,7 +263,9 @@ def _fit(
     n = 2 * int((~response.held_out).sum())
     free = x.size + 2 * heights.size
     variance = float(squares.sum()) / max(n * squares.size - free, 1) + MODEL_ERROR**2
-    sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance, 0.0))
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    height_sd = np.sqrt(model.height_variance(x, covariance, variance * np.mean(np.abs(values) ** 2, axis=0)))
     modes, count = model.mode_values(x), 2 * model.fitted_modes
     mode_sd = np.zeros_like(modes)
     mode_sd[model.modes - model.fitted_modes :] = sd[:count].reshape(-1, 2)
@@ -307,11 +277,14 @@ def _fit(
     fits = []
     for i in range(values.shape[1]):
         order = np.argsort(-np.abs(heights[: model.modes, i]))
-        feedthrough = complex(heights[-1, i]) if FEEDTHROUGH in effects else 0j
+        feedthrough, feedthrough_sd = 0j, 0.0
+        if FEEDTHROUGH in effects:
+            feedthrough, feedthrough_sd = complex(heights[-1, i]), float(height_sd[-1, i])
         residues = heights[: model.modes, i] * (2.0 * np.pi * modes[:, 0]) ** 2 / modes[:, 1]
+        sd_of_modes, at_tones = mode_sd[order], predicted[:, i]
         fits.append(
             ResponseFit(
-                effects, modes[order], residues[order], feedthrough, laws, mode_sd[order], score, predicted[:, i]
+                effects, modes[order], residues[order], feedthrough, feedthrough_sd, laws, sd_of_modes, score, at_tones
             )
         )
     return score, fits

@@ -11,7 +11,8 @@ import pytest
 from estimation.complete_diagnosis import diagnose_with_optics
 from estimation.diagnosis.diagnose import Diagnosis
 from estimation.identification.calibrate import identify
-from estimation.slow.response import fit_response, frequency_responses
+from estimation.slow.response import Response, fit_response
+from estimation.slow.steady_tones import frequency_responses
 from recon.io.convert import convert
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
@@ -175,6 +176,19 @@ def test_identification_states_a_response_that_its_modes_miss(more_modes: bool) 
 
 def test_feedthrough_is_found() -> None:
     assert names(diagnose_with_optics([recording(mode(F0, Q, 0.1) + 0.01j)])) == ["feedthrough"]
+
+
+def test_the_interval_of_feedthrough_has_the_width_of_its_error() -> None:
+    """Over the peak alone the height of the mode has nearly the same shape: the interval was 2.6 times too narrow."""
+    frequency, scores = F0 * (1.0 + np.linspace(-0.7, 0.7, 25) / Q), []
+    ratio = frequency / F0
+    clean = 0.1 / Q / (1.0 - ratio**2 + 1j * ratio / Q) * np.exp(0.3j) + 0.008
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        response = Response("x", frequency, clean + 5e-4 * (rng.normal(size=25) + 1j * rng.normal(size=25)), True, 1.0)
+        found = fit_response(response, ("feedthrough",))
+        scores.append((abs(found.feedthrough) - 0.008) / found.feedthrough_sd)
+    assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.6
 
 
 def test_a_quadratic_drag_in_volts_has_its_size_at_the_largest_amplitude() -> None:
