@@ -32,6 +32,10 @@ TUNING_START_RATIO = 0.03
 TUNING_FACTORS = (10.0, 10.0**0.5)
 """Factors by which the process noise is varied, the coarse one first: the phase error depends on it only weakly."""
 
+MIN_LOG_LIKELIHOOD_GAIN = 0.5
+"""Gain in log likelihood by which another process noise is chosen: that of one standard deviation. Where a lower noise
+is no more likely, as beside a model that errs by less than the noise shows, the search keeps the higher one."""
+
 TRACK_POINTS_PER_CYCLE = 16
 """Points per cycle of the fastest axis at which rate and covariance are kept: enough for a mean over a cycle."""
 
@@ -95,7 +99,8 @@ def track_stride(problem: FilterInput) -> int:
 def tune_torque_noise(problem: FilterInput) -> Array:
     """Process noise of each axis by maximum likelihood of the sense signal, to half a decade.
 
-    Axes are searched in turn, upwards and downwards, until no factor raises the likelihood.
+    Axes are searched in turn, upwards and downwards, until no factor raises the log likelihood by
+    ``MIN_LOG_LIKELIHOOD_GAIN``.
 
     Returns:
         Q_theta, shape (axes,) [(rad/s2)^2].
@@ -122,7 +127,7 @@ def tune_torque_noise(problem: FilterInput) -> Array:
                 for step in (factor, 1.0 / factor):
                     trial = best.copy()
                     trial[i] *= step
-                    while (value := log_likelihood(trial)) > highest:
+                    while (value := log_likelihood(trial)) > highest + MIN_LOG_LIKELIHOOD_GAIN:
                         best, highest, improved = trial.copy(), value, True
                         trial[i] *= step
     return best
