@@ -17,7 +17,7 @@ from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block
-from scanner.motion import AxisMotion
+from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion
 
 BLOCK_CYCLES = 4.0
 """Cycles of the motion per point of the slow clock: short against the ring-down of a resonator, long enough that the
@@ -92,7 +92,7 @@ def axis_motion_from_filter(
         phase=phase,
         amplitude=np.abs(phasors),
         frequency=reference.frequency_at(time) + np.gradient(phase, time) / (2 * np.pi),
-        phase_sd=np.sqrt(variance),
+        phase_sd=np.minimum(np.sqrt(variance), UNKNOWN_PHASE_SD_RAD),
         angle=synthesize_angle(filtered.theta[i], channel, reference, time, phase, np.abs(phasors), clock),
         reference=reference.kind,
         reference_frequency=reference.frequency,

@@ -7,6 +7,7 @@ import pytest
 
 from estimation.estimate import estimate
 from scanner.device import Axis, Device
+from scanner.motion import UNKNOWN_PHASE_SD_RAD
 from scanner.recording import Recording
 from scanner.stages import Drive, Mechanics, Velocity
 
@@ -44,3 +45,10 @@ def test_rest_after_the_drive_adds_no_third_harmonic_to_the_motion_before(method
     driven = slice(angle.size // 10, angle.size * 4 // 10)
     error = estimate(recording, recording.device, method).axes["x"].angle.read()[driven] - angle[driven]
     assert np.std(error) < 2e-3 * AMPLITUDE_RAD
+
+
+def test_the_phase_of_a_mirror_at_rest_is_unknown_and_no_less_than_that() -> None:
+    """Its standard deviation was up to 36 rad here, more than that of a phase of which nothing is known."""
+    recording, _ = stopped_drive()
+    phase_sd = estimate(recording, recording.device, "ekf").axes["x"].phase_sd
+    assert phase_sd[-1] == phase_sd.max() == UNKNOWN_PHASE_SD_RAD
