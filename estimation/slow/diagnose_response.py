@@ -12,7 +12,15 @@ from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
 from estimation.slow.diagnose import MIN_REMAINDER
-from estimation.slow.response import AMPLITUDE_LAWS, FEEDTHROUGH, SECOND_MODE, Response, ResponseFit, fit_response
+from estimation.slow.response import (
+    AMPLITUDE_LAWS,
+    DELAY,
+    FEEDTHROUGH,
+    SECOND_MODE,
+    Response,
+    ResponseFit,
+    fit_response,
+)
 from estimation.slow.response_selection import (
     MAX_CONSISTENT_ERROR,
     fit_subsets,
@@ -140,6 +148,9 @@ def _parameters(response: Response, axis: Axis, effect: str, fit: ResponseFit) -
         size = abs(fit.feedthrough) / response.largest
         spread = Z_95 * fit.feedthrough_sd / response.largest
         return (ParameterEstimate("fraction_of_largest_amplitude", size, (size - spread, size + spread), "1"),)
+    if effect == DELAY:
+        late, spread = fit.delay[0], Z_95 * fit.delay[1]
+        return (ParameterEstimate("delay", late, (late - spread, late + spread), "s"),)
     value, sd = fit.laws[effect]
     if not response.in_rad or axis.mechanics is None:
         power = {"cubic-stiffness": -2, "cubic-damping": -1, "quadratic-drag": 0, "coulomb-friction": -2}[effect]

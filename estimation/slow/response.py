@@ -50,7 +50,7 @@ START_LAW = 0.1
 DERIVATIVE_STEP = 1e-5
 """Step of a numerical derivative by a parameter of a fit, which is a number near 1."""
 
-SECOND_MODE, FEEDTHROUGH = "second-mode", "feedthrough"
+SECOND_MODE, FEEDTHROUGH, DELAY = "second-mode", "feedthrough", "channel-delay"
 
 AMPLITUDE_LAWS: Mapping[str, Callable[[Array, Array], Complex]] = {
     "cubic-stiffness": lambda w, a: 0.75 * a**2 + 0j,
@@ -61,14 +61,17 @@ AMPLITUDE_LAWS: Mapping[str, Callable[[Array, Array], Complex]] = {
 """Describing function phi(w, A) of a law whose torque over J is ``c theta^3``, ``c theta^2 theta'``,
 ``c abs(theta') theta'`` or ``c sign(theta')``."""
 
-EFFECTS = (SECOND_MODE, FEEDTHROUGH, *AMPLITUDE_LAWS)
+EFFECTS = (SECOND_MODE, DELAY, FEEDTHROUGH, *AMPLITUDE_LAWS)
 """Effects that a frequency response may show. A law of amplitude is not combined with a second mode: the amplitudes of
 the modes differ from that of the angle."""
+
+READOUT_SUBSETS = ((), (DELAY,), (FEEDTHROUGH,), (DELAY, FEEDTHROUGH))
+"""Combinations of effects of the readout."""
 
 SUBSETS = tuple(
     (*of_motion, *readout)
     for of_motion in ((), (SECOND_MODE,), *combinations(AMPLITUDE_LAWS, 1), *combinations(AMPLITUDE_LAWS, 2))
-    for readout in ((), (FEEDTHROUGH,))
+    for readout in READOUT_SUBSETS
 )
 """Combinations of effects that are compared."""
 
@@ -113,6 +116,7 @@ class ResponseFit:
         feedthrough: a constant of the response, 0 where it is not fitted.
         feedthrough_sd: standard deviation of its magnitude.
         laws: by effect its coefficient c with its standard deviation, for amplitudes relative to the largest.
+        delay: of the response, with its standard deviation [s]; 0 where it is not fitted.
         mode_sd: standard deviations of ``modes``.
         score: N ln(misfit) + (parameters) ln N + 2 ln(number of subsets of that size).
         predicted: the response at all tones, shape (n,).
@@ -124,13 +128,16 @@ class ResponseFit:
     feedthrough: complex
     feedthrough_sd: float
     laws: Mapping[str, tuple[float, float]]
+    delay: tuple[float, float]
     mode_sd: Array
     score: float
     predicted: Complex
 
 
 class _Model(NamedTuple):
-    """Response by its nonlinear parameters: shift in widths of the peak and ln Q of every fitted mode, then the laws.
+    """Response by its nonlinear parameters: shift in widths of the peak and ln Q of fitted modes, the laws, the delay.
+
+    The parameter of the delay is its phase over the width of the peak: that of one tone belongs to the residues.
 
     Attributes:
         response: of one axis, or the first of several.
@@ -173,6 +180,11 @@ class _Model(NamedTuple):
         unit = self.width * (2.0 * np.pi * self.center) ** 2
         return [float(unit / np.abs(AMPLITUDE_LAWS[law](w, size)).max()) for law in self.laws]
 
+    @property
+    def delay_scale(self) -> float:
+        """Delay [s] over its parameter."""
+        return 1.0 / (2.0 * np.pi * self.width * self.center)
+
     def mode_values(self, x: Array) -> Array:
         """Frequency [Hz] and quality factor of every mode, shape (modes, 2)."""
         pairs = x[: 2 * self.fitted_modes].reshape(-1, 2)
@@ -183,7 +195,8 @@ class _Model(NamedTuple):
         """Response of modes and feedthrough of height 1 at all tones, shape (n, modes) or one column more."""
         w = 2.0 * np.pi * self.response.frequency
         added = np.zeros(w.size, complex)
-        for value, shape in zip(x[2 * self.fitted_modes :], self.shapes(), strict=True):
+        first = 2 * self.fitted_modes
+        for value, shape in zip(x[first : first + len(self.laws)], self.shapes(), strict=True):
             added += value * self.width * (2.0 * np.pi * self.center) ** 2 * shape
         columns = []
         for f0, quality in self.mode_values(x):
@@ -191,7 +204,8 @@ class _Model(NamedTuple):
             columns.append(w0**2 / quality / (w0**2 - w**2 + 1j * w0 * w / quality + added))
         if FEEDTHROUGH in self.effects:
             columns.append(np.ones(w.size, complex))
-        return np.array(columns).T
+        late = np.exp(-1j * w * self.delay_scale * x[-1]) if DELAY in self.effects else 1.0
+        return np.array(columns).T * np.reshape(late, (-1, 1))
 
     def solve(self, x: Array) -> tuple[Complex, Complex]:
         """Heights of the modes and the feedthrough, by linear least squares, and the response at all tones.
@@ -270,8 +284,10 @@ def _fit(
     mode_sd = np.zeros_like(modes)
     mode_sd[model.modes - model.fitted_modes :] = sd[:count].reshape(-1, 2)
     mode_sd *= np.column_stack([np.full(model.modes, center * width), modes[:, 1]])
-    coefficients = zip(model.laws, x[count:], sd[count:], model.law_scales(), strict=True)
+    end = count + len(model.laws)
+    coefficients = zip(model.laws, x[count:end], sd[count:end], model.law_scales(), strict=True)
     laws = {law: (float(value * scale), float(spread * scale)) for law, value, spread, scale in coefficients}
+    delay = (model.delay_scale * float(x[-1]), model.delay_scale * float(sd[-1])) if DELAY in effects else (0.0, 0.0)
     price = 2.0 * float(np.log(comb(len(EFFECTS), len(effects)))) + free * float(np.log(n * squares.size))
     score = n * float(np.sum(np.log(squares / n + MODEL_ERROR**2))) + price
     fits = []
@@ -282,11 +298,8 @@ def _fit(
             feedthrough, feedthrough_sd = complex(heights[-1, i]), float(height_sd[-1, i])
         residues = heights[: model.modes, i] * (2.0 * np.pi * modes[:, 0]) ** 2 / modes[:, 1]
         sd_of_modes, at_tones = mode_sd[order], predicted[:, i]
-        fits.append(
-            ResponseFit(
-                effects, modes[order], residues[order], feedthrough, feedthrough_sd, laws, sd_of_modes, score, at_tones
-            )
-        )
+        of_readout = feedthrough, feedthrough_sd, laws, delay
+        fits.append(ResponseFit(effects, modes[order], residues[order], *of_readout, sd_of_modes, score, at_tones))
     return score, fits
 
 
@@ -295,21 +308,25 @@ def _minimise(model: _Model) -> tuple[Array, Array]:
     from scipy.optimize import least_squares
 
     log_quality, count = float(np.log(0.5 / model.width)), model.fitted_modes
-    if not count + len(model.laws):
+    delays = int(DELAY in model.effects)
+    if not count + len(model.laws) + delays:
         return np.empty(0), np.empty((1, 0))
     signed = [law == "cubic-stiffness" for law in model.laws]
     begins = [
         np.array(
             [*np.ravel([(0.0, log_quality), (shift, log_quality)][model.modes - count : model.modes])]
             + [START_LAW * (sign if each else 1) for each in signed]
+            + [0.0] * delays
         )
         for shift in (SECOND_MODE_SHIFTS if model.modes == 2 else (0.0,))
         for sign in ((-1, 1) if any(signed) else (1,))
     ]
     most = 0.5 / model.width
-    low = np.array([*([-most, 0.0] * count), *(-most if each else 0.0 for each in signed)])
-    high = np.array([*([most, np.log(MAX_QUALITY)] * count), *([most] * len(signed))])
-    scale = np.array([*([1.0, 1.0] * count), *([START_LAW] * len(signed))])
+    spacing = float(np.median(np.diff(np.unique(model.response.frequency))))
+    latest = np.pi * model.width * model.center / spacing  # half a turn from tone to tone
+    low = np.array([*([-most, 0.0] * count), *(-most if each else 0.0 for each in signed), *([0.0] * delays)])
+    high = np.array([*([most, np.log(MAX_QUALITY)] * count), *([most] * len(signed)), *([latest] * delays)])
+    scale = np.array([*([1.0, 1.0] * count), *([START_LAW] * (len(signed) + delays))])
     fits = [
         least_squares(model.residual, np.clip(begin, low, high), bounds=(low, high), x_scale=scale) for begin in begins
     ]

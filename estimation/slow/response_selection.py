@@ -8,8 +8,8 @@ import numpy as np
 
 from estimation.device_fit.open_loop import OpenLoop, is_worse
 from estimation.slow.response import (
-    FEEDTHROUGH,
     MIN_SCORE_GAIN,
+    READOUT_SUBSETS,
     SECOND_MODE,
     SUBSETS,
     Response,
@@ -55,7 +55,7 @@ def with_common_modes(responses: Sequence[Response], selected: list[ResponseFit]
     same = all(np.array_equal(response.frequency, responses[0].frequency) for response in responses)
     if len(responses) < 2 or not same or not any(SECOND_MODE in fit.effects for fit in selected):
         return selected
-    variants = [fit_common_modes(responses, (SECOND_MODE, *more)) for more in ((), (FEEDTHROUGH,))]
+    variants = [fit_common_modes(responses, (SECOND_MODE, *more)) for more in READOUT_SUBSETS]
     score, fits = min(variants, key=lambda variant: variant[0])
     return fits if score < sum(fit.score for fit in selected) + MIN_SCORE_GAIN else selected
 

@@ -60,6 +60,18 @@ def test_a_linear_response_is_consistent_and_corrects_resonance_and_damping() ->
     assert loop["improved"]["fraction"] < 0.1 * loop["nominal"]["fraction"]
 
 
+@pytest.mark.parametrize("delay", [2e-3, 0.02])
+def test_a_delay_of_the_readout_is_named_and_measured(delay: float) -> None:
+    late = np.exp(-2j * np.pi * FREQUENCY * delay)
+    found = diagnose_with_optics([recording(mode(F0, Q, 0.1) * late)])
+    (finding,) = found.findings
+    (parameter,) = finding.parameters
+    assert (finding.effect, finding.stage, parameter.name, parameter.unit) == ("channel-delay", "timing", "delay", "s")
+    assert finding.probability > 0.9
+    assert parameter.ci95[0] < delay < parameter.ci95[1]
+    assert found.device.axes["x"].resonance == pytest.approx(F0, abs=0.01)
+
+
 def test_a_phase_of_the_wrong_sign_is_refused() -> None:
     """It gave a resonance at 1200 Hz, and feedthrough with cubic damping."""
     made = recording(mode(F0, Q, 0.1).conj())
