@@ -43,6 +43,16 @@ or more often, and no drop-outs, of four differences each, of up to 1 in 40 samp
 NORMAL_QUANTILE = 1.6449
 """``SCALE_QUANTILE`` of the absolute values of a normal distribution, in standard deviations."""
 
+MIN_RELATIVE_STEP = 2.0**-22
+"""Smallest change between samples that counts as a step, in units of the largest sample: numbers of 32 bits are rounded
+to a quarter of it, and no converter resolves it."""
+
+ROUNDING_DISTANCE_STEPS = 4.0 / 3.0
+"""Largest distance from the cubic that rounding to steps causes: half a step times the sum of the absolute weights."""
+
+ROUNDING_BEND_STEPS = 2.0
+"""The same of the second difference."""
+
 MAX_VALUE = 1e100
 """Largest sample that is compared with others: no sensor gives larger ones, and their differences remain finite."""
 
@@ -87,6 +97,7 @@ def find_dropouts(channel: Channel) -> list[tuple[int, int]]:
     typical = (np.abs(_second_differences(values))[::step] for _, values in _overlapping(channel))
     known = np.concatenate([np.zeros(0), *(each[np.isfinite(each)] for each in typical)])
     limit = MIN_SPIKE_SDS / NORMAL_QUANTILE * float(np.quantile(known, SCALE_QUANTILE)) if known.size else 0.0
+    limit = max(limit, ROUNDING_BEND_STEPS * _step(channel)) if limit > 0.0 else 0.0
     runs = list[tuple[int, int]]()
     for begin, values in _overlapping(channel) if limit > 0.0 else ():
         _add_dropouts(runs, begin, values, limit)
@@ -107,6 +118,19 @@ def _overlapping(channel: Channel) -> Iterator[tuple[int, Array]]:
 def _second_differences(values: Array) -> Array:
     """Of each sample and the two after it, shape (n - 2,)."""
     return np.asarray(values[:-2] - 2.0 * values[1:-1] + values[2:])
+
+
+def _step(channel: Channel) -> float:
+    """Smallest change from one sample to the next that is none of rounding, in the channel's unit.
+
+    It bounds the step of a converter or of a text from above. A ramp without noise repeats its rounding, or has none
+    except at its corners, so that its distances from the cubic state no scale.
+    """
+    largest = max(float(np.abs(values[np.isfinite(values)]).max(initial=0.0)) for _, values in _overlapping(channel))
+    finest = MIN_RELATIVE_STEP * largest
+    changes = (np.abs(np.diff(values)) for _, values in _overlapping(channel))
+    step = min(float(each[each > finest].min(initial=np.inf)) for each in changes)
+    return step if np.isfinite(step) else finest
 
 
 def _add_dropouts(runs: list[tuple[int, int]], begin: int, values: Array, limit: float) -> None:
@@ -150,10 +174,11 @@ def _find_far(channel: Channel, rails: Sequence[float]) -> Spikes:
         typical.append(distance[np.isfinite(distance)])
     noise = np.concatenate(typical)
     limit = MIN_SPIKE_SDS * robust_sd(noise) if noise.size else 0.0
+    least = max(limit, ROUNDING_DISTANCE_STEPS * _step(channel)) if limit > 0.0 else 0.0
     index, repaired = [np.zeros(0, np.int64)], [np.zeros(0)]
     for first, values in _pieces(channel) if limit > 0.0 else ():
         distance = _distance(values)
-        far = 2 * REACH + np.flatnonzero((distance[inner] > limit) | (distance[inner] < -limit))
+        far = 2 * REACH + np.flatnonzero(np.abs(distance[inner]) > least)
         fits = {
             each: np.abs(distance[far + each] + weight * distance[far]) <= limit for each, weight in NEIGHBOURS.items()
         }

@@ -175,3 +175,20 @@ def test_the_sensor_is_as_accurate_as_it_states_in_spite_of_dropouts() -> None:
     assert axis.amplitude == pytest.approx(1.0, abs=1e-3)
     assert "runs of 3 samples far from the samples around, the first at" in motion.notes[0]
     assert "missing samples" in motion.notes[1]
+
+
+@pytest.mark.parametrize("dtype", ["f8", "f4"])
+@pytest.mark.parametrize("frame_hz", [25.0, 37.3, 1000.0])
+@pytest.mark.parametrize("turn", [0.5, 0.9])
+def test_rounding_of_a_ramp_is_neither_spike_nor_dropout(dtype: str, frame_hz: float, turn: float) -> None:
+    cycle = np.arange(80_000) / RATE_HZ * frame_hz % 1.0
+    ramp = np.where(cycle < turn, 2.0 * cycle / turn - 1.0, 1.0 - 2.0 * (cycle - turn) / (1.0 - turn))
+    signal = channel((1.65 + ramp).astype(dtype) if dtype == "f4" else ramp)
+    assert find_spikes(signal).at.size == 0
+    assert find_dropouts(signal) == []
+
+
+def test_a_spike_of_a_ramp_without_noise_is_found() -> None:
+    ramp = 2.0 * (np.arange(80_000) / RATE_HZ * 25.0 % 1.0) - 1.0
+    ramp[[1_234, 50_000]] += 0.1
+    np.testing.assert_array_equal(find_spikes(channel(ramp)).at, [1_234, 50_000])
