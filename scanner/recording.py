@@ -194,6 +194,11 @@ class Recording:
     def __getitem__(self, name: str) -> Channel:
         return self.require(name)
 
+    @property
+    def names(self) -> list[str]:
+        """Names of all channels, those of edge times last."""
+        return [*self.channels, *self.edges]
+
     def require(self, name: str, why: str | None = None) -> Channel:
         """Return a channel.
 
@@ -206,7 +211,7 @@ class Recording:
         """
         if name not in self.channels:
             what = "is not in the recording" + (f" and {why}" if why else "")
-            hint = f"it holds {list_names(self.channels)}"
+            hint = f"it holds {list_names(self.names)}"
             raise ChannelMissing(what, file=self.path, channel=name, hint=hint)
         return self.channels[name]
 

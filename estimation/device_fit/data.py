@@ -135,7 +135,7 @@ def prepare_run(recording: Recording, device: Device, oversample: int = 1, to_la
     """
     channels = output_channels(recording, device)
     if not channels:
-        holds = ", ".join(recording.channels)
+        holds = ", ".join(recording.names)
         kinds = ", ".join(("sense", *REFERENCE_ORDERS))
         hint = f"record one of {kinds}, or add the readout to the device; it holds {holds}"
         raise BadInput("holds no channel that the device can simulate", file=recording.path, hint=hint)

@@ -274,7 +274,7 @@ def find_position_signal(recording: Recording, axis: Axis, name: str) -> tuple[C
         else f"is not in the recording and {sense} is no position readout",
         file=recording.path,
         channel=f"angle_{name}",
-        hint=f"{advice}; it holds {list_names(recording.channels)}",
+        hint=f"{advice}; it holds {list_names(recording.names)}",
     )
 
 

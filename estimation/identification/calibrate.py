@@ -85,7 +85,7 @@ def identify(recordings: Sequence[Recording], device: Device) -> Identification:
         )
     if not values:
         what = "no recording shows a rest, a free decay, steady tones or a driven motion with a reference angle"
-        names = ", ".join(sorted({name for recording in recordings for name in recording.channels}))
+        names = ", ".join(sorted({name for recording in recordings for name in recording.names}))
         hint = f"record angle_x together with sense_x; the recording contains {names or 'nothing'}"
         if notes:
             what, hint = "the recordings determine no constant", "; ".join(notes)

@@ -334,3 +334,11 @@ def test_a_part_of_a_recording_keeps_the_origin_of_the_whole() -> None:
     assert recording.part(0.45, 0.5).slice(0.46, 0.47).origin == pytest.approx(0.46)  # a recording by itself
     without = recording.without_channel("intensity")
     assert (without.start, without.origin) == (0.5, 0.4)
+
+
+def test_a_missing_channel_is_reported_beside_the_edges_that_are_there() -> None:
+    recording = Recording.from_arrays(
+        {"intensity": (np.ones(10), "V", 1e3), "sync_x": (np.arange(3.0) / 1e3, "s", {"event": "both-edges"})}
+    )
+    with pytest.raises(BadInput, match=r"it holds intensity, sync_x$"):
+        recording.require("drive_x")
