@@ -24,14 +24,25 @@ _MIN_CHECKED_BYTES = 1 << 26
 """Sizes below 64 MB are not checked: even if they are wrong, any computer can allocate them."""
 
 
+def check_parent(path: Path) -> None:
+    """Check that the folder of an output exists.
+
+    Raises:
+        BadInput: it does not exist, or is a file.
+    """
+    if path.parent.is_file():
+        raise BadInput(f"{path.parent} is a file where a folder should be", file=path, hint="name another with -o")
+    if not path.parent.is_dir():
+        raise BadInput("the folder to write into does not exist", file=path, hint=f"create {path.parent}")
+
+
 def check_place(path: Path) -> None:
     """Check that an output file can be written, before the work whose result it will hold.
 
     Raises:
-        BadInput: the folder of ``path`` does not exist or may not be written into, or ``path`` is a folder.
+        BadInput: the folder of ``path`` does not exist, is a file or may not be written into, or ``path`` is a folder.
     """
-    if not path.parent.is_dir():
-        raise BadInput("the folder to write into does not exist", file=path, hint=f"create {path.parent}")
+    check_parent(path)
     if path.is_dir():
         raise BadInput("is a folder, not a file", file=path, hint="name a file")
     check_writable(path.parent)

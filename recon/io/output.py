@@ -22,7 +22,7 @@ from recon.imaging.sample_motion.rigid_motion import SampleMotion
 from recon.io.tiff_size import needs_bigtiff
 from scanner.channel import Channel
 from scanner.errors import BadInput
-from scanner.files import HAS_REPLACED, IS_REPLACING, check_no_input, check_writable
+from scanner.files import HAS_REPLACED, IS_REPLACING, check_no_input, check_parent, check_writable
 from scanner.hdf5 import new_hdf5
 from scanner.motion import Motion
 
@@ -38,8 +38,7 @@ def check_folder(folder: Path) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise BadInput("is a file where a folder should be", file=folder, hint="name another with -o")
-    if not folder.parent.is_dir():
-        raise BadInput("the folder to write into does not exist", file=folder.parent, hint="create it")
+    check_parent(folder)
     check_writable(folder if folder.exists() else folder.parent)
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ from recon.cli import main
 from recon.imaging.frame_axis import FrameAxis
 from recon.imaging.gridding import map_samples
 from recon.imaging.picture import Grid, Picture
-from recon.io.output import replacing_folder, write_frames, write_tiff
+from recon.io.output import check_folder, replacing_folder, write_frames, write_tiff
 from recon.io.tiff_size import needs_bigtiff
 from recon.pipeline import reconstruct
 from recon.sequences.frames import write_scan_frames
@@ -22,6 +23,7 @@ from recon.steps.reconstruction import Options, Reconstruction
 from scanner import devices
 from scanner.device import Device
 from scanner.errors import BadInput, line_of
+from scanner.files import check_place
 from tests.support.simulated import imaging
 
 GRID = Grid(80, 60, 0.18, 0.15)
@@ -197,3 +199,10 @@ def test_files_of_other_options_do_not_stay_beside_new_ones(tmp_path: Path) -> N
         (folder / "image.tif").write_text("new", encoding="utf-8")
     left = {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()}
     assert left == {"image.tif": "new", "notes.txt": "old"}
+
+
+@pytest.mark.parametrize("check", [check_folder, check_place])
+def test_an_output_below_a_file_is_refused_as_such(check: Callable[[Path], None], tmp_path: Path) -> None:
+    (tmp_path / "scan.h5").touch()
+    with pytest.raises(BadInput, match=r"scan\.h5 is a file where a folder should be; name another with -o$"):
+        check(tmp_path / "scan.h5" / "out")
