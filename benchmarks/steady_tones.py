@@ -22,7 +22,15 @@ RESONANCE_HZ, QUALITY, TONES = 800.0, 300.0, 41
 RATE = 2 * np.pi * RESONANCE_HZ
 AXIS = Axis(Mechanics(1.0, RATE / QUALITY, RATE**2), readout=Position(10.0, 1e-4), name="x")
 DEVICE = Device("lever", {"x": AXIS})
-KINDS = ("consistent", "second-mode", "feedthrough", "cubic-stiffness", "cubic-damping", "quadratic-drag")
+KINDS = (
+    "consistent",
+    "second-mode",
+    "feedthrough",
+    "channel-delay",
+    "cubic-stiffness",
+    "cubic-damping",
+    "quadratic-drag",
+)
 
 
 def response(kind: str, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -53,6 +61,8 @@ def response(kind: str, rng: np.random.Generator) -> tuple[Array, Array]:
         z = z + residue * width / (1 - (w / w2) ** 2 + 1j * w / w2 / quality)
     if kind == "feedthrough":
         z = z + rng.uniform(0.03, 0.15) * np.exp(2j * np.pi * rng.uniform())
+    if kind == "channel-delay":
+        z = z * np.exp(-1j * w * rng.uniform(1e-3, 10e-3))
     noise = 10 ** rng.uniform(-3.3, -2.3)
     z = z * (1 + 1e-3 * np.sin(frequency * rng.uniform(0.3, 1.0) + rng.uniform(0, 6.3)))
     z = z + noise * (rng.normal(size=TONES) + 1j * rng.normal(size=TONES))
