@@ -276,26 +276,33 @@ def _with_fitted_rivals(
     """Rivals of a law, and laws that were fitted in its place, with the smaller gap.
 
     The linear model around one law may be wrong by more than two laws differ: a law whose fit under the same noise is
-    as good is as probable.
+    as good is as probable. Laws that were compared under different noise are so by a law that both were compared with.
 
     Args:
         key: of the law.
-        compared: fits that were compared with each other.
+        compared: fits that were compared with each other, the last group under the noise of ``fit``.
     """
-    laws = {candidate.key for candidate in fit.model.candidates}
+    laws = _keys(fit)
+    gaps = {laws: (0.0, 0.0)}
+    for fits in reversed(compared):
+        scores = {_keys(one): np.array([one.neg2_log_evidence, misfit(one)]) for one in fits.values()}
+        common = next((each for each in gaps if each in scores), None)
+        if common is not None:
+            gaps |= {k: tuple(gaps[common] + scores[k] - scores[common]) for k in scores if k not in gaps}
+    candidates = {c.key: c for fits in compared for one in fits.values() for c in one.model.candidates}
     best = {rival.candidate.key: rival for rival in rivals}
-    for fits in compared:
-        own = next((one for one in fits.values() if {c.key for c in one.model.candidates} == laws), None)
-        if own is None:
+    for others, (gap, misfit_gap) in gaps.items():
+        new = others - laws
+        if len(new) != 1 or others - new != laws - {key}:
             continue
-        for other in fits.values():
-            new = [candidate for candidate in other.model.candidates if candidate.key not in laws]
-            if len(new) != 1 or {c.key for c in other.model.candidates} - {new[0].key} != laws - {key}:
-                continue
-            gap = max(other.neg2_log_evidence - own.neg2_log_evidence, 0.0)
-            if new[0].key not in best or gap < best[new[0].key].evidence_gap:
-                best[new[0].key] = RivalFit(gap, new[0], misfit(other) - misfit(own))
+        (name,) = new
+        if name not in best or gap < best[name].evidence_gap:
+            best[name] = RivalFit(max(float(gap), 0.0), candidates[name], float(misfit_gap))
     return tuple(sorted(best.values(), key=lambda rival: rival.evidence_gap))
+
+
+def _keys(fit: Fit) -> frozenset[str]:
+    return frozenset(candidate.key for candidate in fit.model.candidates)
 
 
 def _exchange_near_rival(
@@ -306,8 +313,8 @@ def _exchange_near_rival(
     Sensitivities of a law far from its own fit may be wrong by more than near rivals differ: those within
     ``DETECTION_THRESHOLD`` are fitted, each once, the best in the place of every law first, and compared around their
     own fits, unless a rival leaves so much more that the linear model, which predicts the same for it, is wrong. Where
-    the laws take the bulk of a misfit and leave more than noise, so are the confounders that their terms state; laws
-    that take a part of what no law describes have none. Where corrections gain no more than that beside the laws, they
+    the laws take the bulk of a misfit, so are the confounders that their terms state; laws that take a part of what no
+    law describes have none. Where corrections gain no more than that beside the laws, they
     have no part in the comparison: beside a fit that leaves only noise, one that leaves more to corrections is not a
     better one.
 
@@ -318,7 +325,7 @@ def _exchange_near_rival(
     present = centre.alone if centre.leaves_noise else centre.beside
     best, lowest = None, present.neg2_log_evidence - MIN_EXCHANGE_GAIN
     near = near_rivals(centre.linear, centre.beside, fitted)
-    if not centre.leaves_noise and centre.takes_bulk(nominal):
+    if centre.leaves_noise or centre.takes_bulk(nominal):
         near |= stated_confounders(centre.linear, centre.laws, fitted.keys() | near.keys())
     rivals = _fit_sets(centre, near, fitted, MAX_CHI2_GROWTH)
     fitted |= rivals
