@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,6 +19,7 @@ from estimation.slow.selection import Decays, compress, fit_law, held_out, predi
 from phantoms.forward import InitialState, Plan, simulate
 from phantoms.waveforms import Constant
 from recon.cli import main
+from scanner.arrays import Array
 from scanner.channel import DBM_LEVEL_V
 from scanner.device import Axis, Device
 from scanner.errors import BadInput, UnitUnknown
@@ -210,9 +212,8 @@ def test_lock_in_channels_are_a_sensor(reference: float | str) -> None:
     assert axis.sign == "known: phase_x"
 
 
-@pytest.mark.parametrize("channel", ["amplitude_x", "phase_x", "frequency"])
-def test_a_missing_value_of_a_lock_in_amplifier_affects_the_samples_beside_it_only(channel: str) -> None:
-    """A phase or a frequency of NaN made every later sample NaN; the estimator then ended with "diverges"."""
+def decaying_lock_in_channels() -> tuple[Array, Array, dict[str, tuple[Any, ...]]]:
+    """Times [s] of the lock-in amplifier and of the intensity, and channels of a motion that decays and is swept."""
     slow, time = np.arange(0.0, 0.2, 1e-3), np.arange(20_000) / 1e5
     extra = {"reference": "frequency"}
     channels = {
@@ -221,6 +222,13 @@ def test_a_missing_value_of_a_lock_in_amplifier_affects_the_samples_beside_it_on
         "phase_x": (np.angle(np.exp(1j * 20.0 * slow)), "rad", 1e3, 0.0, extra),
         "frequency": (700.0 + 50.0 * slow, "Hz", 1e3),
     }
+    return slow, time, channels
+
+
+@pytest.mark.parametrize("channel", ["amplitude_x", "phase_x", "frequency"])
+def test_a_missing_value_of_a_lock_in_amplifier_affects_the_samples_beside_it_only(channel: str) -> None:
+    """A phase or a frequency of NaN made every later sample NaN; the estimator then ended with "diverges"."""
+    slow, time, channels = decaying_lock_in_channels()
     channels[channel] = (np.where(slow == slow[5], np.nan, channels[channel][0]), *channels[channel][1:])
     recording = Recording.from_arrays(channels, Device.from_toml("[x]\n"))
     motion = estimate(recording)
@@ -237,14 +245,7 @@ def test_a_missing_value_of_a_lock_in_amplifier_affects_the_samples_beside_it_on
 @pytest.mark.parametrize("channel", ["amplitude_x", "phase_x", "frequency"])
 def test_lock_in_channels_of_differing_length_are_used_in_their_common_time(channel: str) -> None:
     """The last phase was held after its end: angles there were wrong by up to the amplitude, without a line."""
-    slow, time = np.arange(0.0, 0.2, 1e-3), np.arange(20_000) / 1e5
-    extra = {"reference": "frequency"}
-    channels = {
-        "intensity": (time, "V", 1e5),
-        "amplitude_x": (0.1 - 0.1 * slow, "rad", 1e3, 0.0, extra),
-        "phase_x": (np.angle(np.exp(1j * 20.0 * slow)), "rad", 1e3, 0.0, extra),
-        "frequency": (700.0 + 50.0 * slow, "Hz", 1e3),
-    }
+    slow, _, channels = decaying_lock_in_channels()
     channels[channel] = (channels[channel][0][50:150], *channels[channel][1:3], slow[50], *channels[channel][4:])
     recording = Recording.from_arrays(channels, Device.from_toml("[x]\n"))
     motion = estimate(recording)

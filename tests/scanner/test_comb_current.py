@@ -11,39 +11,31 @@ from scanner.stages import Capacitance, Drive, Mechanics, Transimpedance
 from scanner.terms import SignalContext, catalogue
 
 BIAS_V = 5.0
+RATE = 2 * np.pi * 3000.0
+AXIS = Axis(
+    Mechanics(1e-14, 1e-14 * RATE / 300.0, 1e-14 * RATE**2),
+    Capacitance(2e-12, 1e-11, 0.2, 0.0),
+    Drive("electrostatic"),
+    Transimpedance(2e7, BIAS_V, noise_sd=1e-3),
+    name="x",
+)
 
 
 @pytest.mark.parametrize(("is_bias", "ratio"), [(False, 1.0), (True, 2.0)])
 def test_the_bias_of_the_current_is_the_stated_one_unless_it_was_recorded(is_bias: bool, ratio: float) -> None:
-    rate = 2 * np.pi * 3000.0
-    axis = Axis(
-        Mechanics(1e-14, 1e-14 * rate / 300.0, 1e-14 * rate**2),
-        Capacitance(2e-12, 1e-11, 0.2, 0.0),
-        Drive("electrostatic"),
-        Transimpedance(2e7, BIAS_V, noise_sd=1e-3),
-        name="x",
-    )
     recorded = DriveInput(np.full((400, 3), 2.0 * BIAS_V), 5e-6, is_bias=is_bias)
-    motion = simulate_axis(axis, (), recorded, (3e-3, 0.0))
-    found = sense_signal(axis.require_readout(), [motion])
+    motion = simulate_axis(AXIS, (), recorded, (3e-3, 0.0))
+    found = sense_signal(AXIS.require_readout(), [motion])
     expected = -2e7 * BIAS_V * np.gradient(capacitance(motion.angle, 2e-12, 1e-11, 0.2, 0.0), 5e-6, edge_order=2)
     assert np.std(found - ratio * expected) < 0.01 * np.std(found)
 
 
 def test_a_carrier_changes_the_torque_and_not_the_current_under_a_bias() -> None:
     """The current had the root of the mean square of bias and carrier as its bias: it was 31 % too large here."""
-    rate = 2 * np.pi * 3000.0
-    axis = Axis(
-        Mechanics(1e-14, 1e-14 * rate / 300.0, 1e-14 * rate**2),
-        Capacitance(2e-12, 1e-11, 0.2, 0.0),
-        Drive("electrostatic"),
-        Transimpedance(2e7, BIAS_V, noise_sd=1e-3),
-        name="x",
-    )
     terms = [ActiveTerm(catalogue()["carrier-torque"], (18.0,))]
     bias = DriveInput(np.full((400, 3), BIAS_V), 5e-6, is_bias=True)
-    motion, without = (simulate_axis(axis, each, bias, (0.1, 0.0)) for each in (terms, ()))
-    found = sense_signal(axis.require_readout(), [motion])
+    motion, without = (simulate_axis(AXIS, each, bias, (0.1, 0.0)) for each in (terms, ()))
+    found = sense_signal(AXIS.require_readout(), [motion])
     expected = -2e7 * BIAS_V * np.gradient(capacitance(motion.angle, 2e-12, 1e-11, 0.2, 0.0), 5e-6, edge_order=2)
     assert np.std(found - expected) < 0.01 * np.std(found)
     assert np.std(motion.angle - without.angle) > 1e-4 * np.std(motion.angle)
