@@ -276,7 +276,8 @@ def _with_fitted_rivals(
     """Rivals of a law, and laws that were fitted in its place, with the smaller gap.
 
     The linear model around one law may be wrong by more than two laws differ: a law whose fit under the same noise is
-    as good is as probable. Laws that were compared under different noise are so by a law that both were compared with.
+    as good is as probable. Two laws that were fitted under different noise are compared through a third one, which was
+    fitted under both.
 
     Args:
         key: of the law.
@@ -314,9 +315,8 @@ def _exchange_near_rival(
     ``DETECTION_THRESHOLD`` are fitted, each once, the best in the place of every law first, and compared around their
     own fits, unless a rival leaves so much more that the linear model, which predicts the same for it, is wrong. Where
     the laws take the bulk of a misfit, so are the confounders that their terms state; laws that take a part of what no
-    law describes have none. Where corrections gain no more than that beside the laws, they
-    have no part in the comparison: beside a fit that leaves only noise, one that leaves more to corrections is not a
-    better one.
+    law describes have none. Where corrections gain no more than that beside the laws, they have no part in the
+    comparison: beside a fit that leaves only noise, one that leaves more to corrections is not a better one.
 
     Returns:
         that fit, and all fits that were compared under the same noise.

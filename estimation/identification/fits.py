@@ -131,7 +131,8 @@ def check_driven_signs(name: str, ratios: Array) -> None:
     """Check that a driven motion follows its torque and loses energy.
 
     Args:
-        name: of the axis. ratios: k/J [1/s2], b/J [1/s] and 1/J [1/(kg m2)].
+        name: of the axis.
+        ratios: k/J [1/s2], b/J [1/s] and 1/J [1/(kg m2)].
 
     Raises:
         BadInput: 1/J or b/J is not above 0.
