@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recon.imaging.picture import Grid
 from recon.imaging.scan_phase.bidirectional_equations import SMOOTHING_SD_CELLS
-from recon.imaging.scan_phase.bidirectional_phase import MIN_SAMPLES_PER_CELL
+from recon.imaging.scan_phase.registration_cells import MIN_SAMPLES_PER_CELL
 from scanner.arrays import Array
 
 MIN_PART_SAMPLES = 1000

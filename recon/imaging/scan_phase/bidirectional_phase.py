@@ -32,8 +32,9 @@ from recon.imaging.scan_phase.bidirectional_search import (
     RegistrationSamples,
     search_phase_errors,
 )
-from recon.imaging.scan_phase.common_shift import common_shift_factor
+from recon.imaging.scan_phase.common_shift import clustered_sd, common_place_factor, common_shift_factor
 from recon.imaging.scan_phase.phase_error import PhaseError, PhaseErrorParts, PhaseEstimate
+from recon.imaging.scan_phase.registration_cells import finest_cell
 from recon.imaging.scan_phase.slow_gain import SlowGain, estimate_slow_gain
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -43,13 +44,6 @@ from scanner.motion import Motion
 
 PERIODS_PER_SLICE = 25
 """Periods of the slower axis in one time slice. About 15 are needed; within a longer slice the phase drifts."""
-
-MIN_SAMPLES_PER_CELL = 2.0
-"""Samples per cell below which the pattern of the scan lines biases the result."""
-
-MIN_CELLS_ACROSS = 400
-"""Cells across the field that are used, if there are samples for them, however few pixels the picture has: coarse cells
-do not resolve fine detail, which then biases the result."""
 
 PARTS_PER_SLICE = 16
 """Parts of a slice with a phase error each: 1.5 periods of the slower axis, so that each has both directions."""
@@ -72,6 +66,7 @@ class _Fit(NamedTuple):
         clear: whether the features of the picture exceed its noise, shape (slices, 2).
         unbiased: whether they exceed it so far that noise in the gradient does not bias the result, shape (slices, 1).
         parts: value and sd of each part of each slice, shape (slices, PARTS_PER_SLICE, 2, 2).
+        factor: on the standard errors, for what repeats at the same places in all slices, shape (2,).
     """
 
     value: Array
@@ -79,6 +74,7 @@ class _Fit(NamedTuple):
     clear: NDArray[np.bool_]
     unbiased: NDArray[np.bool_]
     parts: Array
+    factor: Array
 
 
 def measure_phase_errors(
@@ -214,10 +210,7 @@ def _estimate_phase_errors(
         nothing = np.full((slices, 2), np.nan), np.full((slices, 2), np.inf)
         return *nothing, _undetermined_parts(slices), None, np.ones((slices, 2))
     inside = (2.0 * np.abs(samples.x) < grid.width) & (2.0 * np.abs(samples.y) < grid.height)
-    finest = max(
-        min(1.0, grid.width / MIN_CELLS_ACROSS),
-        math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size),
-    )
+    finest = finest_cell(samples, inside, grid)
     gain = _slow_gain(samples.select(inside), grid, finest, slices)
     samples = samples._replace(intensity=samples.intensity / gain.at(_slice_time(samples)))
     unknown = np.full(2, np.nan)
@@ -237,7 +230,8 @@ def _estimate_phase_errors(
         )  # further away is another minimum
         best, limit = np.where(better, fit.value, best), np.where(better, fit.sd, limit)
         best_parts = np.where(better[:, None, :, None], fit.parts, best_parts)
-        factor = np.where(better, common_shift_factor(coarser, (fit.value, fit.sd)) if coarser else 1.0, factor)
+        common = common_shift_factor(coarser, (fit.value, fit.sd)) if coarser else 1.0
+        factor = np.where(better, np.maximum(common, fit.factor), factor)
         coarser = fit.value, fit.sd
     determined = limit < SEARCH_RESOLUTION_RAD
     return np.where(determined, best, np.nan), np.where(determined, limit, np.inf), best_parts, gain, factor
@@ -282,7 +276,7 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     to_cells = 0.5 * np.array([grid.width, grid.height]) / cell
     for _ in range(10):
         here = normal_equations(samples, error, grid, cell)
-        step = STEP_DAMPING * (np.linalg.pinv(here.information) @ here.score.sum(1)[..., None])[..., 0]
+        step = STEP_DAMPING * (np.linalg.pinv(here.information) @ here.score.sum((1, 2))[..., None])[..., 0]
         step = np.clip(step, -1 / to_cells, 1 / to_cells)  # the gradient is valid within a cell
         error = error + step
         if np.abs(step * to_cells).max() < 0.01:
@@ -291,7 +285,7 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     slope = np.empty_like(here.information)  # by differences: the information would count noise in the gradient
     for axis in range(2):
         shift = np.eye(2)[axis] / to_cells
-        ahead, behind = (normal_equations(samples, error + s, grid, cell).score.sum(1) for s in (shift, -shift))
+        ahead, behind = (normal_equations(samples, error + s, grid, cell).score.sum((1, 2)) for s in (shift, -shift))
         slope[:, :, axis] = (behind - ahead) * to_cells[axis] / 2
     slope_of, expected = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (slope, here.information))
     # Noise in the gradient makes the slope too small, and detail lost in the smoothing makes it too large. Features of
@@ -300,17 +294,19 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     determined = clear & (slope_of < 2 * expected) & (expected > 0.05 * expected.max(1, keepdims=True))
     unbiased = ((slope_of > MIN_FINE_SLOPE_RATIO * expected) | ~determined).all(axis=1, keepdims=True)
     value, sd, parts = error.copy(), np.full_like(error, np.inf), _undetermined_parts(len(error))
+    by_place = np.zeros((len(error), here.score.shape[2], 2))
     for s, axes in enumerate(determined):
         if axes.any():
-            shares = here.score[s][:, axes] @ np.linalg.pinv(slope[s][np.ix_(axes, axes)]).T
+            shares = here.score[s][..., axes] @ np.linalg.pinv(slope[s][np.ix_(axes, axes)]).T
             sd[s, axes] = [
-                np.linalg.norm(share.reshape(-1, group).sum(axis=1))
-                for share, group in zip(shares.T, np.array(groups)[axes], strict=True)
+                clustered_sd(share.reshape(-1, group, share.shape[-1]).sum(axis=1))
+                for share, group in zip(np.moveaxis(shares, -1, 0), np.array(groups)[axes], strict=True)
             ]
+            by_place[s][:, axes] = shares.sum(axis=0)
             weight = here.block_information[s][:, axes].reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
             weight = np.maximum(weight / weight.sum(0), np.finfo(float).tiny)
-            by_part = shares.reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
+            by_part = shares.sum(1).reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
             parts[s][:, axes, 0] = value[s, axes] + by_part / weight
             parts[s][:, axes, 1] = sd[s, axes] / np.sqrt(weight)
-            value[s, axes] += shares.sum(0)
-    return _Fit(value, sd, clear, unbiased, parts)
+            value[s, axes] += shares.sum((0, 1))
+    return _Fit(value, sd, clear, unbiased, parts, common_place_factor(by_place, sd))

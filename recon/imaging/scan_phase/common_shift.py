@@ -1,7 +1,8 @@
-"""A shift of the measured phase that all slices of a scan have in common, seen by comparing cells of two sizes.
+"""Errors of the measured phase that repeat: at the same places, and in all slices of a scan.
 
-Fine cells do not average out a pattern that the samples repeat from line to line, coarse ones lose detail. Both shift
-all slices alike, which the scatter of blocks of time does not show.
+Fine cells do not average out a pattern that the samples repeat from line to line, coarse ones lose detail. The scatter
+of blocks of time does not show either: the error by detail between the samples repeats at the same places, and a shift
+that all slices have in common shows where cells of two sizes are compared.
 """
 
 from __future__ import annotations
@@ -34,3 +35,33 @@ def common_shift_factor(coarse: tuple[Array, Array], fine: tuple[Array, Array]) 
         means.append((weight * value).sum(axis=0) * variances[-1])
     shift = np.maximum((means[0] - means[1]) ** 2 - np.abs(variances[0] - variances[1]), 0.0)
     return np.where(both.sum(axis=0) >= MIN_COMMON_SLICES, np.sqrt(1.0 + shift / variances[1]), 1.0)
+
+
+def clustered_sd(shares: Array) -> float:
+    """Standard error of a sum whose terms have errors in common within a block of time, or within a place.
+
+    It is the larger of those of sums over blocks and over places, each independent of the others.
+
+    Args:
+        shares: the terms by block and place, shape (blocks, places).
+
+    Source:
+        Cameron and Miller 2015, "A practitioner's guide to cluster-robust inference", section V.
+    """
+    return float(max(np.linalg.norm(shares.sum(axis=1)), np.linalg.norm(shares.sum(axis=0))))
+
+
+def common_place_factor(shares: Array, sd: Array) -> Array:
+    """Factor on the standard errors of slices that allows for errors which repeat at the same places in all of them.
+
+    Args:
+        shares: of the places in the result of each slice, shape (slices, places, axes) [rad].
+        sd: standard errors of the slices, shape (slices, axes) [rad]; inf where undetermined.
+
+    Returns:
+        Shape (axes,), at least 1.
+    """
+    weight = sd**-2.0
+    of_mean = np.linalg.norm((weight[:, None] * shares).sum(axis=0), axis=0)
+    independent = np.maximum(np.sqrt(weight.sum(axis=0)), np.finfo(float).tiny)
+    return np.asarray(np.maximum(of_mean / independent, 1.0))

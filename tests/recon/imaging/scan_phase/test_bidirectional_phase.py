@@ -25,13 +25,13 @@ def tissue():
     return immunohistochemistry() @ [0.2125, 0.7154, 0.0721] / 255
 
 
-def scan(error_x, error_y, n=300_000, scene=None, photons=100.0, seed=0, a_x=A_X, a_y=A_Y, f_y=3_270):
+def scan(error_x, error_y, n=300_000, scene=None, photons=100.0, seed=0, a_x=A_X, a_y=A_Y, f_y=3_270, f_x=13_840):
     """Assumed angles, and intensities at the true angles, which lead by the given phase errors [rad]."""
     rng = np.random.default_rng(seed)
     scene = tissue() if scene is None else scene
     t = np.arange(n) / SAMPLE_RATE_HZ
     start_x, start_y = rng.uniform(0, 2 * np.pi, 2)
-    alpha_x, alpha_y = 2 * np.pi * 13_840 * t + start_x, 2 * np.pi * f_y * t + start_y
+    alpha_x, alpha_y = 2 * np.pi * f_x * t + start_x, 2 * np.pi * f_y * t + start_y
     true = [a_y * np.sin(alpha_y + error_y) / GRID.half_angle_y, a_x * np.sin(alpha_x + error_x) / GRID.half_angle_x]
     places = [(s + 1) / 2 * size - 0.5 for s, size in zip(true, scene.shape, strict=True)]
     intensity = map_coordinates(scene, places, order=1, mode="nearest")
@@ -61,6 +61,18 @@ def test_standard_errors_equal_the_scatter_of_repeated_scans():
         pulls.append((value[0] - true) / sd[0])
     assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.4
     assert np.abs(pulls).max() < 4
+
+
+def test_standard_errors_hold_where_every_line_is_sampled_at_the_same_places():
+    """100 samples in a period of x: neighbours are 12 pixels apart in the middle of the field."""
+    pulls = []
+    for seed in range(8):
+        angles_and_intensity = scan(0.0, 0.0, n=60_000, f_x=50_000, f_y=2_750, photons=1000.0, seed=seed)
+        (found,) = measure_phase_errors(*angles_and_intensity, SAMPLE_RATE_HZ, GRID, A_X, A_Y)
+        error = found.with_common_shift()
+        pulls += [axis.value / axis.sd for axis in (error.x, error.y)]
+    assert 0.5 < np.sqrt(np.nanmean(np.square(pulls))) < 1.4
+    assert np.nanmax(np.abs(pulls)) < 3.0
 
 
 @pytest.mark.parametrize("f_y", [13_800, 6_940, 4_620])
