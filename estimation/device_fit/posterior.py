@@ -67,11 +67,13 @@ class PredictionPhaseError:
         time: of the run [s], shape (n,).
         before: phase of the nominal device's motion, as fitted, against that of the improved device [rad].
         after: half the 95 % band of the improved device's phase [rad].
+        amplitude: of the improved device's motion [rad].
     """
 
     time: Array
     before: Array
     after: Array
+    amplitude: Array
 
 
 def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int) -> PredictionPhaseError | None:
@@ -93,7 +95,8 @@ def phase_error(nominal: Fit, final: Fit, axis: str, run_index: int) -> Predicti
     spread = [mean_phase(phasor(final, x) * reference) for x in draw_parameters(final, POSTERIOR_DRAWS // 2)]
     before = mean_phase(phasor(nominal, nominal.x) * reference)
     time = run.inputs[axis].time[at[:-1]].reshape(PHASE_POINTS, SAMPLES_PER_PHASE).mean(axis=1)
-    return PredictionPhaseError(time, before, Z_95 * np.sqrt(np.mean(np.square(spread), axis=0)))
+    amplitude = np.abs(reference[:-1]).reshape(PHASE_POINTS, SAMPLES_PER_PHASE).mean(axis=1)
+    return PredictionPhaseError(time, before, Z_95 * np.sqrt(np.mean(np.square(spread), axis=0)), amplitude)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from recon.report.numbers import format_value
 from recon.report.page import Figure, Section, Table
 from scanner.arrays import Array
 from scanner.device import Device
+from scanner.motion import in_proportion_to_amplitude, rms_phase
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,9 +49,14 @@ class PhaseErrorScale:
     explanation: str
     sentence: str
 
-    def rms(self, phase: Array) -> float:
-        """Root mean square of a phase error [rad] in the stated unit."""
-        return self.factor * float(np.sqrt(np.mean(phase**2)))
+    def rms(self, phase: Array, amplitude: Array) -> float:
+        """Return the root mean square of a phase error, weighted with the squared amplitude, in the stated unit.
+
+        Args:
+            phase: errors, shape (n,) [rad].
+            amplitude: of the motion, shape (n,) [rad].
+        """
+        return self.factor * rms_phase(phase, amplitude)
 
 
 PICTURE_SCALE = PhaseErrorScale(
@@ -81,11 +87,12 @@ def scale_for(device: Device) -> PhaseErrorScale:
 
 
 def describe_largest_error(errors: Mapping[str, PredictionPhaseError], scale: PhaseErrorScale) -> str:
-    """A sentence on the largest phase error of the nominal device; empty where it lies within its uncertainty."""
-    largest = max(errors.values(), key=lambda error: scale.rms(error.before), default=None)
-    if largest is None or scale.rms(largest.before) <= scale.rms(largest.after):
+    """A sentence on the largest phase error of the nominal device that exceeds its uncertainty; empty without one."""
+    sizes = [(scale.rms(e.before, e.amplitude), scale.rms(e.after, e.amplitude)) for e in errors.values()]
+    exceeding = [before for before, after in sizes if before > after]
+    if not exceeding:
         return ""
-    return f"Predicted from the drive alone, {scale.sentence.format(format_value(scale.rms(largest.before), 2))}."
+    return f"Predicted from the drive alone, {scale.sentence.format(format_value(max(exceeding), 2))}."
 
 
 def prediction_phase_section(errors: Mapping[str, PredictionPhaseError], scale: PhaseErrorScale) -> Section:
@@ -94,11 +101,14 @@ def prediction_phase_section(errors: Mapping[str, PredictionPhaseError], scale: 
     if not errors:
         return Section(heading, "The axis is driven far below its resonance and follows its drive: no phase to lose.")
     text = (
-        f"{scale.explanation} First the motion that the nominal device with fitted values predicts from the drive "
-        "alone, against that of the device with the findings; then the 95 % limit of the uncertainty of this device's "
-        "phase."
+        f"{scale.explanation} Errors count in proportion to the amplitude: where the mirror nearly rests, they "
+        "displace nothing. First the motion that the nominal device with fitted values predicts from the drive alone, "
+        "against that of the device with the findings; then the 95 % limit of the uncertainty of this device's phase."
     )
-    rows = [[name, f"{scale.rms(e.before):.2g}", f"{scale.rms(e.after):.1g}"] for name, e in errors.items()]
+    rows = [
+        [name, *(format_value(scale.rms(phase, e.amplitude), 2) for phase in (e.before, e.after))]
+        for name, e in errors.items()
+    ]
     table = Table([f"rms {scale.quantity} ({scale.unit})", *(label for _, label in PAIR)], rows)
     figures = [phase_error_figure(error, f"{name}: {scale.quantity}", scale) for name, error in errors.items()]
     return Section(heading, text, table, figures, least="24rem")
@@ -112,8 +122,8 @@ def phase_error_figure(error: PredictionPhaseError, caption: str, scale: PhaseEr
             (error.before, BEFORE, PAIR[0][1]),
             (error.after, AFTER, f"{PAIR[1][1]}, 95 % limit"),
         ):
-            value = np.maximum(scale.factor * np.abs(phase), MIN_DRAWN)
-            axes.plot(1e3 * error.time, value, color=colour, label=label)
+            value = scale.factor * np.abs(in_proportion_to_amplitude(phase, error.amplitude))
+            axes.plot(1e3 * error.time, np.maximum(value, MIN_DRAWN), color=colour, label=label)
         if scale.tolerated is not None:
             label = f"tolerated, {scale.tolerated:g} {scale.unit}"
             axes.axhline(scale.tolerated, color="#444", lw=0.8, ls="--", label=label)

@@ -22,7 +22,7 @@ from scanner import devices
 
 def constant_error(before: float, after: float) -> PredictionPhaseError:
     """Phase errors [rad] that are the same at all times."""
-    return PredictionPhaseError(np.linspace(0.0, 1e-3, 5), np.full(5, before), np.full(5, after))
+    return PredictionPhaseError(np.linspace(0.0, 1e-3, 5), np.full(5, before), np.full(5, after), np.ones(5))
 
 
 def test_a_device_with_a_field_of_view_has_its_errors_in_pixels() -> None:
@@ -50,6 +50,12 @@ def test_the_largest_error_is_stated_in_the_unit_of_the_device(scale: PhaseError
 def test_an_error_within_its_uncertainty_is_not_stated() -> None:
     assert describe_largest_error({"a, axis x": constant_error(0.001, 0.02)}, PICTURE_SCALE) == ""
     assert describe_largest_error({}, PICTURE_SCALE) == ""
+
+
+def test_an_error_at_the_end_of_a_decay_is_no_error_of_the_motion() -> None:
+    amplitude = np.exp(-np.arange(10.0))
+    error = PredictionPhaseError(np.arange(10.0), np.linspace(0.0, 0.2, 10) ** 2, np.full(10, 1e-4), amplitude)
+    assert "wrong by 0.023° rms" in describe_largest_error({"decay, axis x": error}, ANGLE_SCALE)
 
 
 def test_recordings_of_one_name_have_their_own_phase_errors(monkeypatch: pytest.MonkeyPatch) -> None:
