@@ -331,7 +331,7 @@ def conclude_point_cloud(summary: Mapping[str, Any], file: str) -> str:
 
 
 def conclude_fleet(summary: Mapping[str, Any]) -> str:
-    """How many recordings show an effect, and which is the most frequent."""
+    """How many recordings show an effect, and which effects most of them have in common."""
     rows: Sequence[Mapping[str, Any]] = [row for row in summary["table"] if not row.get("failed")]
     diagnosed = len({row["recording"] for row in rows})
     effects: dict[str, set[str]] = {}
@@ -339,10 +339,14 @@ def conclude_fleet(summary: Mapping[str, Any]) -> str:
         if row.get("effect"):
             effects.setdefault(f"{row['axis']} {row['effect']}", set()).add(row["recording"])
     affected = len(set().union(*effects.values()))
-    text = f"{affected} of {counted(diagnosed, 'recording')} show effects that the nominal device omits."
-    if effects:
-        name, where = max(effects.items(), key=lambda item: len(item[1]))
-        text += f" The most frequent is {name}, in {len(where)}."
+    verb = "shows" if affected == 1 else "show"
+    text = f"{affected} of {counted(diagnosed, 'recording')} {verb} effects that the nominal device omits."
+    largest = max(map(len, effects.values()), default=0)
+    if largest > 1:
+        names = [name for name, where in effects.items() if len(where) == largest]
+        text += f" The most frequent {'is' if len(names) == 1 else 'are'} {' and '.join(names)}, in {largest}."
+    elif len(effects) > 1:
+        text += " No effect occurs in more than one."
     if summary["failed"]:
         text += f" {counted(summary['failed'], 'recording')} failed; the reasons are listed below."
     return text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.pipeline import reconstruct
-from recon.report.conclusions import conclude_prediction, conclude_study
+from recon.report.conclusions import conclude_fleet, conclude_prediction, conclude_study
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.report.summary import summarise
 from recon.steps.reconstruction import Options
@@ -56,3 +56,21 @@ def test_a_device_without_found_laws_is_to_be_diagnosed(terms: dict[str, list[st
     text = conclude_prediction({"device": "mirror", "terms": terms, "channels": {"sense_x": channel}})
     assert "4.0 times its noise." in text
     assert ("Run lissajous diagnose" in text) is not bool(terms)
+
+
+@pytest.mark.parametrize(
+    ("effects", "stated"),
+    [
+        ("a a", "The most frequent is x a, in 2."),
+        ("a b", "No effect occurs in more than one."),
+        ("ab ab", "The most frequent are x a and x b, in 2."),
+        ("a", "1 of 1 recording shows effects that the nominal device omits."),
+    ],
+)
+def test_an_effect_is_called_the_most_frequent_only_where_it_is(effects: str, stated: str) -> None:
+    rows = [
+        {"recording": str(number), "axis": "x", "effect": effect}
+        for number, found in enumerate(effects.split())
+        for effect in found
+    ]
+    assert conclude_fleet({"table": rows, "failed": 0}).endswith(stated)
