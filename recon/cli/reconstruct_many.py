@@ -18,7 +18,9 @@ from scanner.wording import counted
 if TYPE_CHECKING:
     from recon.steps.reconstruction import Options
 
-TABLE_KEYS = ("estimator", "samples", "fill", "phase_sd_deg", "within_bound", "sign", "trouble", "notes", "seconds")
+TABLE_KEYS = (
+    "estimator", "samples", "fill", "phase_sd_deg", "within_bound", "sign", "trouble", "limits", "notes", "seconds",
+)  # fmt: skip
 """Keys of one recording's summary that the summary of all repeats."""
 
 STACK_FILES = ("stack.ome.tif", "stack_sd.ome.tif", "stack.ome.zarr", "stack.mp4", "stack.gif")
@@ -127,4 +129,5 @@ def format_summary(summary: dict[str, Any]) -> str:
         else:
             shares = ", ".join(f"{axis} {share:.1%}" for axis, share in row["within_bound"].items())
             lines.append(f"  {row['output']}: fill {row['fill']:.1%}, within the bound {shares}")
+            lines += [f"    {limit}" for limit in row["limits"]]
     return "\n".join([*lines, f"  table {summary['output']}/summary.json, page {summary['output']}/index.html"])

@@ -26,6 +26,9 @@ MIN_CERTAIN_PROBABILITY = 0.9
 VALUES_LISTED = 4
 """Values of the device that are listed where they contradict their tolerances: those of a comb and its gain."""
 
+PICTURES_LISTED = 4
+"""Pictures of many that the conclusion names; the page lists all."""
+
 
 def condition_on_clock(summary: Mapping[str, Any]) -> str:
     """The condition on which standard deviations of the phase hold, for a list in brackets; empty without a doubt."""
@@ -283,10 +286,14 @@ def conclude_study(summary: Mapping[str, Any]) -> str:
 
 
 def conclude_many(summary: Mapping[str, Any]) -> str:
-    """How many recordings were reconstructed, and which one needs a look."""
+    """How many recordings were reconstructed, which pictures do not show their scene, and which one needs a look."""
     rows: Sequence[Mapping[str, Any]] = summary["recordings"]
     done = [row for row in rows if not row["failed"]]
     text = f"{len(done)} of {counted(len(rows), 'recording')} reconstructed."
+    if limited := [row["output"].rsplit("/", 1)[-1] for row in done if row["limits"]]:
+        names = ", ".join(limited[:PICTURES_LISTED]) + (", …" if len(limited) > PICTURES_LISTED else "")
+        verb = "does" if len(limited) == 1 else "do"
+        text += f" {counted(len(limited), 'picture')} ({names}) {verb} not show the scene, or only a part."
     if done:
         worst = min(done, key=lambda row: min(row["within_bound"].values()))
         share = min(worst["within_bound"].values())

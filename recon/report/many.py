@@ -39,7 +39,8 @@ def reconstructions_report(summary: Mapping[str, Any]) -> str:
         Section("Recordings", "", Table([*heads, "defects"], rows)),
         Section("Pictures", "The captions link to the reports.", figures=pictures, pixelated=True),
     ]
-    notes = [row["failed"] for row in summary["recordings"] if row["failed"]]
+    notes = [f"{Path(row['output']).name}: {limit}" for row in done for limit in row["limits"]]
+    notes += [row["failed"] for row in summary["recordings"] if row["failed"]]
     notes += summary["stack"]["notes"] if summary["stack"] else []
     return render(
         "Reconstructions", conclude_many(summary), sections, notes, f"Computed in {summary['seconds']:.1f} s."

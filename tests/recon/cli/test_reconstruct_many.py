@@ -7,6 +7,7 @@ import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -38,6 +39,21 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     with h5py.File(paths[2], "r+") as file:
         del file["channels/intensity"]
     return paths
+
+
+def test_a_picture_that_does_not_show_its_scene_is_named_among_others(
+    scans: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = imaging()[0].slice(0.0, 0.012)
+    light = recording["intensity"].read()
+    bright = replace(recording["intensity"], raw=np.minimum(light, np.quantile(light, 0.3)), gain=1.0, offset=0.0)
+    recording.with_channel(bright).write(tmp_path / "bright.h5")
+    paths = [str(scans[0]), str(tmp_path / "bright.h5")]
+    assert main(["reconstruct", *paths, "-o", str(tmp_path / "all"), *ARGUMENTS, "--workers", "1"]) == 0
+    assert "the detector is saturated" in capsys.readouterr().out
+    page = (tmp_path / "all" / "index.html").read_text(encoding="utf-8")
+    assert "1 picture (bright) does not show the scene, or only a part" in page
+    assert "bright: intensity:" in page
 
 
 @pytest.mark.slow
