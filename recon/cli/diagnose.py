@@ -121,7 +121,7 @@ def _format_plan(summary: dict[str, Any]) -> str:
 
 def _format_diagnosis(summary: dict[str, Any]) -> str:
     from estimation.candidate_terms.significance import MIN_RIVAL_PROBABILITY
-    from recon.report.conclusions import name_rival
+    from recon.report.diagnosis_conclusion import name_rival
     from recon.report.numbers import format_interval, format_probability
 
     lines = [summary["conclusion"], f"{summary['output']}: {summary['verdict']}"]

@@ -15,7 +15,8 @@ from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding
 from estimation.diagnosis.identifiability import DISCRIMINATION_SIGMA, Detectability, detectability
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
-from recon.report.conclusions import conclude_diagnosis, conclude_plan, name_rival
+from recon.report.conclusions import conclude_plan
+from recon.report.diagnosis_conclusion import conclude_diagnosis, name_rival
 from recon.report.diagnosis_figures import (
     detectability_figure,
     effect_figure,

@@ -11,7 +11,7 @@ import pytest
 from estimation.device_fit.data import Run, prepare_run
 from estimation.device_fit.further_modes import _band, _Columns, _fit, _heights, find_modes, with_driven_modes
 from estimation.diagnosis import diagnose as diagnosing
-from recon.report.conclusions import conclude_diagnosis
+from recon.report.diagnosis_conclusion import conclude_diagnosis
 from scanner.active_terms import stated_terms
 from scanner.arrays import Array
 from scanner.device import Axis, Device

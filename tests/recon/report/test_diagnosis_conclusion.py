@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from recon.cli.diagnose import format_summary
-from recon.report.conclusions import conclude_diagnosis
+from recon.report.diagnosis_conclusion import conclude_diagnosis
 
 CORRECTED, NOMINAL = "Use the corrected device.toml", "device.toml is the nominal device"
 
