@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from phantoms.optics import sample_scene
-from recon.imaging.sample_motion.block_equations import PlacedSamples
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.rigid_motion import SampleMotion
 
 RATE, PIXELS = 1.5e6, 96

@@ -34,6 +34,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from recon.imaging.sample_motion.gradient_noise import calibrate_gradients
+from recon.imaging.sample_motion.placed_samples import MARGIN_PX, STEP_PX, PlacedSamples
 from recon.imaging.sample_motion.residual_noise import ResidualNoise, fit_residual_noise
 from recon.imaging.smoothing import REACH
 from scanner.arrays import Array
@@ -60,58 +61,11 @@ of smoothed detail. A picture of 256 x 256 pixels has 1024 of them."""
 NUISANCES = 6
 """Free values in each block: phase of x and y, amplitude of x and y, brightness, gain."""
 
-
 MAX_NOISE_SAMPLES = 1 << 16
 """Samples from which the variance of the residuals is fitted: they determine it to 1 %."""
 
 UNIT_NOISE = ResidualNoise(1.0, 0.0, 0.0, 0.0)
 """Variance under which equations remain in the unit of the intensity."""
-
-STEP_PX = 0.01
-"""Step of the places that are kept [px]: its rounding, 0.003 px rms, is far below what a block determines."""
-
-MARGIN_PX = 64.0
-"""Distance beyond the field up to which places are kept [px]: a motion of the sample brings them into the picture."""
-
-
-class PlacedSamples(NamedTuple):
-    """Samples of a scan, each of shape (n,): place of the beam from the corner of the field, and intensity.
-
-    Places are integers in steps of ``STEP_PX`` from ``-MARGIN_PX`` on: 8 bytes a sample in place of 12.
-
-    Attributes:
-        x, y: place [STEP_PX].
-        value: intensity; NaN where the place is unknown or beyond the margin.
-    """
-
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    value: NDArray[np.float32]
-
-    @classmethod
-    def empty(cls, size: int) -> PlacedSamples:
-        """Return ``size`` samples without values."""
-        return cls(np.zeros(size, np.uint16), np.zeros(size, np.uint16), np.full(size, np.nan, np.float32))
-
-    @classmethod
-    def from_arrays(cls, x: Array, y: Array, value: Array) -> PlacedSamples:
-        """Return samples at places in pixels, arrays of shape (n,)."""
-        samples = cls.empty(x.size)
-        samples.write(0, x, y, value)
-        return samples
-
-    def write(self, first: int, x: Array, y: Array, value: Array) -> None:
-        """Write samples at places in pixels, arrays of shape (n,), from sample ``first`` on."""
-        part = slice(first, first + value.size)
-        steps = [np.rint((each + MARGIN_PX) / STEP_PX) for each in (x, y)]
-        inside = np.all([(each >= 0.0) & (each <= np.iinfo(np.uint16).max) for each in steps], axis=0)
-        self.x[part], self.y[part] = (np.where(inside, each, 0.0) for each in steps)
-        self.value[part] = np.where(inside, value, np.nan)
-
-    def places(self, part: slice | NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return the places x and y of some samples [px]."""
-        x, y = (np.multiply(each[part], STEP_PX, dtype=np.float64) - MARGIN_PX for each in (self.x, self.y))
-        return x, y
 
 
 class BlockEquations(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from recon.imaging.sample_motion.block_equations import PlacedSamples
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.residual_noise import fit_residual_noise
 from recon.imaging.smoothing import REACH
 from scanner.arrays import Array

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon.imaging.picture import Grid
-from recon.imaging.sample_motion.block_equations import PlacedSamples
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.rigid_motion import SampleMotion, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
 from scanner.angle_tracks import DerivedAngle

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.sample_motion.block_equations import FOLDS, PARTS, PlacedSamples, fold_references
+from recon.imaging.sample_motion.block_equations import FOLDS, PARTS, fold_references
 from recon.imaging.sample_motion.motion_smoother import SmoothedMotion
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.vibrations import vibration_shift
 from scanner.arrays import Array
 

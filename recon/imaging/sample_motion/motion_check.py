@@ -14,9 +14,10 @@ import numpy as np
 
 from estimation.sensor_hum import find_slow_lines
 from recon.imaging.picture import Grid
-from recon.imaging.sample_motion.block_equations import PARTS, PlacedSamples
+from recon.imaging.sample_motion.block_equations import PARTS
 from recon.imaging.sample_motion.correction import cell_width, cells, read_samples
 from recon.imaging.sample_motion.motion_smoother import part_shift
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.residual import remaining_motion_variance
 from recon.imaging.sample_motion.rigid_motion import MIN_BLOCKS, MIN_CELLS_ACROSS, estimate_sample_motion
 from recon.imaging.scan_phase.bidirectional_phase import slow_period

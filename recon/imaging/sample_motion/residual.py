@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.imaging.sample_motion.block_equations import SHAPES, PlacedSamples, block_equations
+from recon.imaging.sample_motion.block_equations import SHAPES, block_equations
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from scanner.arrays import Array
 from scanner.channel import READ_CHUNK_SAMPLES
 

@@ -21,16 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.imaging.sample_motion.block_equations import (
-    PARTS,
-    PLACE_PX,
-    PlacedSamples,
-    block_equations,
-    sample_log_likelihoods,
-)
+from recon.imaging.sample_motion.block_equations import PARTS, PLACE_PX, block_equations, sample_log_likelihoods
 from recon.imaging.sample_motion.coarse_search import search_motion
 from recon.imaging.sample_motion.jumps import MotionKnots, place_jumps
 from recon.imaging.sample_motion.motion_smoother import SmoothedMotion, part_shift, smooth_motion
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.residual import remaining_motion_variance
 from recon.imaging.sample_motion.vibrations import Vibration, vibration_shift
 from scanner.arrays import Array

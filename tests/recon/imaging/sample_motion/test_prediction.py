@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from recon.imaging.sample_motion import rigid_motion
-from recon.imaging.sample_motion.block_equations import PARTS, PlacedSamples, sample_log_likelihoods
+from recon.imaging.sample_motion.block_equations import PARTS, sample_log_likelihoods
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.rigid_motion import estimate_sample_motion
 from scanner.arrays import Array
 from tests.support.sample_motion import BLOCKS, PERIOD, PIXELS, beads, scan

@@ -10,9 +10,10 @@ import pytest
 
 from phantoms.optics import sample_scene
 from recon.cli import main
-from recon.imaging.sample_motion.block_equations import PARTS, SHAPES, BlockEquations, PlacedSamples, block_equations
+from recon.imaging.sample_motion.block_equations import PARTS, SHAPES, BlockEquations, block_equations
 from recon.imaging.sample_motion.correction import describe_sample_motion
 from recon.imaging.sample_motion.motion_smoother import smooth_motion
+from recon.imaging.sample_motion.placed_samples import PlacedSamples
 from recon.imaging.sample_motion.rigid_motion import MIN_LOG_LIKELIHOOD_GAIN, SampleMotion, estimate_sample_motion
 from recon.imaging.sample_motion.vibrations import Vibration
 from tests.support.sample_motion import BLOCKS, PERIOD, PIXELS, RATE, error_of, scan
