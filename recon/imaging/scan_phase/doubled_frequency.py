@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.imaging.scan_phase.detector_offset import stated_event
-from recon.imaging.scan_phase.phase_agreement import axis_phases
+from recon.imaging.scan_phase.slice_matches import axis_phases
 from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from recon.imaging.scan_phase.bidirectional_phase import slow_period
-from recon.imaging.scan_phase.phase_agreement import axis_phases
 from recon.imaging.scan_phase.phase_search import (
     PERIODS_PER_SEARCH,
     PHASE_CELLS,
@@ -17,6 +16,7 @@ from recon.imaging.scan_phase.phase_search import (
     cut_slices,
     match_phases,
 )
+from recon.imaging.scan_phase.slice_matches import axis_phases
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
