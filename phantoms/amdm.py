@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from phantoms.circuit import AmdmCircuit, run_circuit
-from phantoms.forward import quantise
+from phantoms.sense_channels import quantise
 from phantoms.waveforms import Waveform
 from scanner.arrays import Array
 from scanner.device import Axis

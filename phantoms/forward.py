@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from phantoms.drift_term import drift_terms
 from phantoms.optics import Detector, detect, sample_scene
+from phantoms.sense_channels import quantise, sense_channels
 from phantoms.waveforms import Waveform
 from scanner.active_terms import ActiveTerm, check_effects, stated_terms
 from scanner.arrays import Array
@@ -25,13 +26,13 @@ from scanner.channel import CHANNEL_UNITS
 from scanner.coupled_motion import simulate_coupled
 from scanner.device import Axis, Device
 from scanner.drift import Drift
-from scanner.errors import BadInput, DeviceInvalid
+from scanner.errors import BadInput
 from scanner.forward_model import AxisTrajectory, DriveInput, reference_signal, sense_signal, simulate_axis
 from scanner.integrator.nodes import to_nodes
 from scanner.optics import apply_intensity_terms, beam_position
 from scanner.recording import Recording
 from scanner.settling import settling_time
-from scanner.stages import MotionSensor, Readout, without_noise
+from scanner.stages import without_noise
 
 CHUNK_S = 0.01
 """Length integrated at a time [s]: 2 MB an axis at 10 MHz, so memory does not grow with the recording."""
@@ -197,28 +198,6 @@ def _require_motion(axis: str, angle: Array, plan: Plan) -> None:
             channel=f"drive_{axis}",
             hint="drive near twice the resonance, above the threshold 2/Q, or record a ringdown",
         )
-
-
-def quantise(values: Array, bits: int | None, full_range: float) -> Array:
-    """Return values after a converter of ``bits`` over +- full_range / 2; unchanged for None."""
-    if bits is None:
-        return values
-    lsb = full_range / 2**bits
-    return np.clip(np.round(values / lsb), -(2 ** (bits - 1)), 2 ** (bits - 1) - 1) * lsb
-
-
-def sense_channels(device: Device) -> dict[str, tuple[Readout, tuple[str, ...]]]:
-    """Return the sense channels of the device, each with its readout and the axes that it senses.
-
-    Raises:
-        DeviceInvalid: a sensor of the motion for several axes.
-    """
-    if isinstance(device.readout, MotionSensor) and len(device.axes) > 1:
-        what = f"a {device.readout.kind} sensor reads one axis"
-        raise DeviceInvalid(what, channel="readout", hint="give each axis its own")
-    if device.readout is not None:
-        return {"sense": (device.readout, tuple(device.axes))}
-    return {f"sense_{name}": (axis.readout, (name,)) for name, axis in device.axes.items() if axis.readout}
 
 
 def _motion_pieces(

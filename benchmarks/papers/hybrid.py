@@ -19,7 +19,8 @@ from estimation.filters.hybrid import SIGMA_CYCLES, make_detector, run_hybrid
 from estimation.filters.inputs import FilterInput, prepare_filter_inputs
 from estimation.filters.run import tune_torque_noise
 from estimation.filters.threshold import CrossingDetector, calibrate_crossings, find_crossings
-from phantoms.forward import InitialState, Plan, quantise, simulate_trajectory
+from phantoms.forward import InitialState, Plan, simulate_trajectory
+from phantoms.sense_channels import quantise
 from phantoms.waveforms import Constant
 from scanner.arrays import Array
 from scanner.device import Axis, Device

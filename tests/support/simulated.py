@@ -8,7 +8,8 @@ import numpy as np
 from estimation.signals import phase_reference, sense_channels
 from estimation.tracker.observations import BlockObservations, demodulate_blocks, lay_out_blocks
 from phantoms.experiment import Experiment, simulate_experiment
-from phantoms.forward import Plan, quantise, simulate
+from phantoms.forward import Plan, simulate
+from phantoms.sense_channels import quantise
 from phantoms.waveforms import Sine
 from scanner import devices
 from scanner.device import Device
