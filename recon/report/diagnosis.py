@@ -96,8 +96,8 @@ def _open_loop_section(diagnosis: Diagnosis) -> Section:
         rows.append([channel, *(f"{loop['rmse']:.3g} ({loop['fraction']:.1%})" for loop in loops.values()), noise])
     text = (
         "Root mean square error of the prediction from the drive and the initial state alone, on samples that were not "
-        "used in a fit, in the unit of the channel and in percent of its standard deviation. No prediction errs by "
-        "less than the noise."
+        "used in a fit, in the unit of the channel and in percent of its standard deviation. An exact prediction errs "
+        "by the noise, up to the scatter of that in these samples."
     )
     head = ["channel", "nominal device", "improved device", "noise"]
     return Section("Prediction by the devices", text, Table(head, rows))
