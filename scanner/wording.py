@@ -8,6 +8,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
+def quantity(value: float, unit: str, digits: int = 4) -> str:
+    """Return a value with ``digits`` significant digits and its unit, which may be empty: ``0.25 V``, ``0.25``."""
+    return f"{value:.{digits}g} {unit}".rstrip()
+
+
 def percent(share: float) -> str:
     """A share in percent; small ones with two significant digits, so that they never read as none."""
     return f"{100.0 * share:.0f}%" if share >= 0.1 else f"{100.0 * share:.2g}%"

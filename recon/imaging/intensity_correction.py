@@ -13,12 +13,13 @@ from estimation.sensor_hum import LineBlock
 from recon.imaging.gridding import find_sample_pixels
 from recon.imaging.intensity_drift import IntensityDrift, SampleReader, estimate_intensity_drift
 from recon.imaging.intensity_drift_equations import DriftKind
-from recon.imaging.picture import Grid
+from recon.imaging.picture import Grid, detector_names
 from recon.imaging.pixel_noise import SampleNoise
 from scanner.arrays import Array
 from scanner.channel import Channel, LazySamples
 from scanner.device import AXES
 from scanner.motion import Motion
+from scanner.wording import quantity
 
 UNDETERMINED = (
     "no drift was removed, because the samples do not determine one; that needs samples with noise in pixels that were "
@@ -104,16 +105,15 @@ def add_drift_errors(
     return tuple(None if each is None else each.scaled(k) for each, k in zip(noise, factors, strict=True))
 
 
-def describe_drift(drifts: Sequence[IntensityDrift | None], unit: str) -> list[str]:
+def describe_drift(drifts: Sequence[IntensityDrift | None], intensity: Channel) -> list[str]:
     """What a reader has to know of the drifts that were removed, a line for each detector.
 
     Args:
         drifts: by detector.
-        unit: of the intensity.
+        intensity: whose unit and names of detectors are stated.
     """
     lines = []
-    for number, drift in enumerate(drifts):
-        detector = f"detector {number}" if len(drifts) > 1 else "the detector"
+    for detector, drift in zip(detector_names(intensity.detectors, len(drifts)), drifts, strict=True):
         if drift is None:
             lines.append(f"{detector}: {UNDETERMINED}")
             continue
@@ -121,7 +121,7 @@ def describe_drift(drifts: Sequence[IntensityDrift | None], unit: str) -> list[s
         if change == 0.0:
             lines.append(f"{detector}: no {drift.kind} drift was found")
             continue
-        size = f"{change:.3g} {unit} rms" if drift.kind == "offset" else f"{100 * change:.3g} % rms"
-        error = f"{sd:.2g} {unit}" if drift.kind == "offset" else f"{100 * sd:.2g} %"
+        size = f"{quantity(change, intensity.unit, 3)} rms" if drift.kind == "offset" else f"{100 * change:.3g} % rms"
+        error = quantity(sd, intensity.unit, 2) if drift.kind == "offset" else f"{100 * sd:.2g} %"
         lines.append(f"{detector}: {drift.kind} drift of {size}, known to {error} at each moment, was removed")
     return lines

@@ -6,6 +6,7 @@ import numpy as np
 
 from scanner.arrays import Array
 from scanner.recording import Recording
+from scanner.wording import quantity
 
 CHECKED_SAMPLES = 1 << 20
 """Samples from the start that are checked."""
@@ -45,8 +46,8 @@ def describe_overflows(recording: Recording) -> list[str]:
             if jumps := count_overflows(column):
                 lines.append(
                     f"{name}: jumps {jumps} times from one end of its range to the other, {np.nanmin(column):.4g} and "
-                    f"{np.nanmax(column):.4g} {channel.unit}, and back: its converter or its integer type overflows, "
-                    "and the picture is wrong: change gain or type"
+                    f"{quantity(float(np.nanmax(column)), channel.unit)}, and back: its converter or its "
+                    "integer type overflows, and the picture is wrong: change gain or type"
                 )
     return lines
 

@@ -32,7 +32,7 @@ from recon.report.phase_slider import phase_slider_data
 from recon.report.picture_conclusion import conclude_reconstruction
 from recon.steps.reconstruction import Reconstruction
 from scanner.device import AXES
-from scanner.wording import sentence
+from scanner.wording import quantity, sentence
 
 
 def reconstruction_report(result: Reconstruction, summary: Mapping[str, Any], fill_radius: int = 0) -> str:
@@ -127,7 +127,7 @@ def uncertainty_figures(result: Reconstruction, bar: tuple[str, float]) -> list[
         limits = 0.0, contrast_limits(result.picture_sd)[1]
         image, unit = data_uri(encode_png(to_rgb(result.picture_sd, limits))), result.intensity.unit
         caption = "standard deviation of each pixel; blue: unknown"
-        figures.append(Figure(image, caption, scale_bar=bar, grey_scale=("0", f"{limits[1]:.3g} {unit}")))
+        figures.append(Figure(image, caption, scale_bar=bar, grey_scale=("0", quantity(limits[1], unit, 3))))
     if result.data_share is not None:
         image = data_uri(encode_png(to_rgb(result.data_share, (0.0, 1.0))))
         caption = "share of a pixel's own samples in its value; black: the value follows from other pixels only"

@@ -12,7 +12,7 @@ from scanner.arrays import Array
 from scanner.channel import Channel
 from scanner.device import AXES
 from scanner.motion import Motion
-from scanner.wording import counted, percent
+from scanner.wording import counted, percent, quantity
 
 LOGARITHMIC_UNIT = "dB"
 """Beginning of the units of logarithms: dB, dBm, dBV."""
@@ -74,7 +74,8 @@ def describe_saturation(intensity: Channel) -> list[str]:
     names = _detector_names(intensity)
     checked = min(intensity.size, MAX_CHECKED_SAMPLES)
     return [
-        f"{name}: {rail[1] / checked:.2%} of the samples stand at the largest value, {rail[0]:.4g} {intensity.unit}: "
+        f"{name}: {rail[1] / checked:.2%} of the samples stand at the largest value, "
+        f"{quantity(rail[0], intensity.unit)}: "
         "the detector is saturated there, the picture shows no detail, and its standard deviation is not known; "
         "lower its gain or the light"
         for name, rail in zip(names, rails, strict=True)
@@ -96,9 +97,9 @@ def describe_lower_rail(intensity: Channel) -> list[str]:
         rail = upper_rail(-finite) if finite.size else None
         if rail is not None and rail[0] != 0.0 and -rail[0] >= wild_limits(column).low[0]:
             lines.append(
-                f"{name}: {rail[1] / len(column):.2%} of the samples stand at the smallest value, {-rail[0]:.4g} "
-                f"{intensity.unit}: the signal is clipped there, and dark places appear too bright; change the offset "
-                "or the range of the converter"
+                f"{name}: {rail[1] / len(column):.2%} of the samples stand at the smallest value, "
+                f"{quantity(-rail[0], intensity.unit)}: the signal is clipped there, and dark places appear too "
+                "bright; change the offset or the range of the converter"
             )
     return lines
 
@@ -135,8 +136,8 @@ def describe_wild_samples(intensity: Channel, beam: Motion | None = None, grid: 
             farthest = column[own][np.argmax(np.abs(column[own] - np.nanmedian(column)))]
             lines.append(
                 f"{name}: {number} ({share}) far from all others, "
-                f"the farthest {farthest:.4g} {intensity.unit} (median {np.nanmedian(column):.4g}): electric pulses or "
-                "errors of a transfer, which make their pixels wrong; replace them by NaN"
+                f"the farthest {quantity(farthest, intensity.unit)} (median {np.nanmedian(column):.4g}): electric "
+                "pulses or errors of a transfer, which make their pixels wrong; replace them by NaN"
             )
     return lines
 

@@ -80,7 +80,7 @@ def correct_phase_and_drift(estimated: EstimatedMotion, options: Options) -> Est
         phased = replace(correct_readout_phase(without_drift, options), prepared=estimated.prepared)
         drifts = _measure_drift(phased, options.intensity_drift, flicker)
     prepared = _without_drift(recorded.for_picture(options.undo_lag), drifts)
-    notes = [*phased.motion_notes, *describe_drift(drifts, prepared.intensity.unit)]
+    notes = [*phased.motion_notes, *describe_drift(drifts, prepared.intensity)]
     return replace(phased, prepared=prepared, intensity_drift=drifts, motion_notes=notes)
 
 

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.imaging.intensity_correction import describe_drift
+from recon.imaging.intensity_drift import IntensityDrift
 from recon.steps.intensity_notes import (
     describe_lower_rail,
     describe_negative_counts,
@@ -61,6 +63,19 @@ def test_negative_counts_are_stated_and_negative_volts_are_not() -> None:
     (note,) = describe_negative_counts(replace(detector(-values - 1.0), unit="counts"))
     assert "intensity: 99% of the samples are negative" in note
     assert describe_negative_counts(detector(values)) == []
+
+
+def test_an_intensity_without_a_unit_is_stated_without_a_space_for_it() -> None:
+    light = replace(detector(np.minimum(np.random.default_rng(0).normal(1.0, 0.3, 10_000), 1.0)), unit="")
+    assert "at the largest value, 1: the detector" in describe_saturation(light)[0]
+
+
+def test_the_drift_of_a_detector_is_stated_with_its_name() -> None:
+    two = replace(detector(np.zeros((4, 2))), unit="", detectors=("green", "red"))
+    drift = IntensityDrift("offset", 1, np.array([-0.1, 0.1, -0.1, 0.1]), 0.01)
+    green, red = describe_drift([drift, None], two)
+    assert green == "intensity, green: offset drift of 0.1 rms, known to 0.01 at each moment, was removed"
+    assert red.startswith("intensity, red: no drift was removed")
 
 
 def test_a_frame_longer_than_the_recording_is_stated() -> None:
