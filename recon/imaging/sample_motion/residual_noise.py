@@ -15,8 +15,9 @@ LOWEST = 1.0 / 16.0
 ROUNDS = 100
 """Updates of the coefficients: the last ones change them by less than their standard error."""
 
-MIN_VARIANCE = 1e-12
-"""Lower bound on the variance, for recordings without noise and structure."""
+MIN_VARIANCE_OF_SIGNAL = 1e-12
+"""Lower bound on the variance relative to the mean square of the picture, for recordings without noise and structure.
+Samples are held in single precision, whose rounding has 1e-15 of it."""
 
 MIN_RELATIVE_VARIANCE = 1e-3
 """Lower bound on the variance relative to its mean: a dark sample is then worth at most 1000 usual ones."""
@@ -56,12 +57,13 @@ def fit_residual_noise(expected: Array, gradient: Array, residual: Array) -> Res
         residual: shape (n,).
     """
     lowest = int(np.ceil(LOWEST * expected.size))
+    least_unit = MIN_VARIANCE_OF_SIGNAL * (float(np.mean(expected**2)) if lowest else 0.0) or 1.0
     if not lowest or not residual.any():
-        return ResidualNoise(MIN_VARIANCE, 0.0, 0.0, 0.0)
+        return ResidualNoise(least_unit, 0.0, 0.0, 0.0)
     dark = float(np.mean(np.partition(expected, lowest - 1)[:lowest]))
     terms = np.column_stack([np.ones_like(expected), np.maximum(expected - dark, 0.0), gradient])
     square = residual**2
-    unit, sizes = max(float(square.mean()), MIN_VARIANCE), np.maximum(terms.mean(axis=0), 1e-300)
+    unit, sizes = max(float(square.mean()), least_unit), np.maximum(terms.mean(axis=0), 1e-300)
     relative = _most_likely(terms / sizes, square / unit, np.full(sizes.size, 1.0 / sizes.size))
     floor, slope, place = (unit * each / size for each, size in zip(relative, sizes, strict=True))
     least = MIN_RELATIVE_VARIANCE * unit
