@@ -33,13 +33,22 @@ def read_folder(path: Path) -> list[Layer]:
     image, place = _read_picture(path / "image.tif")
     layers: list[Layer] = []
     for number, plane in enumerate(_planes(image)):
-        low, high = (float(edge) for edge in np.nanpercentile(plane, [0.5, 99.5]))
         name = path.name if image.ndim == 2 else f"{path.name}, detector {number + 1}"
-        arguments = {"name": name, "contrast_limits": (low, max(high, low + 1e-12)), **place}
+        arguments = {"name": name, "contrast_limits": display_limits(plane), **place}
         layers.append((plane, {**arguments, "metadata": {FOLLOWED_KEY: (str(path), number)}}, "image"))
     if is_followed(path):
         _start_refreshing(path)
     return layers
+
+
+def display_limits(plane: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the values shown black and white, the second always the larger, as napari needs it.
+
+    Args:
+        plane: picture of one detector, shape (height, width); NaN where never visited.
+    """
+    low, high = (float(edge) for edge in np.nanpercentile(plane, [0.5, 99.5]))
+    return low, high if high > low else float(np.nextafter(np.float32(low), np.float32(np.inf)))
 
 
 def is_followed(folder: Path) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lissajous.napari_live import Layer, read_folder
+from lissajous.napari_live import Layer, display_limits, read_folder
 
 if TYPE_CHECKING:
     from recon.steps.reconstruction import Reconstruction
@@ -75,8 +75,7 @@ def read_recording(path: str | Sequence[str]) -> list[Layer]:
     planes = [picture.image] if picture.image.ndim == 2 else list(np.moveaxis(picture.image, -1, 0))
     names = picture.detectors or tuple(f"detector {k + 1}" for k in range(len(planes)))
     for plane, name in zip(planes, (result.name,) if len(planes) == 1 else names, strict=True):
-        low, high = (float(edge) for edge in np.nanpercentile(plane, [0.5, 99.5]))
-        shown = {"name": name, "contrast_limits": (low, max(high, low + 1e-12))}
+        shown = {"name": name, "contrast_limits": display_limits(plane)}
         layers.append((plane, {**shown, **place, **metadata}, "image"))
     hidden = {"visible": False}
     layers.append((picture.coverage, {"name": "coverage", "colormap": "viridis", **hidden, **place}, "image"))

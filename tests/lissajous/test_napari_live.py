@@ -11,7 +11,7 @@ import pytest
 
 import lissajous
 from lissajous import napari_live
-from lissajous.napari_live import FOLLOWED_KEY, read_folder, show_picture, watch_pictures
+from lissajous.napari_live import FOLLOWED_KEY, display_limits, read_folder, show_picture, watch_pictures
 from lissajous.napari_reader import get_reader
 from recon.imaging.picture import Grid
 from recon.io.output import write_tiff
@@ -73,6 +73,15 @@ def test_detectors_are_layers_and_lengths_are_in_micrometres(tmp_path: Path) -> 
     assert [arguments["name"] for _, arguments, _ in layers] == ["out, detector 1", "out, detector 2"]
     assert layers[0][1]["units"] == ("um", "um")
     assert layers[0][1]["scale"] == pytest.approx((4.0, 5.0))  # 1 mm a rad
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-12, 1e9])
+def test_black_and_white_are_percentiles_in_any_unit_and_differ(unit: float) -> None:
+    """Photocurrents are of picoamperes, and a picture of one value has to be shown too."""
+    picture = np.linspace(1.0, 2.0, 1200, dtype=np.float32).reshape(30, 40) * np.float32(unit)
+    assert display_limits(picture) == pytest.approx((1.005 * unit, 1.995 * unit))
+    low, high = display_limits(np.full_like(picture, unit))
+    assert low < high
 
 
 def test_each_new_picture_is_shown_until_the_summary_appears(tmp_path: Path, quick: None) -> None:
