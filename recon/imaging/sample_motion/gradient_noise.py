@@ -40,10 +40,12 @@ def calibrate_gradients(references: NDArray[np.float32]) -> None:
     radius = np.hypot(difference, xy)
     large, small = (_share(half + sign * radius, noise) for sign in (1.0, -1.0))
     mean, spread = 0.5 * (large + small), 0.5 * (large - small)
-    turn = np.divide(spread, radius, out=np.zeros_like(radius), where=radius > 0.0)
+    along, across = (
+        spread * np.divide(each, radius, out=np.zeros_like(radius), where=radius > 0.0) for each in (difference, xy)
+    )
     gradients[..., 0], gradients[..., 1] = (
-        (mean + turn * difference) * gradients[..., 0] + turn * xy * gradients[..., 1],
-        turn * xy * gradients[..., 0] + (mean - turn * difference) * gradients[..., 1],
+        (mean + along) * gradients[..., 0] + across * gradients[..., 1],
+        across * gradients[..., 0] + (mean - along) * gradients[..., 1],
     )
 
 

@@ -68,3 +68,14 @@ def test_the_gradient_of_an_edge_remains_and_noise_along_it_does_not() -> None:
     assert np.mean(edge[..., 4] ** 2) < 0.2
     assert np.mean(references[:, 5:-5, :3, 3:] ** 2) < 0.2
     assert np.isnan(references[:, :3, :3, 3:]).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_gradients_of_a_small_unit_are_calibrated_alike() -> None:
+    """Squares of gradients of 1e-20 are below single precision; their ratios are not."""
+    rng = np.random.default_rng(2)
+    scene, noise = rng.standard_normal((20, 20, 5)), rng.standard_normal((8, 20, 20, 5))
+    small = (1e-20 * (scene * [1.0, 1.0, 1.0, 1.0, 0.3] + 0.2 * noise)).astype(np.float32)
+    calibrate_gradients(small)
+    assert np.isfinite(small).all()
+    assert np.abs(small).max() < 1e-18
