@@ -78,6 +78,9 @@ MIN_RELATIVE_VARIANCE = 0.02
 MIN_VARIANCE_OF_SCENE = 1e-4
 """The same relative to the variance of the pixels' means: for recordings without noise."""
 
+SMALLEST_FLOAT32 = float(np.finfo(np.float32).tiny)
+"""Least variance whose inverse is held in single precision."""
+
 MIN_REACH_WIDTH_PX = 4.0
 """Width of the kernel within whose reach of a sample, 16 pixels, a pixel has a value even where the best kernel is
 narrower: gaps between the lines of a scan are seldom wider."""
@@ -184,7 +187,7 @@ def _noise_level_width(samples: SplitSums, noise: SampleNoise) -> float:
 def _sample_precision(mean: Array, level_width: float, noise: SampleNoise, scene_variance: float) -> Array:
     """Inverse variance of a sample by pixel; ``level_width``: smoothing of the mean [px]."""
     variance = noise.variance(smooth(mean, level_width))
-    least = max(MIN_RELATIVE_VARIANCE * variance.mean(), MIN_VARIANCE_OF_SCENE * scene_variance, 1e-30)
+    least = max(MIN_RELATIVE_VARIANCE * variance.mean(), MIN_VARIANCE_OF_SCENE * scene_variance, SMALLEST_FLOAT32)
     return 1.0 / np.maximum(variance, least)
 
 

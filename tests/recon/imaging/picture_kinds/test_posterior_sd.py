@@ -128,3 +128,18 @@ def test_a_bright_background_does_not_change_the_picture() -> None:
         for sums in (noisy, noisy + 100.0 * counts)
     )
     assert rms(bright - 100.0 - dark) < 0.1 * rms(dark - scene)
+
+
+def test_the_unit_of_the_intensity_does_not_change_the_picture_or_its_deviation() -> None:
+    """In units of 1e-15, as a current of femtoamperes has in A, the deviation was 15 times too large."""
+    rng, unit = np.random.default_rng(5), 1e-15
+    scene = np.where(gaussian_filter(rng.normal(size=(SIZE, SIZE)), 6.0) > 0, 1.0, 0.0)
+    counts = (rng.random(scene.shape) < 0.3).astype(float)
+    held = counts * (rng.random(scene.shape) < 0.1)
+    noisy = counts * (scene + rng.normal(scale=0.3, size=scene.shape))
+    usual, small = (
+        posterior_picture(SplitSums(sums, counts, held * sums, held), SampleNoise(0.09 * each**2, 0.0, 0.0))
+        for each, sums in ((1.0, noisy), (unit, unit * noisy))
+    )
+    np.testing.assert_allclose(small.image / unit, usual.image, atol=1e-3)
+    np.testing.assert_allclose(small.sd / unit, usual.sd, rtol=0.01)
