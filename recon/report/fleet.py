@@ -84,5 +84,6 @@ def _sizes(group: Sequence[Row], label: str) -> str:
     names = [Path(row["recording"]).stem for row in drawn]
     panel.set_yticks(range(len(drawn)), names, fontsize=7, parse_math=False)
     panel.invert_yaxis()
+    panel.locator_params(axis="x", nbins=5)  # labels of five digits side by side
     panel.set_xlabel(label)
     return figure_uri(drawing)
