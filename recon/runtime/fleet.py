@@ -276,14 +276,32 @@ def _submit(executor: Executor, task: Callable[[], Failure | None]) -> Future[Fa
 
 def _read_job(output: Path) -> dict[str, Any]:
     """Content of an earlier run's ``JOB_FILE``; empty without one."""
+    hint = "delete it, or name another folder with -o"
     try:
         content = json.loads((output / JOB_FILE).read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
-        hint = "delete it, or name another folder with -o"
         raise BadInput(f"cannot be read: {error}", file=output / JOB_FILE, hint=hint) from None
-    return content if isinstance(content, dict) else {}
+    if not _is_job(content):
+        raise BadInput("does not state the options and the folders of a run", file=output / JOB_FILE, hint=hint)
+    return dict(content)
+
+
+def _is_job(content: object) -> bool:
+    """Whether a value has the form that :func:`plan_fleet` writes: each recording has a stamp and a folder's name."""
+    if not isinstance(content, dict) or not isinstance(content.get("options"), str):
+        return False
+    recordings = content.get("recordings")
+    return isinstance(recordings, dict) and all(
+        isinstance(entry, dict) and "file" in entry and _is_folder_name(entry.get("folder"))
+        for entry in recordings.values()
+    )
+
+
+def _is_folder_name(name: object) -> bool:
+    """Whether a value names a folder directly below another one, as ``scan`` and not ``..``."""
+    return isinstance(name, str) and os.path.dirname(os.path.normpath(os.path.join("output", name))) == "output"
 
 
 def _stamp(path: Path) -> list[int] | None:

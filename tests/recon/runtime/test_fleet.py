@@ -1,5 +1,6 @@
 """The plan of work on many recordings: whose results are kept, and whose are done anew."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -66,6 +67,31 @@ def test_old_results_are_not_done_after_an_overwrite_that_was_killed(tmp_path: P
     assert plan_fleet(recordings[:1], tmp_path / "out", options, "summary.json", False).done == frozenset()
     assert sorted(path.name for path in (tmp_path / "out" / "a").iterdir()) == ["image.tif"]
     assert (tmp_path / "out" / "b" / "summary.json").read_text(encoding="utf-8") == "old"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [],
+        {"recordings": {}},
+        {"options": "first"},
+        {"options": "first", "recordings": []},
+        *({"options": "first", "recordings": {"a.h5": entry}} for entry in (3, {}, {"folder": "a"})),
+        *(
+            {"options": "first", "recordings": {"a.h5": {"folder": folder, "file": None}}}
+            for folder in (3, ["a"], "", "..", "../a")
+        ),
+    ],
+)
+def test_a_damaged_list_of_folders_is_named_and_left(tmp_path: Path, content: object) -> None:
+    (tmp_path / "out").mkdir()
+    job = tmp_path / "out" / fleet.JOB_FILE
+    job.write_text(json.dumps(content).replace("a.h5", str(tmp_path / "a.h5")), encoding="utf-8")
+    before = job.read_bytes()
+    (tmp_path / "a.h5").write_bytes(b"a recording")
+    with pytest.raises(BadInput, match=r"job\.json: does not state .*; delete it"):
+        plan_fleet([tmp_path / "a.h5"], tmp_path / "out", "first", "summary.json", False)
+    assert job.read_bytes() == before
 
 
 def test_registered_files_are_part_of_what_results_were_made_with(
