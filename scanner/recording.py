@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scanner.arguments import check_numbers
 from scanner.channel import USED_CHANNELS, Channel, make_channel
 from scanner.channel_names import list_names
 from scanner.device import Device
@@ -277,10 +278,11 @@ class Recording:
         It is a recording by itself: drifts of a device begin at its start.
 
         Raises:
-            BadInput: the interval holds no sample of any channel.
+            BadInput: the interval holds no sample of any channel, or a limit is no number.
         """
+        check_numbers(t0=t0, t1=t1)
         cuts = {name: _cut(channel, t0, t1) for name, channel in self.channels.items()}
-        nonempty = {name: channel for name, channel in cuts.items() if channel.size}
+        nonempty = {name: channel for name, channel in cuts.items() if channel.size and t0 < t1}  # False of NaN
         if not nonempty:
             what = f"holds nothing from {t0:g} s to {t1:g} s"
             raise BadInput(what, file=self.path, hint=f"it runs from {self.start:g} s to {self.end:g} s")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import inf, nan, pi
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -342,3 +343,12 @@ def test_a_missing_channel_is_reported_beside_the_edges_that_are_there() -> None
     )
     with pytest.raises(BadInput, match=r"it holds intensity, sync_x$"):
         recording.require("drive_x")
+
+
+@pytest.mark.parametrize("limits", [("a", 0.1), (None, 0.1), (0.0, [0.1]), (0.05, nan), (nan, 0.1)])
+def test_limits_of_a_slice_that_are_no_numbers_are_refused(limits: Any) -> None:
+    recording = Recording.from_arrays({"sense_x": (np.zeros(100), "V", 1000.0, 0.0)})
+    for cut in (recording.slice, recording.part):
+        with pytest.raises(BadInput, match=r"give a number|holds nothing from"):
+            cut(*limits)
+    assert recording.slice(0.05, np.inf)["sense_x"].size == 50
