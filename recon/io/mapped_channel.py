@@ -24,11 +24,12 @@ from scanner.channel import (
     SampleSource,
     make_channel,
 )
-from scanner.edges import Edges, make_edges
+from scanner.edges import EDGE_UNITS, Edges, make_edges
 from scanner.errors import BadInput, UnitUnknown
 
 CHANNEL_KEYS = ("variable", "unit", "sample_rate", "start", "time", "scale", "offset", "row", "reference", "level")
-EDGE_KEYS = ("variable", "unit", "event", "angle", "hysteresis")
+CLOCK_KEYS = ("sample_rate", "start", "time")
+EDGE_KEYS = ("variable", "unit", "event", "angle", "hysteresis", *CLOCK_KEYS)
 
 OPTION_OF_KEY = {"unit": "--unit {name}=UNIT", "sample_rate": "--rate {name}=HZ or --time {name}=COLUMN"}
 """Option that states a key of a channel."""
@@ -101,20 +102,11 @@ def map_channel(request: Request) -> Channel:
     scale, offset = _number(spec.get("scale", 1.0)), _number(spec.get("offset", 0.0))
     if not scale or offset is None:
         raise request.bad("scale must be a number other than 0, offset a number", "channel = scale * variable + offset")
-    rate: Any
-    if "time" in spec:
-        if "sample_rate" in spec:
-            raise request.bad("says time and sample_rate", "the times state the rate")
-        rate, first_time = _clock(_find(request, spec["time"]), spec["time"], request.bad)
-        start = spec.get("start", first_time)
-    else:
-        rate, start = spec.get("sample_rate", variable.sample_rate), spec.get("start", variable.start or 0.0)
+    rate, start = _stated_clock(request, variable)
     unit = spec.get("unit", None if scaled else variable.unit)  # the file states the unit before scaling
     for key, value in (("sample_rate", rate), ("unit", unit)):
         if value is None:
-            because = f", and the file states none{f' ({variable.note})' if variable.note else ''}"
-            what = f"no {key} is stated for variable {spec['variable']!r}{because}"
-            raise request.bad(what, f"{request.how_to_state(key)}; {request.holds}")
+            raise _not_stated(request, key, variable)
     lock_in = {key: spec.get(key) for key in ("reference", "level")}
     try:
         return make_channel(
@@ -137,6 +129,28 @@ def map_channel(request: Request) -> Channel:
         )
         hint = f"{error.hint}; of counts of a converter, state the unit after scaling and its size per count: {example}"
         raise UnitUnknown(error.what, file=error.file, channel=error.channel, hint=hint) from None
+
+
+def _stated_clock(request: Request, variable: Variable) -> tuple[Any, Any]:
+    """Sample rate [Hz], None where nothing states it, and start [s] of a channel, by its statements, else by the file.
+
+    Raises:
+        BadInput: times and rate are both stated, or the times are no clock.
+    """
+    spec = request.spec
+    if "time" not in spec:
+        return spec.get("sample_rate", variable.sample_rate), spec.get("start", variable.start or 0.0)
+    if "sample_rate" in spec:
+        raise request.bad("says time and sample_rate", "the times state the rate")
+    rate, first_time = _clock(_find(request, spec["time"]), spec["time"], request.bad)
+    return rate, spec.get("start", first_time)
+
+
+def _not_stated(request: Request, key: str, variable: Variable) -> BadInput:
+    """The exception for a key that neither the statements nor the file contain."""
+    because = f", and the file states none{f' ({variable.note})' if variable.note else ''}"
+    what = f"no {key} is stated for variable {request.spec['variable']!r}{because}"
+    return request.bad(what, f"{request.how_to_state(key)}; {request.holds}")
 
 
 def is_scaled(spec: Mapping[str, Any]) -> bool:
@@ -248,6 +262,8 @@ def _from_quadratures(variable: Variable, wants_phase: bool, bad: Callable[[str,
 def map_edges(request: Request) -> Edges:
     """The edge times that are asked for; the mapping states ``variable``, ``unit`` and ``event`` or ``angle``.
 
+    A variable in volts is the sampled sync signal, whose clock is stated as that of every channel.
+
     Raises:
         BadInput: as ``map_channel``.
     """
@@ -262,13 +278,22 @@ def map_edges(request: Request) -> Edges:
         what = f"variable {spec['variable']!r} of shape {variable.raw.shape} is no list of numbers"
         raise request.bad(what, f"name the list of edge times, or the sync signal; {request.holds}")
     times = column[0 : column.shape[0]]
-    stated = {"unit": variable.unit} | {key: value for key, value in spec.items() if key != "variable"}
-    if stated["unit"] in CONVERSIONS["V"] and variable.sample_rate:  # the sync signal itself
-        event = str(stated.get("event", "both-edges"))
-        times = find_edges(np.asarray(times, np.float64), variable.sample_rate, variable.start or 0.0, event)
+    clock = [key for key in CLOCK_KEYS if key in spec]
+    stated = {"unit": variable.unit} | {key: spec[key] for key in spec if key not in ("variable", *clock)}
+    if stated["unit"] in CONVERSIONS["V"]:  # the sync signal itself
+        rate, start = (_number(value) for value in _stated_clock(request, variable))
+        if rate is None and "sample_rate" not in spec:
+            raise _not_stated(request, "sample_rate", variable)
+        if rate is None or rate <= 0.0 or start is None:
+            raise request.bad("sample_rate must be a number above 0, start a number", "state them in Hz and s")
+        times = find_edges(np.asarray(times, np.float64), rate, start, str(stated.get("event", "both-edges")))
         if not times.size:
             raise request.bad(f"{spec['variable']!r} has no edge: it stays at one level", "name the sync signal")
         stated["unit"] = "s"
+    elif clock and stated["unit"] in EDGE_UNITS:
+        what = f"states {clock[0]}, but {spec['variable']!r} in {stated['unit']} is a list of edge times"
+        hint = "state it of the other channels only; the unit of a sampled sync signal is V"
+        raise request.bad(what, hint)
     return make_edges(request.name, times, stated, request.place)
 
 

@@ -104,7 +104,8 @@ def test_edge_times_become_a_sync_channel(tmp_path: Path) -> None:
     assert summary["edges"] == {"sync_x": {"number": 20, "event": "both-edges"}}
     with Recording.open(tmp_path / "a.h5") as made:
         assert np.allclose(made.edges["sync_x"].times, 1e-6 * np.arange(20.0))
-    for change, line in (({"unit": "V"}, "unit 'V' is unknown"), ({"rate": 1.0}, "rate is not a known key of edges")):
+    unclocked, unknown = "no sample_rate is stated for variable 'edges'", "rate is not a known key of edges"
+    for change, line in (({"unit": "V"}, unclocked), ({"rate": 1.0}, unknown)):
         wrong = channels | {"sync_x": channels["sync_x"] | change}
         with pytest.raises(BadInput, match=line):
             convert(tmp_path / "a.npz", {"channels": wrong})

@@ -1,5 +1,6 @@
 """Edges of a sync signal that was sampled with the other channels."""
 
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -38,3 +39,27 @@ def test_a_signal_at_one_level_is_refused(tmp_path: Path) -> None:
     mapping = {"channels": {"sync_x": {"variable": "Sync", "unit": "V", "event": "both-edges"}}}
     with pytest.raises(BadInput, match="'Sync' has no edge: it stays at one level"):
         convert(tmp_path / "scope.csv", mapping)
+
+
+def test_the_clock_of_a_sampled_signal_is_stated_as_that_of_a_channel(tmp_path: Path) -> None:
+    times = 0.5 + np.arange(500) / 1e6
+    np.savez(tmp_path / "a.npz", sync=5.0 * (np.arange(500) // 50 % 2), t=times, edges=times[::50])
+    spec = {"variable": "sync", "unit": "V", "event": "both-edges"}
+
+    def edges(**statements: object) -> np.ndarray:
+        return convert(tmp_path / "a.npz", {"channels": {"sync_x": spec | statements}}).edges["sync_x"].times
+
+    expected = 0.5 + (np.arange(50, 500, 50) - 0.5) / 1e6
+    np.testing.assert_allclose(edges(time="t"), expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(edges(sample_rate=1e6, start=0.5), expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(edges(time="t", start=0.0), expected - 0.5, rtol=0.0, atol=1e-12)
+    for statements, line in (
+        ({}, "no sample_rate is stated for variable 'sync'"),
+        ({"time": "t", "sample_rate": 1e6}, "says time and sample_rate"),
+        ({"sample_rate": -1e6}, "must be a number above 0"),
+        ({"sample_rate": "1e6"}, "must be a number above 0"),
+        ({"sample_rate": 1e6, "start": nan}, "must be a number above 0, start a number"),
+        ({"variable": "edges", "unit": "s", "sample_rate": 1e6}, "states sample_rate, but 'edges' in s is a list"),
+    ):
+        with pytest.raises(BadInput, match=line):
+            edges(**statements)
