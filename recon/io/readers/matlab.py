@@ -21,6 +21,11 @@ from scanner.errors import BadInput
 from scanner.files import check_claim
 from scanner.hdf5 import MAX_GROUP_DEPTH
 
+
+class ComplexValues(BadInput):
+    """A variable that is complex, or holds a complex field, was read as real numbers."""
+
+
 Load = Callable[[str], NDArray[Any]]
 
 DTYPES = {"double": "f8", "single": "f4", "logical": "?", "char": "U1"} | {
@@ -58,10 +63,12 @@ def _through_scipy(path: Path, read: Callable[..., Any], **options: Any) -> Any:
         raise BadInput("no such file", file=path, hint="name the instrument's file")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", np.exceptions.ComplexWarning)  # refuse complex samples
+            warnings.simplefilter("error", np.exceptions.ComplexWarning)  # which would lose the imaginary part
             return read(path, **options)
     except MemoryError:
         raise
+    except np.exceptions.ComplexWarning:
+        raise ComplexValues("holds complex values", file=path) from None
     except Exception as error:  # a damaged file can make the parser raise anything
         what = f"is not a whole MATLAB file: {error or type(error).__name__}"
         raise BadInput(what, file=path, hint="copy or save it again") from None
@@ -74,7 +81,11 @@ def _lazy(path: Path, load: Load, name: str, shape: tuple[int, ...], kind: str) 
     shape = vector(shape)
 
     def fetch(first: int, stop: int) -> NDArray[Any]:
-        return load(name).reshape(shape)[first:stop]
+        values = load(name)
+        if values.dtype.kind == "c":  # the file's directory does not state it
+            hint = "save real and imaginary part as two variables"
+            raise BadInput("holds complex values", file=path, channel=name, hint=hint)
+        return values.reshape(shape)[first:stop]
 
     return LazySamples(shape, dtype, fetch)
 
@@ -105,7 +116,11 @@ def _fields(load: Load, name: str, value: NDArray[Any], keys: tuple[str, ...] = 
 def _load(path: Path, name: str) -> NDArray[Any]:
     from scipy.io import loadmat
 
-    content = _through_scipy(path, loadmat, variable_names=[name], mat_dtype=True)
+    read = partial(_through_scipy, path, loadmat, variable_names=[name])
+    try:
+        content = read(mat_dtype=True)
+    except ComplexValues:
+        content = read()  # complex fields remain complex; whole numbers have the type in which the file stores them
     if name not in content:
         raise BadInput("cannot be read", file=path, channel=name, hint="copy or save the file again")
     return content[name]

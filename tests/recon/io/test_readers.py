@@ -131,6 +131,16 @@ def test_matlab_files_before_7_3_are_read(tmp_path: Path, kind: str, version: st
     np.testing.assert_array_equal(variables["two"].raw[1:], values.reshape(3, 2)[1:])
 
 
+def test_a_complex_field_leaves_the_real_ones_of_its_structure(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    savemat(path, {"d": {"x": np.arange(8.0), "z": np.arange(8.0) * 1j}, "z": np.arange(8.0) * 1j})
+    variables = read(path).variables
+    assert variables["d.x"].is_signal and not variables["d.z"].is_signal
+    np.testing.assert_array_equal(variables["d.x"].raw[2:5], [2.0, 3.0, 4.0])
+    with pytest.raises(BadInput, match=r"a\.mat: z: holds complex values; save real and imaginary part"):
+        variables["z"].raw[0:8]
+
+
 def test_complex_matlab_variables_are_refused(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"v": VALUES + 1j})
     plan = {"channels": {"intensity": {"variable": "v", "unit": "V", "sample_rate": 1.0}}}
