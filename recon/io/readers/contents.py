@@ -131,6 +131,9 @@ def infer_clock(times: SampleSource) -> tuple[float | None, float | None, str]:
         Rate (None if the times are not uniform), start, and a note that says where they are not uniform, else empty.
     """
     size = times.shape[0]
+    missing = _first_missing(times)
+    if missing is not None:
+        return None, None, f"the time of sample {missing} is missing"
     first, last = (float(times[at : at + 1][0]) for at in (0, size - 1))
     with np.errstate(all="ignore"):
         step = (np.float64(last) - first) / max(size - 1, 1)
@@ -158,6 +161,15 @@ def agree_on_clock(times: SampleSource, stated: float | None) -> tuple[float | N
     if abs(stated / measured - 1.0) * times.shape[0] <= 1.0:
         return stated, start, note
     return float(f"{measured:.12g}"), start, f"its times give {measured:.6g} Hz, and the header states {stated:.6g} Hz"
+
+
+def _first_missing(times: SampleSource) -> int | None:
+    """Index of the first time that is not finite; None if all are."""
+    for low in range(0, times.shape[0], READ_CHUNK_SAMPLES):
+        finite = np.isfinite(np.asarray(times[low : low + READ_CHUNK_SAMPLES], np.float64))
+        if not finite.all():
+            return low + int(np.argmin(finite))
+    return None
 
 
 def _find_jump(times: SampleSource, size: int) -> str:

@@ -109,3 +109,13 @@ def test_edge_times_become_a_sync_channel(tmp_path: Path) -> None:
         wrong = channels | {"sync_x": channels["sync_x"] | change}
         with pytest.raises(BadInput, match=line):
             convert(tmp_path / "a.npz", {"channels": wrong})
+
+
+@pytest.mark.parametrize("at", [0, 5, 99])
+def test_a_missing_time_is_named(tmp_path: Path, at: int) -> None:
+    times = np.arange(100) / 1e5
+    times[at] = np.nan
+    np.savez(tmp_path / "a.npz", v=np.zeros(100), t=times)
+    mapping = {"channels": {"sense_x": {"variable": "v", "unit": "V", "time": "t"}}}
+    with pytest.raises(BadInput, match=f"time = 't' is no clock: the time of sample {at} is missing"):
+        convert(tmp_path / "a.npz", mapping)
