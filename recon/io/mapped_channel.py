@@ -142,7 +142,12 @@ def _stated_clock(request: Request, variable: Variable) -> tuple[Any, Any]:
         return spec.get("sample_rate", variable.sample_rate), spec.get("start", variable.start or 0.0)
     if "sample_rate" in spec:
         raise request.bad("says time and sample_rate", "the times state the rate")
-    rate, first_time = _clock(_find(request, spec["time"]), spec["time"], request.bad)
+    times = _find(request, spec["time"])
+    rate, first_time = _clock(times, spec["time"], request.bad)
+    number, size = flatten_vector(times.raw).shape[0], _samples(request, variable).shape[0]
+    if number != size:
+        what = f"time = {spec['time']!r} holds {number} times, and {spec['variable']!r} {size} samples"
+        raise request.bad(what, "name the column of their times, or state the sample rate in their place")
     return rate, spec.get("start", first_time)
 
 

@@ -119,3 +119,21 @@ def test_a_missing_time_is_named(tmp_path: Path, at: int) -> None:
     mapping = {"channels": {"sense_x": {"variable": "v", "unit": "V", "time": "t"}}}
     with pytest.raises(BadInput, match=f"time = 't' is no clock: the time of sample {at} is missing"):
         convert(tmp_path / "a.npz", mapping)
+
+
+def test_times_of_another_number_than_the_samples_are_refused(tmp_path: Path) -> None:
+    values = {"v": np.zeros(1000), "w": np.zeros(1000), "rows": np.zeros((2, 1000))}
+    np.savez(tmp_path / "a.npz", every=np.arange(1000.0), tenth=10.0 * np.arange(100), **values)
+    specs = [
+        ("sense_x", {"variable": "v", "unit": "V"}),
+        ("sense_x", {"variable": "rows", "row": 1, "unit": "V"}),
+        ("intensity", {"variable": ["v", "w"], "unit": "V"}),
+    ]
+    for name, spec in specs:
+        made = convert(tmp_path / "a.npz", {"channels": {name: spec | {"time": "every"}}})
+        assert made[name].sample_rate == 1.0
+        with pytest.raises(BadInput, match=r"time = 'tenth' holds 100 times, and .* 1000 samples"):
+            convert(tmp_path / "a.npz", {"channels": {name: spec | {"time": "tenth"}}})
+    sync = {"variable": "v", "unit": "V", "time": "tenth", "event": "both-edges"}
+    with pytest.raises(BadInput, match="holds 100 times"):
+        convert(tmp_path / "a.npz", {"channels": {"sync_x": sync}})
