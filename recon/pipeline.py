@@ -35,6 +35,7 @@ from recon.quality.amplitude_check import (
 from recon.quality.centre_motion import describe_centre_motion
 from recon.quality.clock_jumps import mark_path_during_jumps
 from recon.quality.defects import PHASE_JUMP, Defect, describe_defects, unlocated_samples
+from recon.quality.drive_size import describe_drive_sizes
 from recon.quality.dropped_samples import (
     TimingBreak,
     find_timing_break,
@@ -168,7 +169,7 @@ def estimate_motion(
     motion, sign_notes = follow_signs(motion, device, prepared.intensity, recording.origin)
     grid, field_notes = _picture_grid(device, motion, options)
     notes = [*notes, *sign_notes, *motion.notes, *describe_unconfirmed_signs(recording, device, motion)]
-    notes += describe_resonance_mismatch(device, motion)
+    notes += [*describe_resonance_mismatch(device, motion), *describe_drive_sizes(recording, device, motion)]
     motion = without_contradicted_signs(recording, device, motion)
     return _leave_out_lost_signals(EstimatedMotion(prepared, motion, grid, field_notes, notes))
 
