@@ -53,7 +53,8 @@ def diagnose_each(
 
     started, paths = time.perf_counter(), find_recordings(places)
     nominal = None if device is None else devices.find(device)
-    fleet = plan_fleet(paths, output, state_inputs(nominal, mapping), "diagnosis.json", overwrite)
+    stated = state_inputs(nominal, mapping)
+    fleet = plan_fleet(paths, output, stated, "diagnosis.json", overwrite, ("verdict", "findings"))
     where = device if nominal is None or not Path(str(device)).is_file() else Path(str(device)).absolute()
     work = partial(_diagnose_one, where, mapping and mapping.absolute())
     failures = run_fleet(fleet, work, "diagnose", scheduler, workers)

@@ -76,7 +76,7 @@ def reconstruct_files(
     started, paths = time.perf_counter(), find_recordings(paths)
     alone = options if options.wants_frames else replace(options, zarr=False, movie=None)  # a stack's own options
     stated = f"{replace(alone, device=None)} {state_inputs(options.device, mapping)}"
-    fleet = plan_fleet(paths, output, stated, "summary.json", overwrite)
+    fleet = plan_fleet(paths, output, stated, "summary.json", overwrite, TABLE_KEYS)
     work = partial(_reconstruct_one, options, mapping and mapping.absolute())
     failures = run_fleet(fleet, work, "reconstruct", scheduler, workers)
     rows: list[Row] = []

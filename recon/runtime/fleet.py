@@ -9,7 +9,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass
 from glob import escape
@@ -115,16 +115,19 @@ def _digest(content: object) -> str | None:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, overwrite: bool) -> Fleet:
+def plan_fleet(
+    paths: Sequence[Path], output: Path, options: str, result: str, overwrite: bool, keys: Collection[str] = ()
+) -> Fleet:
     """Assign a folder to each recording, and find those that an earlier run has completed.
 
     Args:
         paths: the recordings.
         output: folder of the folders; it is made.
         options: of the work, as text. Folders that were made with others are neither used nor replaced.
-        result: file that a completed folder holds.
+        result: JSON file that a completed folder holds.
         overwrite: do everything anew. The ``result`` of each recording is deleted, and no other file, before the new
             options are written: after a kill, what is left of the old results is not taken as done.
+        keys: that ``result`` states. A damaged one, as of a disk that was full, is done anew.
 
     Raises:
         BadInput: ``output`` cannot be written, or holds results of other options or of a recording that has changed.
@@ -151,7 +154,7 @@ def plan_fleet(paths: Sequence[Path], output: Path, options: str, result: str, o
             known[key] = {"folder": name}
         known[key]["file"] = stamp
         folders[path] = output.absolute() / known[key]["folder"]
-        if not overwrite and (folders[path] / result).is_file():
+        if not overwrite and _is_whole(folders[path] / result, keys):
             done.add(path)
     if overwrite:
         for folder in folders.values():
@@ -272,6 +275,15 @@ def _submit(executor: Executor, task: Callable[[], Failure | None]) -> Future[Fa
         broken: Future[Failure | None] = Future()
         broken.set_exception(error)
         return broken
+
+
+def _is_whole(result: Path, keys: Collection[str]) -> bool:
+    """Whether a file is a JSON object that states the keys."""
+    try:
+        content = json.loads(result.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and content.keys() >= set(keys)
 
 
 def _read_job(output: Path) -> dict[str, Any]:

@@ -94,6 +94,22 @@ def test_a_damaged_list_of_folders_is_named_and_left(tmp_path: Path, content: ob
     assert job.read_bytes() == before
 
 
+@pytest.mark.parametrize("content", ["", '{"fill": 0.', "[]", "3", '{"fill": 0.5}'])
+def test_a_recording_whose_result_is_damaged_is_done_anew(tmp_path: Path, content: str) -> None:
+    recording = tmp_path / "a.h5"
+    recording.write_bytes(b"a recording")
+
+    def plan() -> fleet.Fleet:
+        return plan_fleet([recording], tmp_path / "out", "first", "summary.json", False, ("fill", "samples"))
+
+    folder = plan().folders[recording]
+    folder.mkdir()
+    (folder / "summary.json").write_text('{"fill": 0.5, "samples": 3}', encoding="utf-8")
+    assert plan().done == {recording}
+    (folder / "summary.json").write_text(content, encoding="utf-8")
+    assert plan().done == frozenset()
+
+
 def test_registered_files_are_part_of_what_results_were_made_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
