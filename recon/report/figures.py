@@ -169,10 +169,12 @@ def phase_figure(
         motions: of the axis, by estimator.
         bound: p/m [rad].
         errors: against the truth, by estimator.
-        picture_errors: (time, value, sd) of the phase error measured in the picture [s, rad, rad].
+        picture_errors: (time, value, sd) of the phase error measured in the picture [s, rad, rad]; those whose sd is
+            not finite are left out.
         name_of_axis: for the label.
     """
-    lower = bool(errors) or bool(picture_errors)
+    known = [measurement for measurement in picture_errors if np.isfinite(measurement[2])]
+    lower = bool(errors) or bool(known)
     drawing, axes = new_figure(2 if lower else 1, 1, (NARROW_WIDTH_IN, 4.4 if lower else 2.4))
     top = axes[0, 0]
     for (name, axis), colour in zip(motions.items(), COLOURS, strict=False):
@@ -187,12 +189,12 @@ def phase_figure(
     top.legend(**LEGEND, ncols=2)
     if lower:
         bottom = axes[1, 0]
+        bottom.sharex(top)
         largest = np.degrees(bound)
         bottom.axhspan(-largest, largest, color="#3d8f5f", alpha=0.15, lw=0, label="±p/m")
         for (name, error), colour in zip(errors.items(), COLOURS, strict=False):
             t, phase = min_max_envelope(error.time, np.degrees(error.phase))
             bottom.plot(1e3 * t, phase, color=colour, lw=1.0, label=f"{name}: true error")
-        known = [measurement for measurement in picture_errors if np.isfinite(measurement[2])]
         if known:
             t, value, sd = (np.array(column) for column in zip(*known, strict=True))
             bottom.errorbar(

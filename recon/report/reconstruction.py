@@ -190,10 +190,10 @@ def phase_figures(results: Mapping[str, Reconstruction]) -> list[Figure]:
         motions = {name: result.motion.axes[axis] for name, result in results.items()}
         errors = {name: result.evaluation[axis] for name, result in results.items() if axis in result.evaluation}
         shown = [(e.time, *getattr(e, axis)) for e in first.phase_errors] if len(results) == 1 else []
+        shown = [measured for measured in shown if np.isfinite(measured[2])]
         uri = phase_figure(motions, first.phase_bound(axis), errors, shown, axis)
-        figures.append(
-            Figure(uri, f"axis {axis}: phase with ±2 standard deviations, and its error with the bound ±p/m")
-        )
+        error = ", and its error with the bound ±p/m" if errors or shown else "; nothing shows its error"
+        figures.append(Figure(uri, f"axis {axis}: phase with ±2 standard deviations{error}"))
     return figures
 
 
