@@ -220,14 +220,16 @@ def _rigol(head: list[list[str]]) -> Layout:
 
 
 def _tektronix_above(head: list[list[str]], keys: dict[str, list[str]], width: int) -> Layout:
-    """MSO, DPO, MDO, TBS, and Siglent: lines of ``key,value``, the last one ``TIME,CH1`` or ``Second,Volt``."""
+    """MSO, DPO, MDO, TBS, and Siglent: lines of ``key,value``, the last one ``TIME,CH1``, or ``Second,Volt`` below
+    ``Source,CH1``."""
     seconds = "".join(keys["horizontal units"][:1]).lower() in NAMES_OF_SECONDS
     stated = [unit.rpartition(":")[2] for unit in keys.get("vertical units", [])]  # Siglent writes CH1:V
     units = ["", *_padded(stated, width - 1)]
     rate = rate_from_step(parse_number("".join(keys["sample interval"][:1]))) if seconds else None
-    device = " ".join(keys.get("model", [])[:1])
+    device = " ".join((keys.get("model") or keys.get("model number") or [])[:1])
     times = 0 if seconds and head[-1][0].lower() in TIME_NAMES else None
-    names = _padded(head[-1], width)
+    sources = [name for name in keys.get("source", []) if name]
+    names = [head[-1][0], *sources] if len(sources) == width - 1 else _padded(head[-1], width)
     about = {"device": device}
     return Layout("Tektronix CSV", names, units, range(width), len(head), times, None, rate, None, about)
 

@@ -213,3 +213,19 @@ def test_a_table_that_ends_within_a_line_is_still_refused(tmp_path: Path) -> Non
     path.write_text("time,ch1,ch2\n0,1,2\n1,2,3\n2")
     with pytest.raises(BadInput, match="line 4 ends after 1 of 3 columns"):
         read(path)
+
+
+@pytest.mark.parametrize("sources", ["CH1,CH3", "CH1"])
+def test_columns_of_a_siglent_file_have_the_names_of_their_sources(tmp_path: Path, sources: str) -> None:
+    width = sources.count(",") + 1
+    head = [
+        "Record Length,Analog:40", "Sample Interval,0.000005", "Vertical Units,CH1:V,CH3:V", "Horizontal Units,S",
+        "Model Number,SDS2104X", f"Source,{sources}", "Second" + ",Value" * width,
+    ]  # fmt: skip
+    rows = [f"{k * 5e-6:.10f}" + f",{0.1 * k:.4f}" * width for k in range(40)]
+    (tmp_path / "a.csv").write_text("\n".join([*head, *rows]), encoding="utf-8")
+    contents = read(tmp_path / "a.csv")
+    assert list(contents.variables) == sources.split(",")
+    assert contents.variables["CH1"].unit == "V"
+    assert contents.variables["CH1"].sample_rate == 2e5
+    assert contents.about["device"] == "SDS2104X"
