@@ -70,6 +70,9 @@ class PhasorTrack(Protocol):
     def cut_segments(self, first: int, stop: int) -> PhasorSegments:
         """Return segments that begin with sample ``first`` and cover the samples up to ``stop``."""
 
+    def is_in_segments(self, first: int, stop: int) -> bool:
+        """Return whether segments describe the samples ``first`` up to ``stop``: phase and amplitude do not bend."""
+
     def phase(self, time: Array) -> Array:
         """Return the phase u of the motion at ``time`` (n,) [s], also outside the track, shape (n,) [rad]."""
 

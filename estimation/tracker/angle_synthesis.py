@@ -2,13 +2,15 @@
 
 The sample axis is cut into segments of ``SEGMENT_SAMPLES``. At a segment's ends phase, amplitude and harmonics are
 interpolated from the blocks. Within a segment the phase is linear in time, so that the phasors exp(i u) of its samples
-follow from the first one by complex multiplication.
+follow from the first one by complex multiplication. Segments in which phase or amplitude bend, as those of a coarsely
+sampled decay, which are several periods long, are computed sample by sample.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,17 +19,26 @@ from numpy.typing import NDArray
 
 from estimation.reference import PhaseReference
 from scanner.angle_tracks import PhasorSegments
-from scanner.arrays import Array, Complex
+from scanner.arrays import Array, Complex, Mask
 
 Harmonics = NDArray[np.complexfloating[Any, Any]]
 
 SEGMENT_SAMPLES = 256
 """Samples over which the phase is linear in time. At 5 MS/s, 51 us: a drift of 10 Hz/ms bends the phase by 2e-5 rad."""
 
+MAX_SEGMENT_BEND = 1e-4
+"""Largest distance of the phase [rad] or of ln A from a line over a segment: a fiftieth of a pixel of 400 across the
+motion."""
+
 PHASOR_BATCH = 64
 """Phasors that are multiplied together. A power of two that divides SEGMENT_SAMPLES; they fit the first-level cache."""
 
 BATCH_RAMP = np.arange(PHASOR_BATCH, dtype=np.float64)
+
+SEGMENT_RAMP = np.arange(SEGMENT_SAMPLES)
+
+BENT_SEGMENTS = 64
+"""Segments that are computed sample by sample at a time: their harmonics take 2 MB."""
 
 READ_SAMPLES = 1 << 20
 """Samples that ``PhasorAngle.read`` synthesises at a time: bounds the memory of the segments' tables."""
@@ -66,6 +77,50 @@ class PhasorMotion:
             self.harmonics,
         )
         return phase + self.reference.phase(time), harmonics
+
+    def angle(self, time: Array) -> Array:
+        """Angle at ``time`` [s], with one sine for each, shape (n,) [rad]."""
+        phase, harmonics = self.at(time)
+        odd = harmonics.shape[1] == 3
+        first, step = np.exp(1j * phase) if odd else np.ones(time.size), np.exp((2j if odd else 1j) * phase)
+        return np.asarray(first * _polynomial(harmonics, step)).real
+
+    def bends(self, duration: float) -> Array:
+        """Largest distance of phase [rad] or ln A from a line over ``duration`` [s], after each knot: (knots - 1,)."""
+        step = np.diff(self.time)
+        apart = step > 0.0
+        h = np.where(apart, step, 1.0)
+        middle = 0.5 * (self.time[:-1] + self.time[1:])
+        reference = self.reference.phase(self.time)
+        own = 4.0 * (reference[:-1] - 2.0 * self.reference.phase(middle) + reference[1:]) / h**2
+        phase = _largest_curvature(self.phase, self.phase_rate, h) + np.abs(own)
+        log = _largest_curvature(self.log_amplitude, self.log_amplitude_rate, h) + _larger(self.log_amplitude_rate) ** 2
+        jumps = [
+            np.abs(np.diff(values)) + 0.25 * duration * np.abs(np.diff(rates))
+            for values, rates in ((self.phase, self.phase_rate), (self.log_amplitude, self.log_amplitude_rate))
+        ]
+        return np.where(apart, np.maximum(phase, log) * duration**2 / 8.0, np.maximum(*jumps))
+
+
+def _polynomial(coefficients: Complex, x: Complex) -> Complex:
+    """Sum of coefficients[:, n] x^n, shape (n,)."""
+    total = coefficients[:, -1]
+    for column in coefficients.T[-2::-1]:
+        total = total * x + column
+    return total
+
+
+def _larger(values: Array) -> Array:
+    """The larger absolute value at the ends of each interval, shape (knots - 1,)."""
+    return np.asarray(np.maximum(np.abs(values[:-1]), np.abs(values[1:])))
+
+
+def _largest_curvature(values: Array, slopes: Array, step: Array) -> Array:
+    """Largest second derivative of the cubic Hermite polynomial of each interval, shape (knots - 1,)."""
+    mean = np.diff(values) / step
+    first = 6.0 * mean - 4.0 * slopes[:-1] - 2.0 * slopes[1:]
+    last = -6.0 * mean + 2.0 * slopes[:-1] + 4.0 * slopes[1:]
+    return np.asarray(np.maximum(np.abs(first), np.abs(last)) / step)
 
 
 @njit(cache=True, error_model="numpy")
@@ -228,7 +283,30 @@ class PhasorAngle:
             part = out[at : at + READ_SAMPLES]
             cut = self.cut_segments(low + at, low + at + part.size)
             _synthesise(cut.first_phasor, cut.step_phasor, cut.harmonics, cut.harmonic_steps, part)
+            bent = np.flatnonzero(self._bent_segments(low + at, low + at + part.size))
+            for few in range(0, bent.size, BENT_SEGMENTS):
+                index = (bent[few : few + BENT_SEGMENTS, None] * SEGMENT_SAMPLES + SEGMENT_RAMP).reshape(-1)
+                index = index[index < part.size]
+                part[index] = self.motion.angle(self.start + (low + at + index) / self.sample_rate)
         return out
+
+    @cached_property
+    def _bends(self) -> Mask:
+        """After which knots a segment bends by more than ``MAX_SEGMENT_BEND``, shape (knots - 1,)."""
+        return np.asarray(self.motion.bends(SEGMENT_SAMPLES / self.sample_rate) > MAX_SEGMENT_BEND)
+
+    def _bent_segments(self, first: int, stop: int) -> Mask:
+        """Which segments from sample ``first`` on are not lines, shape (segments,)."""
+        count = -(-(stop - first) // SEGMENT_SAMPLES)
+        ramp: Array = first + SEGMENT_SAMPLES * np.arange(count + 1, dtype=np.float64)
+        edges = self.start + ramp / self.sample_rate
+        sums = np.append(0, np.cumsum(self._bends))
+        knot = np.clip(np.searchsorted(self.motion.time, edges, "right") - 1, 0, self._bends.size - 1)
+        return np.asarray(sums[knot[1:] + 1] > sums[knot[:-1]])
+
+    def is_in_segments(self, first: int, stop: int) -> bool:
+        """Return whether segments describe the samples ``first`` up to ``stop``, to ``MAX_SEGMENT_BEND``."""
+        return not self._bent_segments(first, stop).any()
 
     def negated(self) -> PhasorAngle:
         """Return the same motion with the opposite sign."""

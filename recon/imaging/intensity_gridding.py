@@ -90,7 +90,13 @@ def add_samples(to: PixelSums, beam: Motion, intensity: Channel, grid: Grid, ran
             samples += int(np.isfinite(values).reshape(len(values), -1).all(axis=1).sum())
         else:
             samples += len(values)
-        if phasors_x is not None and phasors_y is not None and values.ndim == 1:
+        if (
+            phasors_x is not None
+            and phasors_y is not None
+            and values.ndim == 1
+            and phasors_x.is_in_segments(begin, end)
+            and phasors_y.is_in_segments(begin, end)
+        ):
             accumulate_phasors(phasors_x, phasors_y, begin, values, grid, to.sums, to.counts)
         else:
             accumulate_samples(x.read(begin, end), y.read(begin, end), values, grid, to.sums, to.counts)
