@@ -13,7 +13,7 @@ import numpy as np
 from estimation.filters.inputs import FilterInput
 from estimation.reference import PhaseReference
 from scanner.angle_tracks import SampledAngle
-from scanner.arrays import Array
+from scanner.arrays import Array, Complex
 from scanner.channel import Channel
 from scanner.errors import BadInput
 from scanner.lock_in import block_phasors, slow_clock_block
@@ -22,6 +22,9 @@ from scanner.motion import UNKNOWN_PHASE_SD_RAD, AxisMotion
 BLOCK_CYCLES = 4.0
 """Cycles of the motion per point of the slow clock: short against the ring-down of a resonator, long enough that the
 third harmonic averages out."""
+
+HANN_VARIANCE = 1.0 / 12.0 - 0.5 / np.pi**2
+"""Variance of a Hann window as a density, in squares of its length."""
 
 Clock = tuple[float, float, int]
 """Sample rate [Hz], time of the first sample [s] and number of samples."""
@@ -68,7 +71,7 @@ def axis_motion_from_filter(
     channel, reference = problem.sense.channel, problem.references[name]
     f = reference.frequency
     block = slow_clock_block(f, channel.sample_rate, BLOCK_CYCLES, channel.size)
-    time, phasors = block_phasors(filtered.theta[i], channel.sample_rate, channel.start, f, block)
+    time, means = block_phasors(filtered.theta[i], channel.sample_rate, channel.start, f, block)
     if time.size < 2:
         raise BadInput(
             f"is too short to determine the phase of axis {name}: {2 * block} samples are needed",
@@ -76,7 +79,9 @@ def axis_motion_from_filter(
             channel=channel.name,
             hint="record for longer",
         )
-    phase = reference.relative_phase(time, phasors)
+    mean_phase = reference.relative_phase(time, means)
+    phasors = _at_centres(np.abs(means) * np.exp(1j * mean_phase))
+    phase = mean_phase + np.angle(phasors * np.exp(-1j * mean_phase))
     phase += 2 * np.pi * np.round((problem.start.axes[name].phase - phase[0]) / (2 * np.pi))
     track_sample = np.arange(filtered.track.shape[1]) * filtered.stride + filtered.stride
     variance = _phase_variance(filtered.theta[i, track_sample], filtered.track[i], 2 * np.pi * f)
@@ -98,6 +103,17 @@ def axis_motion_from_filter(
         reference_frequency=reference.frequency,
         sign=problem.start.axes[name].sign,
     )
+
+
+def _at_centres(means: Complex) -> Complex:
+    """Phasors at the centres of blocks, from their means under a Hann window over each, both of shape (blocks,).
+
+    The mean of a phasor that bends is beside its value in the centre by half of the second derivative times the
+    variance of the window: 0.7 % of the amplitude in a decay with a Q of 20.
+    """
+    centres = means.copy()
+    centres[1:-1] -= 0.5 * HANN_VARIANCE * np.diff(means, 2)
+    return centres
 
 
 def synthesize_angle(
