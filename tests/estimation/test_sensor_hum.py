@@ -9,9 +9,10 @@ from estimation.filters.baselines import estimate_from_sensor
 from estimation.sensor_hum import find_lines
 from recon.pipeline import reconstruct
 from recon.steps.reconstruction import Options, Reconstruction
-from scanner.device import Device
+from scanner.device import Axis, Device
 from scanner.device_templates import KnownAxis, new_device
 from scanner.recording import Recording
+from scanner.stages import Drive, Mechanics, Position
 
 RATE_HZ = 2e5
 TIME = np.arange(16_000) / RATE_HZ
@@ -113,3 +114,20 @@ def test_lines_are_found_beside_noise_and_no_smaller_one_than_the_motion_changes
     assert (strong.frequency, weak.frequency) == (pytest.approx(50.2, abs=0.05), pytest.approx(99.0, abs=0.1))
     assert (strong.amplitude, weak.amplitude) == (pytest.approx(1.0, abs=0.03), pytest.approx(0.4, abs=0.03))
     assert len(find_lines(CENTRES_S, values, 160.0, 0.5)) == 1
+
+
+@pytest.mark.parametrize("samples_per_period", [8.5, 12.5, 20.4])
+def test_a_period_of_no_whole_number_of_samples_shows_no_hum(samples_per_period: float) -> None:
+    """A line of 2.4 % of the amplitude was found beside 8.5 samples a period, and was subtracted."""
+    frequency, amplitude, quality, inertia = 2000.0, 0.1, 100.0, 1e-12
+    rate = samples_per_period * frequency
+    time, w = np.arange(round(0.6 * rate)) / rate, 2.0 * np.pi * frequency
+    drive = Drive("linear", torque_per_volt=inertia * w**2 * amplitude / quality)
+    readout = Position(gain=10.0, noise_sd=0.002)
+    axis = Axis(Mechanics(inertia, inertia * w / quality, inertia * w**2), drive=drive, readout=readout, name="x")
+    angle, noise = -amplitude * np.cos(w * time), np.random.default_rng(0).normal(0.0, 0.002, time.size)
+    channels = {"drive_x": (np.sin(w * time), "V", rate), "sense_x": (10.0 * angle + noise, "V", rate)}
+    device = Device("steady", {"x": axis})
+    motion = estimate_from_sensor(Recording.from_arrays(channels, device), device)
+    assert not motion.notes
+    assert np.std(motion.axes["x"].angle.read() - angle) < 1.1 * 0.0002
