@@ -12,7 +12,7 @@ import numpy as np
 
 from scanner.arrays import Array, Complex, Mask
 from scanner.channel import MAX_TIME_ROUNDING_SAMPLES, Channel
-from scanner.device import Axis
+from scanner.device import DEFAULT_TOLERANCE, Axis
 from scanner.errors import BadInput
 from scanner.harmonics import readout_response
 from scanner.recording import Recording
@@ -45,6 +45,11 @@ def lock_in_amplitude(recording: Recording, axis: Axis) -> tuple[Array, Array, b
 def is_voltage_of_motion(recording: Recording, axis: Axis) -> bool:
     """Whether amplitude and phase are those of the voltage of a sensor of the motion."""
     return recording[f"amplitude_{axis.name}"].unit != "rad" and isinstance(axis.readout, MotionSensor)
+
+
+def amplitude_tolerance(recording: Recording, axis: Axis) -> float:
+    """Relative standard uncertainty of the amplitude [rad] by that of the gain that it is converted with."""
+    return axis.tolerance.get("gain", DEFAULT_TOLERANCE) if is_voltage_of_motion(recording, axis) else 0.0
 
 
 def recorded_derivatives(recording: Recording, axis: Axis) -> int:

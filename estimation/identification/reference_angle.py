@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimation.lock_in_channels import is_voltage_of_motion, lock_in_angle, lock_in_span
+from estimation.lock_in_channels import amplitude_tolerance, lock_in_angle, lock_in_span
 from estimation.reference import dominant_frequency
 from scanner.arrays import Array
 from scanner.channel import Channel, make_channel
@@ -80,7 +80,7 @@ def find_reference_angle(recording: Recording, axis: Axis, default_tolerance: fl
             raise BadInput(f"has no time in common with drive_{name}", file=held.file, channel=held.name, hint=hint)
         angle = lock_in_angle(recording, axis, time[inside]).values
         channel = _channel(name, angle, drive.sample_rate, float(time[inside][0]))
-        return ReferenceAngle(channel, held.name, tolerance if is_voltage_of_motion(recording, axis) else 0.0)
+        return ReferenceAngle(channel, held.name, amplitude_tolerance(recording, axis))
     if f"sense_{name}" in recording and isinstance(axis.readout, MotionSensor):
         sense, readout = recording[f"sense_{name}"], axis.readout
         check_signal(sense)

@@ -15,9 +15,10 @@ from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.diagnosis.free_decay import confounders_in_one_decay, decay_advice
 from estimation.least_squares import Z_95
-from estimation.lock_in_channels import lock_in_amplitude
+from estimation.lock_in_channels import amplitude_tolerance, lock_in_amplitude
 from estimation.reference import MIN_SAMPLES_PER_PERIOD, dominant_frequency
 from estimation.slow.decay import LAWS, Law
+from estimation.slow.law_units import law_estimate, relative_unit_sd
 from estimation.slow.selection import (
     UNKNOWN_LAW_ERRORS,
     DecayFit,
@@ -30,7 +31,7 @@ from estimation.slow.selection import (
 )
 from scanner.arrays import Array
 from scanner.channel import Channel
-from scanner.device import Axis, Device
+from scanner.device import DEFAULT_TOLERANCE, Axis, Device
 from scanner.errors import BadInput
 from scanner.lock_in import block_length, block_phasors
 from scanner.recording import Recording
@@ -69,6 +70,7 @@ class SlowDecay(NamedTuple):
         time: [s], amplitude: in rad or in another unit, shape (n,).
         in_rad: whether the amplitude is in rad.
         scale: unit of the channel over the unit of ``amplitude``.
+        tolerance: relative standard uncertainty of ``amplitude``, by that of the sensor's gain.
     """
 
     name: str
@@ -77,6 +79,7 @@ class SlowDecay(NamedTuple):
     amplitude: Array
     in_rad: bool
     scale: float
+    tolerance: float = 0.0
 
 
 def slow_decays(recording: Recording, device: Device) -> list[SlowDecay]:
@@ -95,7 +98,8 @@ def slow_decays(recording: Recording, device: Device) -> list[SlowDecay]:
         if f"amplitude_{name}" in recording and not found:
             time, amplitude, in_rad = lock_in_amplitude(recording, axis)
             scale = _largest(recording[f"amplitude_{name}"].read()) / _largest(amplitude)
-            decays.append(SlowDecay(name, f"amplitude_{name}", time, amplitude, in_rad, scale))
+            uncertain = amplitude_tolerance(recording, axis)
+            decays.append(SlowDecay(name, f"amplitude_{name}", time, amplitude, in_rad, scale, uncertain))
             continue
         if axis.mechanics is None or f"drive_{name}" in recording or f"bias_{name}" in recording:
             continue
@@ -112,7 +116,8 @@ def slow_decays(recording: Recording, device: Device) -> list[SlowDecay]:
             values -= values[np.isfinite(values)].mean()
             time, phasors = block_phasors(values, channel.sample_rate, channel.start, frequency, block)
             scale = gain * (2 * np.pi * frequency) ** order
-            decays.append(SlowDecay(name, key, time, np.abs(phasors) / scale, True, scale))
+            uncertain = axis.tolerance.get("gain", DEFAULT_TOLERANCE) if key.startswith("sense") else 0.0
+            decays.append(SlowDecay(name, key, time, np.abs(phasors) / scale, True, scale, uncertain))
     return decays
 
 
@@ -235,7 +240,7 @@ def _finding(
         stage="mechanics",
         effect=law.effect if named else "unknown",
         equation=term.equation if named else "d ln A / dt = -f(A)",
-        parameters=_parameters(law, best, axis, decays, measured[0].in_rad) if named else (),
+        parameters=_parameters(law, best, axis, decays, measured[0]) if named else (),
         where="",
         probability=weights[law.effect] / total if named else 1.0,
         rivals=tuple(rivals),
@@ -275,29 +280,26 @@ def _open_loop(
     return loops
 
 
-def _parameters(law: Law, fit: DecayFit, axis: Axis, decays: Decays, in_rad: bool) -> tuple[ParameterEstimate, ...]:
+def _parameters(
+    law: Law, fit: DecayFit, axis: Axis, decays: Decays, measured: SlowDecay
+) -> tuple[ParameterEstimate, ...]:
     """Parameters of a law in SI units; without an angle, the rate of decay that it adds at the first amplitude."""
-    sd = Z_95 * np.sqrt(np.maximum(np.diag(fit.covariance)[1:], 0.0))
+    sd = np.sqrt(np.maximum(np.diag(fit.covariance)[1:], 0.0))
     duration, first = decays.duration, decays.reference
     if law.power is None:
         beta, log_tau = float(fit.shared[1]), float(fit.shared[2])
-        tau = duration * np.exp(log_tau)
-        ends = tau * np.exp(-sd[1]), tau * np.exp(sd[1])
-        return (
-            ParameterEstimate("beta", beta, (beta - float(sd[0]), beta + float(sd[0])), "1"),
-            ParameterEstimate("tau", float(tau), (float(ends[0]), float(ends[1])), "s"),
-        )
-    rate = float(fit.shared[1]) / duration
-    if not in_rad or axis.mechanics is None:
-        ends = rate - float(sd[0]) / duration, rate + float(sd[0]) / duration
-        return (ParameterEstimate("rate_at_first_amplitude", rate, ends, "1/s"),)
+        tau = float(duration * np.exp(log_tau))
+        ends = float(tau * np.exp(-Z_95 * sd[1])), float(tau * np.exp(Z_95 * sd[1]))
+        return law_estimate("beta", "1", beta, float(sd[0])), ParameterEstimate("tau", tau, ends, "s")
+    rate, rate_sd = float(fit.shared[1]) / duration, float(sd[0]) / duration
+    if not measured.in_rad or axis.mechanics is None:
+        return (law_estimate("rate_at_first_amplitude", "1/s", rate, rate_sd),)
     J, w = axis.mechanics.J, 2 * np.pi * axis.resonance
-    factor = {2.0: 8.0 * J / first**2, 1.0: 0.75 * np.pi * J / (w * first), -1.0: 0.5 * np.pi * J * w * first}[
-        law.power
-    ]
-    ends = factor * (rate - float(sd[0]) / duration), factor * (rate + float(sd[0]) / duration)
+    number, rate_power = {2.0: (8.0, 0.0), 1.0: (0.75 * np.pi, -1.0), -1.0: (0.5 * np.pi, 1.0)}[law.power]
+    factor = number * J * w**rate_power / first**law.power
+    relative_sd = relative_unit_sd(axis, measured.tolerance, law.power, rate_power)
     parameter = catalogue()[law.effect].parameters[0]
-    found = [ParameterEstimate(parameter.name, factor * rate, ends, parameter.unit)]
+    found = [law_estimate(parameter.name, parameter.unit, factor * rate, factor * rate_sd, relative_sd)]
     if law.effect == "coulomb-friction":  # the rate at which friction turns over is far below that of the motion
         turnover = 1e-3 * first * w
         found.append(ParameterEstimate("omega_s", turnover, (0.0, 10.0 * turnover), "rad/s"))

@@ -12,6 +12,7 @@ from estimation.diagnosis.diagnose import Diagnosis
 from estimation.diagnosis.finding import Finding, ParameterEstimate, Rival
 from estimation.least_squares import Z_95
 from estimation.slow.diagnose import MIN_REMAINDER
+from estimation.slow.law_units import law_estimate, relative_unit_sd
 from estimation.slow.response import (
     AMPLITUDE_LAWS,
     DELAY,
@@ -145,23 +146,20 @@ def _parameters(response: Response, axis: Axis, effect: str, fit: ResponseFit) -
             for key, unit, value, sd in zip(("f", "Q"), ("Hz", "1"), fit.modes[i], fit.mode_sd[i], strict=True)
         )
     if effect == FEEDTHROUGH:
-        size = abs(fit.feedthrough) / response.largest
-        spread = Z_95 * fit.feedthrough_sd / response.largest
-        return (ParameterEstimate("fraction_of_largest_amplitude", size, (size - spread, size + spread), "1"),)
+        size, sd = (abs(value) / response.largest for value in (fit.feedthrough, fit.feedthrough_sd))
+        return (law_estimate("fraction_of_largest_amplitude", "1", size, sd),)
     if effect == DELAY:
-        late, spread = fit.delay[0], Z_95 * fit.delay[1]
-        return (ParameterEstimate("delay", late, (late - spread, late + spread), "s"),)
+        return (law_estimate("delay", "s", *fit.delay),)
     value, sd = fit.laws[effect]
     if not response.in_rad or axis.mechanics is None:
         power = {"cubic-stiffness": -2, "cubic-damping": -1, "quadratic-drag": 0, "coulomb-friction": -2}[effect]
         factor = (2.0 * np.pi * float(fit.modes[0, 0])) ** power
-        ends = factor * (value - Z_95 * sd), factor * (value + Z_95 * sd)
-        return (ParameterEstimate("at_largest_amplitude", factor * value, ends, "1"),)
+        return (law_estimate("at_largest_amplitude", "1", factor * value, factor * sd),)
     power = {"cubic-stiffness": -2, "cubic-damping": -2, "quadratic-drag": -1, "coulomb-friction": 1}[effect]
     factor = axis.mechanics.J * response.largest**power
     parameter = catalogue()[effect].parameters[0]
-    ends = factor * (value - Z_95 * sd), factor * (value + Z_95 * sd)
-    return (ParameterEstimate(parameter.name, factor * value, ends, parameter.unit),)
+    relative_sd = relative_unit_sd(axis, response.tolerance, power)
+    return (law_estimate(parameter.name, parameter.unit, factor * value, factor * sd, relative_sd),)
 
 
 def _with_fit(device: Device, response: Response, fit: ResponseFit, findings: Sequence[Finding]) -> Device:

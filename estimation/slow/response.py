@@ -85,6 +85,7 @@ class Response(NamedTuple):
         values: complex amplitude, shape (n,), in rad or in another unit.
         in_rad: whether it is in rad.
         scale: unit of the channel over the unit of ``values``.
+        tolerance: relative standard uncertainty of ``values``, by that of the sensor's gain.
     """
 
     name: str
@@ -92,6 +93,7 @@ class Response(NamedTuple):
     values: Complex
     in_rad: bool
     scale: float
+    tolerance: float = 0.0
 
     @property
     def held_out(self) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.lock_in_channels import lock_in_amplitude
+from estimation.lock_in_channels import amplitude_tolerance, lock_in_amplitude
 from estimation.slow.response import FEEDTHROUGH, MIN_SCORE_GAIN, Response, fit_response
 from scanner.channel import Channel
 from scanner.device import Device
@@ -43,7 +43,8 @@ def frequency_responses(recording: Recording, device: Device) -> list[Response]:
             what = f"holds {counted(np.unique(frequency[good]).size, 'steady tone')}, {MIN_TONES} are needed"
             raise BadInput(what, channel=key, hint="measure tones on both sides of the resonance")
         scale = float(np.abs(recording[key].read())[good].max() / amplitude[good].max())
-        found.append(Response(name, frequency[good], amplitude[good] * np.exp(1j * phase[good]), in_rad, scale))
+        values = amplitude[good] * np.exp(1j * phase[good])
+        found.append(Response(name, frequency[good], values, in_rad, scale, amplitude_tolerance(recording, axis)))
         _check_phase_sign(found[-1], recording[phase_key])
     return found
 
