@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil, floor
 
 import numpy as np
 
 from estimation.device_fit.drive_lines import drive_lines, is_steady, strongest_line
 from estimation.device_fit.resampling import decimate, fast_transform_length, resample_drive
+from estimation.rail import upper_rail
 from estimation.reference import MIN_SAMPLES_PER_PERIOD, sampled_too_slowly
 from scanner.arrays import Array
 from scanner.channel import Channel
@@ -88,6 +90,16 @@ class Output:
     def on_grid(self) -> bool:
         """Whether the samples coincide with the points of the integration grid."""
         return abs(self.first) < 1e-6 and abs(self.stride - 1.0) * self.data.size < 1e-6
+
+    @cached_property
+    def noisy_share(self) -> Array:
+        """Share of every sample of ``data`` that contains noise, shape (n,): samples at a rail of the signal do not."""
+        rails = [(side, rail[0]) for side in (1.0, -1.0) if (rail := upper_rail(side * self.full))]
+        if not rails:
+            return np.ones(self.data.size)
+        free = np.logical_and.reduce([side * self.full < limit for side, limit in rails]).astype(float)
+        decimation = max(1, round(self.step * self.full_rate))
+        return np.clip(free if decimation == 1 else decimate(free, decimation), 0.0, 1.0)[: self.data.size]
 
     def sampled(self, signal: Array) -> Array:
         """``signal``, given on the integration grid, at the samples of this channel up to the end of the grid."""

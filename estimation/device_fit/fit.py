@@ -63,6 +63,8 @@ class Fit:
         jacobian: of the whitened residual, shape (N, p).
         rows: mask of the fitted samples, shape (N,).
         validation_rows: mask of the held-out samples, shape (N,).
+        validation_noise: chi-square of the held-out samples that noise alone has: their number, less where a clipped
+            signal has no noise.
         neg2_log_evidence: by Laplace's method; lower is better.
     """
 
@@ -74,6 +76,7 @@ class Fit:
     jacobian: Array
     rows: Mask
     validation_rows: Mask
+    validation_noise: float
     neg2_log_evidence: float
 
     @property
@@ -85,7 +88,7 @@ class Fit:
     @property
     def validation_chi2(self) -> float:
         """Reduced chi-square of the held-out samples."""
-        return float(np.mean(self.residual[self.validation_rows] ** 2))
+        return float(np.sum(self.residual[self.validation_rows] ** 2)) / self.validation_noise
 
 
 def misfit(fit: Fit) -> float:
@@ -131,6 +134,7 @@ class Likelihood:
         rows, validation_rows: masks over all whitened samples, shape (N,).
         time: of every whitened sample as a fraction of its recording, shape (N,).
         channel: index of its channel, counted over all recordings, shape (N,).
+        validation_noise: chi-square of the held-out samples that noise alone has.
     """
 
     def __init__(self, runs: Sequence[Run], whiteners: Sequence[Sequence[Whitener]]):
@@ -142,6 +146,8 @@ class Likelihood:
         compared = np.concatenate([whitener.keep for whitener in flat])
         validation = _is_held_out(self.time)
         self.rows, self.validation_rows = compared & ~validation, compared & validation
+        noisy_share = np.concatenate([whitener.noisy_share for whitener in flat])
+        self.validation_noise = max(float(noisy_share[self.validation_rows].sum()), 1.0)
         self._whitened: dict[tuple[object, ...], Array] = {}
 
     def fitted(self, stop: float) -> Mask:
@@ -294,4 +300,5 @@ def _finalise_fit(likelihood: Likelihood, model: Model, x: Array, residual: Arra
     information = jacobian[rows].T @ jacobian[rows]
     evidence = laplace_neg2_log_evidence(chi2 + penalty, information, model.precision**-0.5)
     evidence += sum(mains.cost for mains in model.mains) + sum(candidate.cost for candidate in model.candidates)
-    return Fit(model, x, chi2, penalty, residual, jacobian, rows, likelihood.validation_rows, evidence)
+    held_out = likelihood.validation_rows, likelihood.validation_noise
+    return Fit(model, x, chi2, penalty, residual, jacobian, rows, *held_out, evidence)

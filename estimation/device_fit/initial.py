@@ -93,8 +93,9 @@ def estimate_whiteners(model: Model, x: Array) -> list[list[Whitener]]:
             width = 0.06 * max(motions)  # the width of the lines of a decaying motion
             if _lines_overlap(output, lines, width, min(motions)):
                 width = 0.0
-            psd, first = noise_psd(output.data - signal, output.bins, output.step, lines, width)
-            row.append(make_whitener(psd, output.data.size, output.guard, first))
+            share = output.noisy_share if model.clips and output.kind == "sense" else None
+            psd, first = noise_psd(output.data - signal, output.bins, output.step, lines, width, share)
+            row.append(make_whitener(psd, output.data.size, output.guard, first, share))
         whiteners.append(row)
     return whiteners
 

@@ -73,11 +73,11 @@ class Model:
         self.basis, self._pre_saturation_basis = {}, {}
         terms = [candidate.term for candidate in self.candidates]
         terms += [active.term for of_axis in self.given.values() for active in of_axis]
-        clips = any(term.after_noise for term in terms)
+        self.clips = any(term.after_noise for term in terms)
         for r, run in enumerate(self.runs):
             for output in run.outputs:
                 indices, waveforms = self._additive_basis(r, output)
-                if clips and output.kind == "sense":
+                if self.clips and output.kind == "sense":
                     self._pre_saturation_basis[r, output.name] = indices, _on_grid(waveforms, output, run)
                     indices, waveforms = _EMPTY_BASIS
                 self.basis[r, output.name] = indices, waveforms

@@ -50,6 +50,8 @@ class Whitener:
         guard: samples at the start and end of the residual that are not compared.
         psd: variance of every bin, shape (m,).
         first: lowest bin whose noise was measured; the spectrum is extrapolated below it. 0 if all bins were measured.
+        noisy_share: variance of every whitened sample of the noise, below 1 where a clipped signal has none, shape
+            (samples,).
     """
 
     size: int
@@ -57,7 +59,8 @@ class Whitener:
     keep: NDArray[np.bool_]
     guard: tuple[int, int]
     psd: Array
-    first: float = 0.0
+    first: float
+    noisy_share: Array
 
     @property
     def samples(self) -> int:
@@ -102,13 +105,20 @@ def sample_times(samples: int) -> Array:
     return (np.arange(samples) + 0.5) / samples
 
 
-def make_whitener(psd: Array, size: int, guard: tuple[int, int], first: float = 0.0) -> Whitener:
-    """Whitener for noise of variance ``psd``, shape (m,), in the bins of a residual of ``size`` samples."""
+def make_whitener(
+    psd: Array, size: int, guard: tuple[int, int], first: float = 0.0, noisy_share: Array | None = None
+) -> Whitener:
+    """Whitener for noise of variance ``psd``, shape (m,), in the bins of a residual of ``size`` samples.
+
+    Args:
+        noisy_share: of every sample of the residual that contains noise, shape (size,); None for all of it.
+    """
     samples = 2 * (psd.size - 1)
     weights = np.sqrt(size) * np.exp(-0.5 * np.interp(0.5 * np.arange(samples), np.arange(psd.size), np.log(psd)))
     time = sample_times(samples)
     keep = (time >= guard[0] / size) & (time < 1.0 - guard[1] / size)
-    return Whitener(size, weights, keep, guard, psd, first)
+    share = np.ones(samples) if noisy_share is None else np.interp(time, sample_times(size), noisy_share)
+    return Whitener(size, weights, keep, guard, psd, first, share)
 
 
 def flat_psd(data: Array, bins: int) -> Array:
@@ -133,7 +143,12 @@ def _hann(samples: int) -> Array:
 
 
 def noise_psd(
-    residual: Array, bins: int, step: float, lines: Sequence[float] | Array, width: float
+    residual: Array,
+    bins: int,
+    step: float,
+    lines: Sequence[float] | Array,
+    width: float,
+    noisy_share: Array | None = None,
 ) -> tuple[Array, float]:
     """Variance of the noise in every bin of the Fourier transform of a residual.
 
@@ -143,9 +158,10 @@ def noise_psd(
         step: between samples [s].
         lines: frequencies of motion and drive, which are excluded [Hz].
         width: excluded on either side of a line [Hz].
+        noisy_share: of every sample that contains noise, shape (n,); None for all of it.
 
     Returns:
-        variances, shape (bins,), and the lowest bin that was measured.
+        variances of noise in all samples, shape (bins,), and the lowest bin that was measured.
     """
     power = periodogram(_remove_slow_variation(residual))
     bin_width = 1.0 / (residual.size * step)
@@ -155,6 +171,8 @@ def noise_psd(
         usable = _bins_off_lines(frequency, lines, NARROW_EXCLUSION_BINS * bin_width)
     if usable.size < 16:
         usable = np.arange(1, power.size)
+    if noisy_share is not None:
+        power /= max(np.average(noisy_share, weights=_hann(residual.size) ** 2), 1.0 / residual.size)
     psd, first = _running_median(usable.astype(float), power[usable], np.arange(bins, dtype=float))
     return psd, min(first, bins - 1.0)
 

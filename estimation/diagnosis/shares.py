@@ -59,11 +59,12 @@ def misfit_by_channel(fit: Fit) -> dict[str, float]:
 
 
 def noise_by_channel(likelihood: Likelihood) -> dict[str, float]:
-    """Variance of every channel's noise, averaged over its runs."""
+    """Variance of every channel's noise on held-out samples, averaged over its runs."""
     values: dict[str, list[float]] = {}
     for run, whiteners in zip(likelihood.runs, likelihood.whiteners, strict=True):
         for output, whitener in zip(run.outputs, whiteners, strict=True):
-            values.setdefault(output.name, []).append(whitener.measured_noise_variance)
+            noisy_share = float(whitener.noisy_share[held_out_samples(whitener.samples)].mean())
+            values.setdefault(output.name, []).append(noisy_share * whitener.measured_noise_variance)
     return {name: float(np.mean(runs)) for name, runs in values.items()}
 
 

@@ -95,7 +95,8 @@ def test_the_profile_rises_by_the_95_percent_threshold_at_the_interval_ends(fitt
 class Posterior:
     """The likelihood of a model of two parameters for two samples, both fitted, and that model."""
 
-    validation_rows, precision, mains, candidates = np.zeros(2, bool), np.full(2, 1e-12), (), ()
+    validation_rows, validation_noise = np.zeros(2, bool), 1.0
+    precision, mains, candidates = np.full(2, 1e-12), (), ()
 
     def fitted(self, stop: float) -> np.ndarray:
         return ~self.validation_rows
@@ -103,9 +104,8 @@ class Posterior:
     def best(self, *x: float) -> Fit:
         """The fit at ``x``, where the residual is zero."""
         at = np.array(x)
-        return Fit(
-            self, at, 0.0, 0.0, np.zeros(2), self.jacobian(self, at), ~self.validation_rows, self.validation_rows, 0.0
-        )  # type: ignore[arg-type]
+        rows, held_out = ~self.validation_rows, self.validation_rows
+        return Fit(self, at, 0.0, 0.0, np.zeros(2), self.jacobian(self, at), rows, held_out, 1.0, 0.0)  # type: ignore[arg-type]
 
     def prefetch_trajectories(self, *_: object, **__: object) -> None:
         """There are none."""
