@@ -77,10 +77,10 @@ def _near_any(frequency: Array, known: Sequence[_AxisLines]) -> NDArray[np.bool_
 def strongest_interfering_line(fit: Fit) -> float | None:
     """Frequency [Hz] of the strongest line of a sense channel that is no harmonic of motion or drive, or None.
 
-    If there is none and the drive has many lines, a tone that coincides with one of them is returned. Mains hum is
-    included; the fit decides by its amplitude whether it is noise or interference.
+    Where the drive has many lines, a tone that coincides with one of them is a candidate too. Mains hum is included;
+    the fit decides by its amplitude whether it is noise or interference.
     """
-    off_lines = among_lines = (0.0, 0.0)
+    strongest: tuple[float, float | None] = (LINE_DETECTION_RATIO, None)
     model = fit.model
     x = np.array(
         [
@@ -103,16 +103,13 @@ def strongest_interfering_line(fit: Fit) -> float | None:
             around = percentile_filter(power, 50, 2 * NEIGHBOUR_BINS + 1) / MEDIAN_TO_MEAN_POWER
             ratio = power / np.maximum(noise, around)
             ratio[_near_any(frequency, known) | (frequency < 2.5 / duration)] = 0.0
-            off_lines = max(off_lines, _strongest(ratio, power, duration))
+            strongest = max(strongest, _strongest(ratio, power, duration))
             if any(lines.is_broad for lines in known):
                 known = [lines.without_broad_drive(4.0 / duration) for lines in known]
                 ratio = power / percentile_filter(power, 90, 2 * NEIGHBOUR_BINS + 1)
                 ratio[_near_any(frequency, known) | (frequency < 2.5 / duration)] = 0.0
-                among_lines = max(among_lines, _strongest(ratio, power, duration))
-    for height, line in (off_lines, among_lines):
-        if height > LINE_DETECTION_RATIO:
-            return line
-    return None
+                strongest = max(strongest, _strongest(ratio, power, duration))
+    return strongest[1]
 
 
 def _strongest(ratio: Array, power: Array, duration: float) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from estimation.candidate_terms.anchor import fit_anchor, fit_growing, follow_motion, max_residual_ratio, residual_ratio
 from estimation.candidate_terms.curves import CURVE_TERMS
@@ -113,6 +114,15 @@ class SelectionResult:
     final: Fit
     steps: tuple[SelectionStep, ...] = ()
     remaining: float = 0.0
+
+    @cached_property
+    def without_rails(self) -> Fit:
+        """Fit of the nominal device without the rails at which samples stand: their shares are of its misfit."""
+        nominal = self.nominal
+        if not nominal.model.candidates:
+            return nominal
+        model = nominal.model.with_candidates(())
+        return fit_model(self.likelihood, model, model.map_parameters_from(nominal.model, nominal.x))
 
 
 def select_terms(

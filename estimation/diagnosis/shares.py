@@ -77,13 +77,13 @@ def channel_of_share(result: SelectionResult, step: SelectionStep) -> str:
 def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
     """Share that a finding alone explains of the misfit of :func:`channel_of_share`."""
     name, noise = channel_of_share(result, step), noise_by_channel(result.likelihood)
-    reference = step.before if _is_rail(result, step) else result.nominal
+    reference = result.without_rails if _is_rail(result, step) else result.nominal
     without, complete, nominal = (misfit_by_channel(fit)[name] for fit in (step.before, result.final, reference))
     return explained_share(without, complete, nominal, noise[name])
 
 
 def _is_rail(result: SelectionResult, step: SelectionStep) -> bool:
-    """Whether a finding is a rail at which samples stand. The nominal fit has it; shares are of the fit without."""
+    """Whether a finding is a rail at which samples stand. The nominal fit has it; its share is of the fit without."""
     return step.candidate in result.nominal.model.candidates
 
 
@@ -124,8 +124,8 @@ def find_remainder(
     if leaves_noise_alone(result):
         return None
     noise = noise_by_channel(result.likelihood)
-    only_rail = len(result.steps) == 1 and _is_rail(result, result.steps[0])
-    reference = result.steps[0].before if only_rail else result.nominal
+    only_rails = all(_is_rail(result, step) for step in result.steps)
+    reference = result.without_rails if only_rails else result.nominal
     complete, nominal = misfit_by_channel(result.final), misfit_by_channel(reference)
     name = max(complete, key=lambda key: complete[key] / max(noise[key], 1e-300))
     share = remaining_share(complete[name], nominal[name], noise[name])

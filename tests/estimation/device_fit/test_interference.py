@@ -47,6 +47,16 @@ def test_a_foreign_tone_among_the_lines_of_a_multisine_is_detected() -> None:
     assert line == pytest.approx(336.0, abs=3.0)
 
 
+def test_the_stronger_of_a_tone_among_the_lines_of_the_drive_and_one_off_them_is_returned() -> None:
+    rng = np.random.default_rng(8)
+    lines = 20.0 + 15.0 * np.arange(80)
+    drive = 0.3 * np.sin(2 * np.pi * np.multiply.outer(TIME, lines) + rng.uniform(0, 2 * np.pi, 80)).sum(-1)
+    weak = rng.normal(0, NOISE_SD, SAMPLES) + 2e-3 * np.cos(2 * np.pi * 4260.0 * TIME)
+    assert strongest_line(drive, weak) == pytest.approx(4260.0, abs=5.0)
+    line = strongest_line(drive, weak + 3e-2 * np.cos(2 * np.pi * 336.0 * TIME))
+    assert line == pytest.approx(336.0, abs=3.0)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_resonance_of_the_amplifier_is_no_tone_and_hides_none(seed: int) -> None:
     """It is narrower than a band of the noise spectrum, whose median lies far below its peak."""

@@ -97,19 +97,29 @@ def test_what_a_correction_beside_named_laws_still_takes_is_stated(
     assert remainder == (expected if stated else None)
 
 
-def test_the_share_of_a_rail_and_the_remainder_are_of_the_fit_without_the_rail(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("beside", "share", "remainder"), [(False, 0.75, 0.25), (True, 0.125, 0.5)])
+def test_the_share_of_a_rail_is_of_the_nominal_fit_without_it(
+    monkeypatch: pytest.MonkeyPatch, beside: bool, share: float, remainder: float
+) -> None:
+    """A law beside the rail: without the rail the complete model has a small misfit, the nominal one a large one."""
     complete = SimpleNamespace(validation_chi2=9.0)
-    without, nominal = object(), SimpleNamespace(model=SimpleNamespace(candidates=("rail",)))
-    misfits = {id(without): {"sense_x": 9.0}, id(complete): {"sense_x": 3.0}, id(nominal): {"sense_x": 3.0}}
-    monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: misfits[id(fit)])
+    without, without_rails, nominal = object(), object(), SimpleNamespace(model=SimpleNamespace(candidates=("rail",)))
+    misfits = {
+        id(without): 4.0 if beside else 9.0, id(complete): 3.0, id(nominal): 5.0 if beside else 3.0,
+        id(without_rails): 9.0,
+    }  # fmt: skip
+    monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: {"sense_x": misfits[id(fit)]})
     monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 1.0})
     monkeypatch.setattr(shares, "chi2_reduction_by_channel", lambda likelihood, before, after: {"sense_x": 5.0})
     step = SimpleNamespace(before=without, candidate="rail")
-    result = SimpleNamespace(final=complete, nominal=nominal, likelihood=None, steps=(step,), remaining=0.0)
-    assert share_of_finding(cast(SelectionResult, result), cast(SelectionStep, step)) == pytest.approx(0.75)
-    remainder = find_remainder(cast(SelectionResult, result), None)
-    assert remainder is not None
-    assert remainder["share"] == pytest.approx(0.25)
+    steps = (step, SimpleNamespace(before=nominal, candidate="law"))[: 1 + beside]
+    result = SimpleNamespace(
+        final=complete, nominal=nominal, without_rails=without_rails, likelihood=None, steps=steps, remaining=0.0
+    )
+    assert share_of_finding(cast(SelectionResult, result), cast(SelectionStep, step)) == pytest.approx(share)
+    found = find_remainder(cast(SelectionResult, result), None)
+    assert found is not None
+    assert found["share"] == pytest.approx(remainder)
 
 
 def test_shares_beside_further_modes_are_of_the_misfit_of_the_device_without_them() -> None:
