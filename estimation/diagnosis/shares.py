@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from estimation.candidate_terms.discrepancy import is_discrepancy
 from estimation.candidate_terms.linear_model import LinearModel
 from estimation.candidate_terms.linearisation import linear_model_of_corrections
 from estimation.candidate_terms.screening import ScoreTest
 from estimation.candidate_terms.significance import DETECTION_THRESHOLD, residual_is_noise
 from estimation.device_fit.fit import Fit, Likelihood, held_out_samples, misfit
 from estimation.diagnosis.localisation import chi2_reduction_by_channel
+from estimation.diagnosis.pruning import refit_without
 from estimation.diagnosis.selection import SelectionResult, SelectionStep
 
 MAX_UNEXPLAINED_SHARE = 0.1
@@ -77,14 +79,27 @@ def channel_of_share(result: SelectionResult, step: SelectionStep) -> str:
 def share_of_finding(result: SelectionResult, step: SelectionStep) -> float:
     """Share that a finding alone explains of the misfit of :func:`channel_of_share`."""
     name, noise = channel_of_share(result, step), noise_by_channel(result.likelihood)
-    reference = result.without_rails if _is_rail(result, step) else result.nominal
-    without, complete, nominal = (misfit_by_channel(fit)[name] for fit in (step.before, result.final, reference))
+    fits = (step.before, result.final, result.nominal)
+    if _is_rail(result, step):
+        fits = (*_fits_of_named_laws(result, step), result.without_rails)
+    without, complete, nominal = (misfit_by_channel(fit)[name] for fit in fits)
     return explained_share(without, complete, nominal, noise[name])
 
 
 def _is_rail(result: SelectionResult, step: SelectionStep) -> bool:
     """Whether a finding is a rail at which samples stand. The nominal fit has it; its share is of the fit without."""
     return step.candidate in result.nominal.model.candidates
+
+
+def _fits_of_named_laws(result: SelectionResult, step: SelectionStep) -> tuple[Fit, Fit]:
+    """The fits without and with a rail beside the named laws; a free curve of the readout would take its place."""
+    free = [candidate for candidate in result.final.model.candidates if is_discrepancy(candidate)]
+    if not free:
+        return step.before, result.final
+    named = result.final
+    for candidate in free:
+        named = refit_without(result.likelihood, named, candidate)
+    return refit_without(result.likelihood, named, step.candidate), named
 
 
 def leaves_noise_alone(result: SelectionResult) -> bool:

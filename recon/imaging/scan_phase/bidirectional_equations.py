@@ -28,14 +28,16 @@ class NormalEquations(NamedTuple):
     """Normal equations of the module's model.
 
     Attributes:
-        score: of each block and tile, shape (slices, BLOCKS_PER_SLICE, TILES_ACROSS², 2).
+        score: of each block, shape (slices, BLOCKS_PER_SLICE, 2).
         information: of each slice, shape (slices, 2, 2).
         block_information: its diagonal by block, shape (slices, BLOCKS_PER_SLICE, 2).
+        tile_score: of each tile of the field, shape (slices, TILES_ACROSS², 2).
     """
 
     score: Array
     information: Array
     block_information: Array
+    tile_score: Array
 
 
 def normal_equations(samples: RegistrationSamples, error: Array, grid: Grid, cell: float) -> NormalEquations:
@@ -52,10 +54,10 @@ def normal_equations(samples: RegistrationSamples, error: Array, grid: Grid, cel
     counts, sums = fields[..., 0], fields[..., 1]
     picture = np.divide(sums, counts, out=np.full(shape, np.nan), where=counts > 1e-9)
     fields[..., 7], fields[..., 6] = np.nan_to_num(np.gradient(picture)) / cell
-    score = np.zeros((len(error), BLOCKS_PER_SLICE, TILES_ACROSS**2, 2))
-    information, block_information = np.zeros((len(error), 2, 2)), np.zeros((len(error), BLOCKS_PER_SLICE, 2))
-    _accumulate_normal(samples, cos, sin, cell, fields, score, information, block_information)
-    return NormalEquations(score, information, block_information)
+    score, information = np.zeros((len(error), BLOCKS_PER_SLICE, 2)), np.zeros((len(error), 2, 2))
+    equations = NormalEquations(score, information, np.zeros_like(score), np.zeros((len(error), TILES_ACROSS**2, 2)))
+    _accumulate_normal(samples, cos, sin, cell, fields, equations)
+    return equations
 
 
 @numba.njit(cache=True, inline="always")
@@ -91,7 +93,8 @@ def _splat(samples, cos, sin, cell, fields):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate_normal(samples, cos, sin, cell, fields, score, information, block_information):  # type: ignore[no-untyped-def]
+def _accumulate_normal(samples, cos, sin, cell, fields, equations):  # type: ignore[no-untyped-def]
+    score, information, block_information, tile_score = equations
     height, width, _ = fields.shape
     mean = np.empty(8)
     for i in range(samples.x.size):
@@ -109,8 +112,10 @@ def _accumulate_normal(samples, cos, sin, cell, fields, score, information, bloc
         residual -= slope_x * (x - mean[2] / count) + slope_y * (y - mean[3] / count)
         z_x, z_y = slope_x * (dx - mean[4] / count), slope_y * (dy - mean[5] / count)
         tile = TILES_ACROSS * row // height * TILES_ACROSS + TILES_ACROSS * column // width
-        score[s, block, tile, 0] += z_x * residual
-        score[s, block, tile, 1] += z_y * residual
+        score[s, block, 0] += z_x * residual
+        score[s, block, 1] += z_y * residual
+        tile_score[s, tile, 0] += z_x * residual
+        tile_score[s, tile, 1] += z_y * residual
         information[s, 0, 0] += z_x * z_x
         information[s, 0, 1] += z_x * z_y
         information[s, 1, 0] += z_x * z_y

@@ -32,7 +32,7 @@ from recon.imaging.scan_phase.bidirectional_search import (
     RegistrationSamples,
     search_phase_errors,
 )
-from recon.imaging.scan_phase.common_shift import clustered_sd, common_place_factor, common_shift_factor
+from recon.imaging.scan_phase.common_shift import common_place_factor, common_shift_factor
 from recon.imaging.scan_phase.phase_error import PhaseError, PhaseErrorParts, PhaseEstimate
 from recon.imaging.scan_phase.registration_cells import finest_cell
 from recon.imaging.scan_phase.slow_gain import SlowGain, estimate_slow_gain
@@ -276,7 +276,7 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     to_cells = 0.5 * np.array([grid.width, grid.height]) / cell
     for _ in range(10):
         here = normal_equations(samples, error, grid, cell)
-        step = STEP_DAMPING * (np.linalg.pinv(here.information) @ here.score.sum((1, 2))[..., None])[..., 0]
+        step = STEP_DAMPING * (np.linalg.pinv(here.information) @ here.score.sum(1)[..., None])[..., 0]
         step = np.clip(step, -1 / to_cells, 1 / to_cells)  # the gradient is valid within a cell
         error = error + step
         if np.abs(step * to_cells).max() < 0.01:
@@ -285,7 +285,7 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     slope = np.empty_like(here.information)  # by differences: the information would count noise in the gradient
     for axis in range(2):
         shift = np.eye(2)[axis] / to_cells
-        ahead, behind = (normal_equations(samples, error + s, grid, cell).score.sum((1, 2)) for s in (shift, -shift))
+        ahead, behind = (normal_equations(samples, error + s, grid, cell).score.sum(1) for s in (shift, -shift))
         slope[:, :, axis] = (behind - ahead) * to_cells[axis] / 2
     slope_of, expected = (np.diagonal(matrix, axis1=1, axis2=2) for matrix in (slope, here.information))
     # Noise in the gradient makes the slope too small, and detail lost in the smoothing makes it too large. Features of
@@ -294,19 +294,19 @@ def _fit_cells(samples: RegistrationSamples, error: Array, grid: Grid, cell: flo
     determined = clear & (slope_of < 2 * expected) & (expected > 0.05 * expected.max(1, keepdims=True))
     unbiased = ((slope_of > MIN_FINE_SLOPE_RATIO * expected) | ~determined).all(axis=1, keepdims=True)
     value, sd, parts = error.copy(), np.full_like(error, np.inf), _undetermined_parts(len(error))
-    by_place = np.zeros((len(error), here.score.shape[2], 2))
+    by_place = np.zeros_like(here.tile_score)
     for s, axes in enumerate(determined):
         if axes.any():
-            shares = here.score[s][..., axes] @ np.linalg.pinv(slope[s][np.ix_(axes, axes)]).T
+            inverse = np.linalg.pinv(slope[s][np.ix_(axes, axes)]).T
+            shares, by_place[s][:, axes] = here.score[s][:, axes] @ inverse, here.tile_score[s][:, axes] @ inverse
             sd[s, axes] = [
-                clustered_sd(share.reshape(-1, group, share.shape[-1]).sum(axis=1))
-                for share, group in zip(np.moveaxis(shares, -1, 0), np.array(groups)[axes], strict=True)
+                np.linalg.norm(share.reshape(-1, group).sum(axis=1))
+                for share, group in zip(shares.T, np.array(groups)[axes], strict=True)
             ]
-            by_place[s][:, axes] = shares.sum(axis=0)
             weight = here.block_information[s][:, axes].reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
             weight = np.maximum(weight / weight.sum(0), np.finfo(float).tiny)
-            by_part = shares.sum(1).reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
+            by_part = shares.reshape(PARTS_PER_SLICE, -1, axes.sum()).sum(1)
             parts[s][:, axes, 0] = value[s, axes] + by_part / weight
             parts[s][:, axes, 1] = sd[s, axes] / np.sqrt(weight)
-            value[s, axes] += shares.sum((0, 1))
+            value[s, axes] += shares.sum(0)
     return _Fit(value, sd, clear, unbiased, parts, common_place_factor(by_place, sd))

@@ -37,22 +37,10 @@ def common_shift_factor(coarse: tuple[Array, Array], fine: tuple[Array, Array]) 
     return np.where(both.sum(axis=0) >= MIN_COMMON_SLICES, np.sqrt(1.0 + shift / variances[1]), 1.0)
 
 
-def clustered_sd(shares: Array) -> float:
-    """Standard error of a sum whose terms have errors in common within a block of time, or within a place.
-
-    It is the larger of those of sums over blocks and over places, each independent of the others.
-
-    Args:
-        shares: the terms by block and place, shape (blocks, places).
-
-    Source:
-        Cameron and Miller 2015, "A practitioner's guide to cluster-robust inference", section V.
-    """
-    return float(max(np.linalg.norm(shares.sum(axis=1)), np.linalg.norm(shares.sum(axis=0))))
-
-
 def common_place_factor(shares: Array, sd: Array) -> Array:
-    """Factor on the standard errors of slices that allows for errors which repeat at the same places in all of them.
+    """Factor on the standard errors of slices that allows for errors which repeat at the same places.
+
+    The standard error of their mean then is that which follows from the scatter of the places.
 
     Args:
         shares: of the places in the result of each slice, shape (slices, places, axes) [rad].
@@ -60,6 +48,9 @@ def common_place_factor(shares: Array, sd: Array) -> Array:
 
     Returns:
         Shape (axes,), at least 1.
+
+    Source:
+        Cameron and Miller 2015, "A practitioner's guide to cluster-robust inference", section II.
     """
     weight = sd**-2.0
     of_mean = np.linalg.norm((weight[:, None] * shares).sum(axis=0), axis=0)

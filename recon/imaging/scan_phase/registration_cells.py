@@ -13,10 +13,10 @@ from scanner.arrays import Mask
 MIN_SAMPLES_PER_CELL = 2.0
 """Samples per cell below which the pattern of the scan lines biases the result."""
 
-MIN_OCCUPIED_SHARE = 0.7
-"""Share of the cells with a sample below which they count as too fine: with two samples in a cell, figures of
-incommensurate frequencies occupy 0.74 to 0.85. Where the sample rate is a multiple of a frequency, the samples fall on
-columns with empty cells between them, and detail between the columns would shift the phase."""
+MIN_OCCUPANCY = 0.8
+"""Number of cells with a sample, over that of samples at random places, below which cells are too fine. Figures of
+incommensurate frequencies have 0.9 to 1.1. Where the sample rate is a multiple of a frequency, it is 0.4 to 0.6: the
+samples fall on columns with empty cells between them, and detail between the columns would shift the phase."""
 
 MIN_CELLS_ACROSS = 400
 """Cells across the field that are used, if there are samples for them, however few pixels the picture has: coarse cells
@@ -39,7 +39,7 @@ def finest_cell(samples: RegistrationSamples, inside: Mask, grid: Grid) -> float
 
 
 def _occupied_cell(samples: RegistrationSamples, cell: float) -> float:
-    """The smallest size of a cell [px], from ``cell`` on, with samples in ``MIN_OCCUPIED_SHARE`` of the cells; at most
+    """The smallest size of a cell [px], from ``cell`` on, with an occupancy of ``MIN_OCCUPANCY``; at most
     a sixteenth of the smaller side of the field that the samples cover."""
     ranges = [(float(np.min(place)), float(np.ptp(place))) for place in (samples.x, samples.y)]
     most = min(length for _, length in ranges) / 16.0
@@ -50,7 +50,8 @@ def _occupied_cell(samples: RegistrationSamples, cell: float) -> float:
         )
         columns, rows = (math.ceil(length / cell) for _, length in ranges)
         occupied = np.count_nonzero(np.bincount(row * (columns + 1) + column))
-        if occupied >= MIN_OCCUPIED_SHARE * columns * rows:
+        at_random = columns * rows * -math.expm1(-samples.x.size / (columns * rows))
+        if occupied >= MIN_OCCUPANCY * at_random:
             break
         cell *= math.sqrt(2.0)
     return cell

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -97,22 +97,36 @@ def test_what_a_correction_beside_named_laws_still_takes_is_stated(
     assert remainder == (expected if stated else None)
 
 
-@pytest.mark.parametrize(("beside", "share", "remainder"), [(False, 0.75, 0.25), (True, 0.125, 0.5)])
+@pytest.mark.parametrize(
+    ("beside", "share", "remainder"), [(None, 0.75, 0.25), ("cubic-stiffness", 0.125, 0.5), ("free-readout", 0.5, 0.5)]
+)
 def test_the_share_of_a_rail_is_of_the_nominal_fit_without_it(
-    monkeypatch: pytest.MonkeyPatch, beside: bool, share: float, remainder: float
+    monkeypatch: pytest.MonkeyPatch, beside: str | None, share: float, remainder: float
 ) -> None:
-    """A law beside the rail: without the rail the complete model has a small misfit, the nominal one a large one."""
-    complete = SimpleNamespace(validation_chi2=9.0)
-    without, without_rails, nominal = object(), object(), SimpleNamespace(model=SimpleNamespace(candidates=("rail",)))
-    misfits = {
-        id(without): 4.0 if beside else 9.0, id(complete): 3.0, id(nominal): 5.0 if beside else 3.0,
-        id(without_rails): 9.0,
-    }  # fmt: skip
-    monkeypatch.setattr(shares, "misfit_by_channel", lambda fit: {"sense_x": misfits[id(fit)]})
+    """Without the rail, a law beside it leaves a misfit of 4 and the nominal device alone of 9.
+
+    A free curve of the readout takes the place of the rail; its share is that without the curve.
+    """
+
+    def fit(mean_square: float, *effects: str) -> Any:
+        candidates = tuple(SimpleNamespace(term=SimpleNamespace(effect=effect), key=effect) for effect in effects)
+        return SimpleNamespace(mean_square=mean_square, model=SimpleNamespace(candidates=candidates))
+
+    others = () if beside is None else (beside,)
+    complete, nominal = fit(3.0, "saturation", *others), fit(3.0 if beside is None else 5.0, "saturation")
+    without, without_rails = fit(9.0 if beside is None else 4.0, *others), fit(9.0)
+    (rail,), law = nominal.model.candidates, complete.model.candidates[-1]
+    complete.model.candidates = (rail, law)[: 1 + len(others)]
+    monkeypatch.setattr(shares, "misfit_by_channel", lambda each: {"sense_x": each.mean_square})
     monkeypatch.setattr(shares, "noise_by_channel", lambda likelihood: {"sense_x": 1.0})
     monkeypatch.setattr(shares, "chi2_reduction_by_channel", lambda likelihood, before, after: {"sense_x": 5.0})
-    step = SimpleNamespace(before=without, candidate="rail")
-    steps = (step, SimpleNamespace(before=nominal, candidate="law"))[: 1 + beside]
+    monkeypatch.setattr(shares, "is_discrepancy", lambda candidate: candidate.key.startswith("free"))
+    monkeypatch.setattr(
+        shares, "refit_without", lambda likelihood, each, out: without_rails if out is rail else nominal
+    )
+    step = SimpleNamespace(before=without, candidate=rail)
+    steps = (step, SimpleNamespace(before=nominal, candidate=law))[: 1 + len(others)]
+    complete.validation_chi2 = 9.0
     result = SimpleNamespace(
         final=complete, nominal=nominal, without_rails=without_rails, likelihood=None, steps=steps, remaining=0.0
     )
