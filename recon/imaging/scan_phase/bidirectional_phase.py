@@ -210,7 +210,7 @@ def _estimate_phase_errors(
         nothing = np.full((slices, 2), np.nan), np.full((slices, 2), np.inf)
         return *nothing, _undetermined_parts(slices), None, np.ones((slices, 2))
     inside = (2.0 * np.abs(samples.x) < grid.width) & (2.0 * np.abs(samples.y) < grid.height)
-    finest = finest_cell(samples, inside, grid)
+    finest, repeats = finest_cell(samples, inside, grid)
     gain = _slow_gain(samples.select(inside), grid, finest, slices)
     samples = samples._replace(intensity=samples.intensity / gain.at(_slice_time(samples)))
     unknown = np.full(2, np.nan)
@@ -231,7 +231,7 @@ def _estimate_phase_errors(
         best, limit = np.where(better, fit.value, best), np.where(better, fit.sd, limit)
         best_parts = np.where(better[:, None, :, None], fit.parts, best_parts)
         common = common_shift_factor(coarser, (fit.value, fit.sd)) if coarser else 1.0
-        factor = np.where(better, np.maximum(common, fit.factor), factor)
+        factor = np.where(better, np.maximum(common, fit.factor) if repeats else common, factor)
         coarser = fit.value, fit.sd
     determined = limit < SEARCH_RESOLUTION_RAD
     return np.where(determined, best, np.nan), np.where(determined, limit, np.inf), best_parts, gain, factor

@@ -23,8 +23,8 @@ MIN_CELLS_ACROSS = 400
 do not resolve fine detail, which then biases the result."""
 
 
-def finest_cell(samples: RegistrationSamples, inside: Mask, grid: Grid) -> float:
-    """Return the smallest size of a cell that the samples fill [px].
+def finest_cell(samples: RegistrationSamples, inside: Mask, grid: Grid) -> tuple[float, bool]:
+    """Return the smallest size of a cell that the samples fill [px], and whether they repeat at the same places.
 
     Args:
         samples: all of them.
@@ -35,23 +35,24 @@ def finest_cell(samples: RegistrationSamples, inside: Mask, grid: Grid) -> float
         min(1.0, grid.width / MIN_CELLS_ACROSS),
         math.sqrt(MIN_SAMPLES_PER_CELL * grid.width * grid.height / samples.x.size),
     )
-    return _occupied_cell(samples.select(inside), cell)
+    occupied = _occupied_cell(samples.select(inside), cell)
+    return occupied, occupied > cell
 
 
 def _occupied_cell(samples: RegistrationSamples, cell: float) -> float:
-    """The smallest size of a cell [px], from ``cell`` on, with an occupancy of ``MIN_OCCUPANCY``; at most
-    a sixteenth of the smaller side of the field that the samples cover."""
-    ranges = [(float(np.min(place)), float(np.ptp(place))) for place in (samples.x, samples.y)]
-    most = min(length for _, length in ranges) / 16.0
-    while cell < most:
-        column, row = (
-            ((place - first) / cell).astype(np.int64)
-            for place, (first, _) in zip((samples.x, samples.y), ranges, strict=True)
-        )
-        columns, rows = (math.ceil(length / cell) for _, length in ranges)
-        occupied = np.count_nonzero(np.bincount(row * (columns + 1) + column))
-        at_random = columns * rows * -math.expm1(-samples.x.size / (columns * rows))
-        if occupied >= MIN_OCCUPANCY * at_random:
+    """The smallest size of a cell [px], from ``cell`` on, with an occupancy of ``MIN_OCCUPANCY``.
+
+    Only samples further apart than a cell leave columns between them, so that it is hardly more than their distance.
+    """
+    if samples.x.size < 2:
+        return cell
+    distance = float(np.median(np.hypot(np.diff(samples.x), np.diff(samples.y))))
+    column, row = (place - place.min() for place in (samples.x, samples.y))
+    while cell < distance:
+        columns, rows = (math.ceil(place.max() / cell) + 1 for place in (column, row))
+        index = (row / cell).astype(np.int64) * columns + (column / cell).astype(np.int64)
+        occupied, cells = np.count_nonzero(np.bincount(index)), columns * rows
+        if occupied >= MIN_OCCUPANCY * cells * -math.expm1(-index.size / cells):
             break
         cell *= math.sqrt(2.0)
     return cell

@@ -42,7 +42,7 @@ CASES = {
     "strong harmonics": (oscillation(13840.0, 0.1, third=0.2), oscillation(3270.0, 0.185), Grid(7, 400, 0.18, 0.18)),
     "far beyond the field": (oscillation(13840.0, 0.185), oscillation(3270.0, 0.185), Grid(400, 400, 0.002, 0.18)),
     "one pixel": (oscillation(13840.0, 0.185), oscillation(3270.0, 0.185), Grid(1, 1, 0.18, 0.18)),
-    "ringdown": (oscillation(13840.0, 0.3, -60.0, 3e6), oscillation(3270.0, 0.3, -60.0), Grid(400, 400, 0.18, 0.18)),
+    "ringdown": (oscillation(13840.0, 0.3, -60.0, 2e5), oscillation(3270.0, 0.3, -60.0), Grid(400, 400, 0.18, 0.18)),
 }
 
 
@@ -51,6 +51,8 @@ CASES = {
 @pytest.mark.parametrize("dtype", [np.int16, np.uint8, np.float32])
 def test_counts_and_sums_equal_those_from_angles(case: str, dtype: type) -> None:
     x, y, grid = CASES[case]
+    assert x.is_in_segments(0, SIZE)
+    assert y.is_in_segments(0, SIZE)
     whole = np.random.default_rng(0).integers(-30000 if dtype != np.uint8 else 0, 30000, SIZE)
     intensity = whole.astype(dtype)
     expected = accumulate_samples(x.read(), y.read(), intensity.astype(float), grid)
