@@ -46,7 +46,7 @@ def test_table_and_page_list_every_device(folder: Path, capsys: pytest.CaptureFi
     arguments = ["diagnose", "--each", str(folder / "recordings"), "-o", str(folder / "out"), "--workers", "1"]
     assert main(arguments) == 2
     out = capsys.readouterr().out
-    assert "1 of 2 recordings show effects" in out
+    assert "1 of 2 recordings shows effects" in out
     assert "c.h5: is not an HDF5 file" in out
     with (folder / "out" / "table.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
